@@ -1,13 +1,13 @@
 """Compare a handwritten stereo visual-inertial EKF with a GTSAM smoother on the same measurements.
 
-``toolkit.compare("drive", ["ekf", "batch"])`` is the whole of it; what the package offers is imported when first used.
+``toolkit.compare("drive", ["ekf", "batch"])`` runs a comparison. Submodules are imported when first used.
 
-Reading order: sequence (what comes in; its parts are measured_motion, resampling, track_noise, track_budget) ->
-estimator, estimate, answers (what comes out) -> models -> filters/ekf -> filters/batch -> runner (one over the other,
-with divergence) -> metrics -> experiment -> report. docs/architecture.md has the picture.
-Before a run: datasets, frontend and simulation make a sequence, audit looks for its faults, track_errors for its noise,
-initialization for a first state. Beside it: gate, evaluation and verify judge; cli and api are what users call. Below
-all: settings, files, progress, discovery, compilation, arrays, jackknife, geometry, threads, errors.
+Reading order: sequence (the input; its parts are measured_motion, resampling, track_noise, track_budget) -> estimator,
+estimate (the output) -> models -> filters/ekf -> filters/batch -> runner (an estimator over a sequence, with
+divergence) -> metrics -> experiment -> report. docs/architecture.md has the picture. Before a run: datasets, frontend
+and simulation make a sequence, audit finds its faults, track_errors fits the noise of its tracks, initialization finds
+the first state. gate, evaluation and verify judge results; users call cli and api. The lowest layers: settings, files,
+progress, discovery, compilation, arrays, jackknife, geometry, threads, errors.
 """
 
 from typing import TYPE_CHECKING, Any

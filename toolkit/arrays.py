@@ -1,4 +1,4 @@
-"""What is asked of an array that comes in: its shape, that a pose is one, where values stand in it, its digest."""
+"""Checks of arrays (shape, rigid transformation), look-up of values in them, and a digest of their content."""
 
 import hashlib
 from collections.abc import Iterable
@@ -52,7 +52,7 @@ def freeze_arrays(value: Any, **shapes: tuple[int | None, ...]) -> None:
 
 
 def rows_of(wanted: IntArray, ascending: IntArray) -> tuple[IntArray, BoolArray]:
-    """Return in which rows (M,) of ascending values (N,) wanted ones (M,) stand, and whether they do (M,)."""
+    """Return the rows (M,) of wanted values (M,) among ascending values (N,), and whether each is there (M,)."""
     if not ascending.size:
         return np.zeros(wanted.shape, dtype=np.int64), np.zeros(wanted.shape, dtype=bool)
     rows = np.minimum(np.searchsorted(ascending, wanted), ascending.size - 1)
@@ -60,15 +60,15 @@ def rows_of(wanted: IntArray, ascending: IntArray) -> tuple[IntArray, BoolArray]
 
 
 def is_among(ids: IntArray, others: IntArray) -> BoolArray:
-    """Say which ids (N,) are among others (M,), each of which there is once; for some hundreds, where isin is slow."""
+    """Say which ids (N,) are among others (M,), which are unique; for some hundreds, where numpy.isin is slow."""
     return rows_of(ids, np.sort(others))[1]
 
 
 def content_digest(values: Iterable[object], digits: int | None = None) -> str:
     """Return the SHA-256, in hexadecimal digits, over arrays, numbers, texts and the fields of dataclasses.
 
-    With ``digits``, what is a float is rounded before: a number to so many digits, an array to as many of its largest
-    value. Every array counts with its shape.
+    With ``digits``, floats are rounded first: a number to that many significant digits, an array to that many digits of
+    its largest value. The shape of every array is part of the digest.
     """
     digest = hashlib.sha256()
     for value in values:

@@ -1,7 +1,8 @@
-"""Whether what an estimator has compiled runs in the place of its NumPy, and what became of it.
+"""Decides whether an estimator's compiled code runs instead of its NumPy code, and records what ran.
 
-NumPy is the definition. What computes the same compiled is a module of its own that imports numba (the extra ``fast``):
-it is imported when an estimator that has one is built, never before, and compiled then, once for each version.
+The NumPy code is the definition. Compiled code that computes the same is in modules of its own, which import numba (the
+extra ``fast``). They are imported when an estimator that has them is built, never before, and compiled then, once for
+each version.
 """
 
 import fcntl
@@ -24,7 +25,7 @@ _NEEDS = "needs numba, which is not installed: pip install 'vislam-toolkit[fast]
 
 
 def check_possible(requested: Requested) -> None:
-    """Raise EstimatorError where compiled code is asked for and cannot be had here."""
+    """Raise EstimatorError where compiled code is required and numba is not installed."""
     if requested == "compiled" and find_spec("numba") is None:
         raise EstimatorError(f"arithmetic = compiled {_NEEDS}")
 
@@ -32,8 +33,9 @@ def check_possible(requested: Requested) -> None:
 class Compilation:
     """Compiled modules for one run, as asked: where numba is installed ("auto"), in any case, or never ("numpy").
 
-    ``ran`` says afterwards what did, None where the estimator has NumPy alone; ``log`` what is to be told of it;
-    ``wall_s`` and ``cpu_s`` what importing and compiling took, which is once a process and no cost of the run.
+    Afterwards ``ran`` says which code ran, None where the estimator has NumPy code alone; ``log`` has remarks for the
+    user; ``wall_s`` and ``cpu_s`` are the times of importing and compiling, which happen once a process and do not
+    count as cost of the run.
     """
 
     def __init__(self, requested: Requested = "numpy") -> None:
@@ -45,15 +47,15 @@ class Compilation:
     def module(self, name: str) -> ModuleType | None:
         """Return a compiled module by its dotted name, or None where NumPy is to run.
 
-        Its constant ``COMPILED`` says in words what had to be compiled; empty where that was found on disk. Raises
-        EstimatorError where it is asked for and cannot be had.
+        Its constant ``COMPILED`` describes what had to be compiled; it is empty where the compiled code was found on
+        disk. Raises EstimatorError where compiled code is required and not available.
         """
         return self._imported(name, _one_process_at_a_time(name)) if self._can_run() else None
 
     def share(self, names: Iterable[str]) -> None:
-        """Import those of some compiled modules that no other process has begun to: each compiles some for all.
+        """Import those compiled modules that no other process is importing yet, so that processes share the compiling.
 
-        :meth:`module` then waits for the others. Raises what it raises.
+        :meth:`module` then waits for the other processes. Raises as :meth:`module` does.
         """
         for name in names if self._can_run() else ():
             with _unless_another_process(name) as alone:

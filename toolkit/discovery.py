@@ -127,12 +127,13 @@ def announced(group: str) -> list[FoundModule]:
 def line_of_another_package(error: BaseException) -> str:
     """Return file and line of the innermost code that an error came through in a package announced by others.
 
-    Errors of other processes are looked at by the traceback that they bring. It is empty where ours alone is in it.
+    For an error from another process the traceback that it carries is searched. The result is empty where only the
+    toolkit's own code is in the traceback.
     """
     announced_packages = {point.value for group in GROUPS for point in entry_points(group=group)}
     folders: list[str] = []
     for package in sorted(one for one in announced_packages if one.partition(".")[0] not in _OURS):
-        with suppress(Exception):  # one that cannot be found is told elsewhere
+        with suppress(Exception):  # a package that cannot be found is reported elsewhere
             folders += ((spec := _spec(package)) and spec.submodule_search_locations) or ()
     places = _PLACE.findall("".join(traceback.format_exception(error)))
     inside = [f"{file}, line {line}" for file, line in places if any(Path(file).is_relative_to(one) for one in folders)]
@@ -142,7 +143,7 @@ def line_of_another_package(error: BaseException) -> str:
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
     """Return what installed distributions announce under a group.
 
-    Their files are read once for as long as Python's path and its folders, where they are installed, stay unchanged.
+    The metadata files are read again only when Python's path, or a folder on it, has changed.
     """
     return _entry_points(group, tuple((folder, _changed_ns(Path(folder))) for folder in sys.path))
 

@@ -1,9 +1,9 @@
 """Says whether a run has diverged, without truth: it contradicts the measured motion, or its gate has collapsed.
 
-The correction a consistent filter makes at a frame has the covariance it takes away: what it had before, less what
-it has after. In a steady state that is what the motion noise adds in a frame; a filter that learns its heading or a
-bias after a long drive may take away, and so jump by, much more, if its own covariances say so. Steps far outside
-that are rare in a filter that works and common in one that has diverged.
+The correction that a consistent filter makes at a frame has, as its covariance, the covariance before it less the
+covariance after it. In a steady state this difference is what the motion noise adds in a frame. It is much larger where
+a filter learns its heading or a bias after a long drive, and then a large jump is consistent. Corrections far outside
+this covariance are rare in a filter that works and common in one that has diverged.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.models.predicted_steps import predicted_steps
+from toolkit.models.motion import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -43,13 +43,13 @@ _MOST_OUTLIERS = 0.2
 # rad/s of turn rate and m/s of velocity.
 _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
 
-# No trajectory goes farther from its first pose than so many times the way that odometry measured (beyond a quarter too
-# much vision and odometry disagree already), or beside an IMU, which measures none, than so many m/s times the time
-# since; and a correction of the first poses is no travel (m).
+# No trajectory goes farther from its first pose than this many times the path that odometry measured (at a quarter
+# more, vision and odometry disagree already). Beside an IMU, which measures no path, the limit is this speed (m/s)
+# times the time since. The last number (m) allows for a correction of the first poses.
 MOST_WAYS, MOST_MPS, _NO_TRAVEL_M = 2.0, 1000.0, 10.0
 
-# Covariances are linearised anew at every frame: what a correction takes away shows in their difference down to such a
-# share of a standard deviation. Of a position that is uncertain by 20 m that is 0.2 m: a turn of the whole way behind.
+# Covariances are linearised anew at every frame, so their difference shows what a correction took away only down to
+# this share of a standard deviation: 0.2 m for a position that is uncertain by 20 m.
 _RESOLUTION = 0.01
 
 
@@ -70,9 +70,9 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
 
 
 def _out_of_reach(trajectory: Trajectory, sequence: Sequence) -> str | None:
-    """Return which pose is farther away than anything travels that moves as was measured, or None.
+    """Return the first pose that is farther away than the measured motion allows, or None.
 
-    A single leap, after which all steps are again the measured ones, is seen by nothing else.
+    Only this test finds a single leap after which all steps agree with the measured ones again.
     """
     position, t_ns = trajectory.T_world_imu[:, :3, 3], trajectory.t_ns
     if t_ns.size == 0:
@@ -105,7 +105,7 @@ def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = No
     """Return why an estimator with these diagnostics (N,), by name, of N frames has diverged, or None.
 
     Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error, or the
-    noise of tracks that it was told is less than theirs.
+    stated noise of tracks is less than their real noise.
     """
     doubt = "" if track_noise is None else ", or its tracks err more than it was told (noise.tracks)"
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
@@ -126,7 +126,7 @@ def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = No
 
 
 def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
-    """Return the least share that must pass of measurements that are as long as those accepted are on average.
+    """Return the least share of measurements that must pass, for tracks as long as the accepted ones are on average.
 
     Their length is in sightings of three degrees of freedom, of which at least so many are in a measurement.
     """
@@ -137,7 +137,7 @@ def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
 
 
 class _Step(NamedTuple):
-    """A step between neighbouring frames: its rows, and what the measured motion makes of the state at its start."""
+    """A step between neighbouring frames: its rows, and the prediction by the measured motion from its start."""
 
     start: int
     end: int
@@ -180,7 +180,8 @@ def _slack(trajectory: Trajectory, dt_s: float) -> Array:
 def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Array) -> Array:
     """Return the pose covariance (S, 6, 6) that the correction at the end of each step took away, where it took any.
 
-    ``transition`` (S, 6, d) is what of the state's error reaches the pose, ``noise`` (S, 6, 6) what a step adds to it.
+    ``transition`` (S, 6, d) maps the error of the state to the error of the next pose; ``noise`` (S, 6, 6) is the
+    covariance that a step adds.
     """
     if cov_start.shape[-1] != transition.shape[-1]:
         return np.zeros_like(noise)

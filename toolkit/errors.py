@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from typing import ClassVar
 
 _LONG_WORD, _SHOWN = re.compile(r"\S{300,}"), 60
-# The beginning of a name is one from so many letters on, and of no more names than these.
+# Names that begin with an unknown one are suggested if it has this many letters and no more than this many names do.
 _FEWEST_LETTERS, _MOST_BEGUN = 3, 4
 
 
@@ -44,13 +44,13 @@ class EstimatorError(VislamError):
 
 
 class ExtensionError(VislamError):
-    """What another package announces, or a file dropped in, that is not there or not what such a file must be."""
+    """A module of another package, or a file dropped in, that is missing or does not define what it must."""
 
     exit_status = 70
 
 
 class SystemLimitError(VislamError):
-    """Something the system does not give: processes, open files, room for what they share."""
+    """The system does not provide enough processes, open files or shared memory."""
 
     exit_status = 71
 
@@ -66,7 +66,7 @@ def printable(text: str) -> str:
 
 
 def one_line(message: str) -> str:
-    """Return a message as one printable line; of a word longer than a file's name may be, only both ends."""
+    """Return a message as one printable line; words longer than a file name may be are cut in the middle."""
     line = printable(" ".join(message.split()))
     return _LONG_WORD.sub(lambda word: f"{word[0][:_SHOWN]}...{word[0][-_SHOWN:]}", line)
 
@@ -87,13 +87,13 @@ def _meant(name: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message about a name nobody knows: the known ones like it, or nothing where none is."""
+    """Return the end of a message about an unknown name: the known names that are similar, or nothing."""
     close = _meant(name, known)
     return f"; did you mean {close}?" if close else ""
 
 
 def no_such(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the message for a name nobody knows: the known ones like it, then all of them."""
+    """Return the message for an unknown name: the known names that are similar, then all of them."""
     names = list(known)
     close = _meant(name, names)
     hint = f" (did you mean {close}?)" if close else ""

@@ -1,12 +1,12 @@
 """The protocol every estimator follows, and how the toolkit finds estimators without naming one.
 
-An installed package announces, in the entry-point group ``toolkit.estimators``, a package whose modules are
-estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its
-summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
-ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
-where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` says which of the common
-rules below it treats otherwise than estimators do that say nothing: True where it obeys one, else the reason why not;
-``CITES`` is what ``vislam cite`` prints for it, keys of toolkit/report/references.bib or BibTeX itself.
+An installed package announces, in the entry-point group ``toolkit.estimators``, a package whose modules are estimators:
+a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its summary and its function
+``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the ladder, in which every
+rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared where no estimator is
+named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` lists the common rules below for which it differs
+from the default: True where it obeys a rule, else the reason why not; ``CITES`` is what ``vislam cite`` prints for it,
+keys of toolkit/report/references.bib or BibTeX itself.
 """
 
 import ast
@@ -27,8 +27,9 @@ from toolkit.settings import DEFAULTS, Scalar, Settings
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
 LADDER = "ladder"
-# Settings that are meant for all estimators, and whether one obeys them whose module says nothing of them: the outlier
-# policy, the window, the stated noise of tracks, and parts of the noise model that not all estimators have.
+# Settings that are meant for all estimators, and whether an estimator obeys them by default, when its module has no
+# entry for them: the outlier policy, the window, the stated noise of tracks, and parts of the noise model that not all
+# estimators have.
 RULES = {
     "outliers": True,
     "window": True,
@@ -43,8 +44,8 @@ RULES = {
 class Setup:
     """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
 
-    ``options`` are the settings of this estimator alone, by name; ``progress`` is told of a long ``finish``;
-    ``compilation`` gives what is compiled.
+    ``options`` are the settings of this estimator alone, by name; a long ``finish`` reports to ``progress``;
+    ``compilation`` provides compiled modules.
     """
 
     rig: StereoRig
@@ -59,7 +60,7 @@ class Setup:
 
 
 class Estimator(Protocol):
-    """Reads packets in order of time and says where the IMU is."""
+    """Reads packets in order of time and estimates the state of the IMU."""
 
     def step(self, packet: Packet) -> Estimate | None:
         """Answer for the packet's frame from the past alone, or return None to answer only at the end."""
@@ -124,7 +125,7 @@ class EstimatorEntry:
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it.
 
-        So it does where compiled arithmetic is asked for and there is nothing to compile with.
+        It also raises EstimatorError where compiled arithmetic is required and numba is not installed.
         """
         check_possible(settings.arithmetic)
         self._rules()
@@ -172,7 +173,7 @@ def defaults() -> tuple[str, ...]:
 
 
 def check_options(settings: Settings, own: Collection[str] = ()) -> None:
-    """Raise EstimatorError where an option is set that no estimator has, be it found or one's ``own``, run or not."""
+    """Raise EstimatorError where an option is set that no known estimator has, whether discovered or among ``own``."""
     found = discover() if settings.estimators else {}
     for name in settings.estimators:
         if name not in {*found, *own}:

@@ -206,7 +206,7 @@ def quaternion_from_rotation(rotation: Array) -> Array:
     trace = diagonal.sum(axis=-1)
     of_vector, of_scalar = 1.0 + 2.0 * diagonal - trace[..., None], 1.0 + trace
     if (of_vector < of_scalar[..., None]).all():
-        # By less than 90 degrees or so each, as what lies between two estimates nearly always is.
+        # The usual case: rotations by less than about 90 degrees, such as those between two estimates.
         vee = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1])
         row = np.stack([*vee, of_scalar], axis=-1)
     else:

@@ -1,4 +1,4 @@
-"""Standard errors of estimates from dependent data, by what they are without each stretch of it.
+"""Standard errors of estimates from dependent data: the estimate is repeated with one stretch left out at a time.
 
 Source: Shao & Tu, "The Jackknife and Bootstrap" (1995), section 2.3: the delete-d jackknife of dependent data.
 """
@@ -10,12 +10,12 @@ import numpy as np
 
 from toolkit.geometry import Array
 
-# Parts of a recording of which one at a time is left out: what lasts for seconds is one event.
+# Number of stretches of a recording, of which one at a time is left out. Errors that last for seconds stay within one.
 STRETCHES = 10
 
 
 def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
-    """Return the standard error of an estimate from arrays (M, ...) in time, by what it is without each tenth."""
+    """Return the standard error of an estimate from arrays (M, ...) in time, leaving out each tenth."""
     return float(np.sqrt(jackknife_cov(lambda *some: np.array([estimate(*some)]), *rows)[0, 0]))
 
 

@@ -1,6 +1,6 @@
-"""What was measured of the IMU's motion: the samples of a recording, their noise, and the motion of one interval.
+"""The measured motion of the IMU: the samples of a recording, their noise, and the motion of one interval.
 
-There are three kinds: measured body twists, the samples of an IMU, and motion that nobody measured.
+There are three kinds: measured body twists, the samples of an IMU, and no measurement of the motion.
 """
 
 from collections.abc import Iterator
@@ -54,7 +54,7 @@ class ImuNoise:
 
 @dataclass(frozen=True, eq=False)
 class TwistChangeNoise:
-    """Densities of the white noise on the change of a twist that nobody measured, per axis (3,), in the IMU frame.
+    """Densities of the white noise on the change of an unmeasured twist, per axis (3,), in the IMU frame.
 
     Units: m/s^2/sqrt(Hz) of the velocity, rad/s^2/sqrt(Hz) of the turn rate.
     """
@@ -113,8 +113,8 @@ class TwistSamples(_TwoVectors):
 class ImuSamples(_TwoVectors):
     """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame.
 
-    ``pairing`` says what stands for the motion: the mean of two neighbours from one stamp to the next, or each sample
-    for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
+    ``pairing`` says how samples describe the motion: the mean of two neighbours from one stamp to the next, or each
+    sample for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
     """
 
     VECTORS = ("accel_mps2", "gyro_radps")
@@ -138,7 +138,7 @@ class NoSamples:
         return np.empty((self.t_ns.size, 0))
 
     def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return other stamps (S,), of which there are no values (S, 0) either."""
+        """Return the same kind with other stamps (S,); ``values`` is (S, 0)."""
         return replace(self, t_ns=t_ns)
 
 
@@ -181,7 +181,7 @@ def noise_scale_of(motion: TwistMotion | ImuMotion) -> Array:
 
 
 def with_noise_scaled(motion: Motion, variance: float) -> Motion:
-    """Return a motion whose samples' white noise has so many times its variance; where none is measured, as it is."""
+    """Return a motion with the variance of its white noise multiplied; an unmeasured motion is returned unchanged."""
     if variance == 1.0 or isinstance(motion, UnmeasuredMotion):
         return motion
     return replace(motion, noise_scale=np.sqrt(variance) * noise_scale_of(motion))

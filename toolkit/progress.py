@@ -1,6 +1,6 @@
-"""Progress of long work, with the time that is left: a bar on a terminal, a line now and then in a log.
+"""Progress of long work, with the time left: a bar on a terminal, a line from time to time in a log.
 
-The loop that reports progress does not know who watches: nobody (``SILENT``) and a bar look the same to it.
+The loop that reports progress is the same with a bar and without any display (``SILENT``).
 """
 
 import sys
@@ -11,42 +11,44 @@ from typing import Protocol, TextIO
 
 from toolkit.errors import printable
 
-# Seconds between two lines where the stream is a file or a pipe, and before the first; of work that takes hours there
-# are fewer: a twentieth of the time so far lies between two, and at most five minutes.
+# Seconds before the first line and between two lines where the stream is a file or a pipe. For long work the interval
+# grows to a twentieth of the time so far, and to five minutes at most.
 LOG_EVERY_S = 10.0
 _SELDOM_AFTER_S, _MOST_SELDOM = 200.0, 30.0
 _FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
 _LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
-# The first steps hold what comes once, as reading and compiling: with less than this done, the time left is a guess.
+# The first steps include one-time work such as reading and compiling; before this share is done, the time left is a
+# guess.
 _LEAST_SHARE = 0.02
 _LOG_FORMAT_BEFORE = "{desc} {percentage:.0f} % [{elapsed}]"
 
 
 class Progress(Protocol):
-    """Is told how many of all steps are done."""
+    """Receives the number of steps done, of how many."""
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Take note; ``stage`` names what is under way where that changes, as in a solver's iterations.
+        """Report the steps done; ``stage`` names the current part of the work, such as a solver's iteration.
 
-        Where the total is another, or less is done than before, other steps are counted, and their time anew.
+        A different total, or fewer steps done than before, begins another count, and its time is measured anew.
         """
 
 
 class Silent:
-    """Progress nobody watches."""
+    """Progress that is not displayed."""
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Take note of nothing."""
+        """Do nothing."""
 
 
 SILENT = Silent()
-# Begins a named piece of work: a context, at whose end the work ends, that gives the Progress to report to.
+# Begins a named piece of work: a context manager that returns the Progress to report to; the work ends with the
+# context.
 ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 
 
 @contextmanager
 def silent(_label: str) -> Iterator[Progress]:
-    """Begin a piece of work that nobody watches."""
+    """Begin a piece of work without a display."""
     yield SILENT
 
 
@@ -101,7 +103,7 @@ class _Log:
         self._first_s = self._shown_s = self._began_s
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Write a line where the last one is long past."""
+        """Write a line if enough time has passed since the last one."""
         now_s = time.monotonic()
         if total != self._total or done < self._done:
             self._began_s = now_s

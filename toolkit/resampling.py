@@ -14,7 +14,7 @@ NS_PER_S = 1_000_000_000
 
 # Which sample describes the motion between two stamps: the one at its start, the one at its end, or their mean.
 Pairing = Literal["start", "end", "mean"]
-# What stands for the motion of an IMU: the mean of two neighbours from stamp to stamp, or each sample for the time
+# How IMU samples describe the motion: the mean of two neighbours from stamp to stamp, or each sample for the time
 # around it, half-way to its neighbours.
 ImuPairing = Literal["mean", "middle"]
 
@@ -27,10 +27,10 @@ def cut_at(
     The samples, stamps (S,) and values (S, d), must span the frames. An interval is divided at the samples
     inside it, with ``middle`` half-way between them; at the frames themselves ``mean`` interpolates linearly.
 
-    White noise of the samples is that of the values only where no sample is shared out: a mean of neighbours gives
-    an interval of n samples ``(n - 1/2) / n`` of the variance and each of its neighbours a covariance of ``1 / 4 n``,
-    so that it adds up to the whole over many intervals, and with ``middle`` nothing is shared where the frames are
-    half-way between samples.
+    The noise of the values equals that of the samples only where no sample contributes to two intervals. With the mean
+    of neighbours, an interval of n samples has ``(n - 1/2) / n`` of the variance and a covariance of ``1 / 4 n`` with
+    each neighbouring interval, which adds up to the whole variance over many intervals. With ``middle``, no sample is
+    shared where the frames are half-way between samples.
     """
     ends = _half_way(t_ns) if pairing == "middle" else t_ns
     inside = ends[(ends > frames_t_ns[0]) & (ends < frames_t_ns[-1])]
@@ -46,7 +46,7 @@ def _half_way(t_ns: IntArray) -> IntArray:
 
 
 def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing | ImuPairing) -> Array:
-    """Return the value (n, d) that stands for each of the n intervals between knots."""
+    """Return the value (n, d) that describes each of the n intervals between knots."""
     if pairing == "middle":
         return values[np.searchsorted(_half_way(t_ns), knots[:-1], side="right")]
     if pairing == "start":
@@ -60,7 +60,7 @@ def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing | I
 
 @dataclass(frozen=True, eq=False)
 class Bridges:
-    """Spans (B,) in which nobody measured the motion and samples were put in, which are noisier than the others.
+    """Spans (B,) without measured motion, in which samples were interpolated; these are noisier than the others.
 
     ``noise_scale`` (B, 2) multiplies the standard deviation of the white noise there, of linear and angular samples.
     """

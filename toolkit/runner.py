@@ -1,4 +1,4 @@
-"""Run one estimator over one sequence: feed it the packets, time it, keep both kinds of output.
+"""Run one estimator over one sequence: give it the packets, measure its time, keep both kinds of output.
 
 Nothing here knows an estimator by name. A run is ``ok`` only when its estimates are finite, its solves converged,
 its trajectory does not contradict the measured motion and its gate lets measurements pass; otherwise it says
@@ -18,11 +18,20 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.answers import checked_estimate, checked_finish
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
+from toolkit.estimate import (
+    Estimate,
+    Finished,
+    Landmarks,
+    Run,
+    Status,
+    Timings,
+    Trajectory,
+    checked_estimate,
+    checked_finish,
+)
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.progress import SILENT, Progress
@@ -30,7 +39,7 @@ from toolkit.sequence import Packet, Prior, Sequence
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.threads import on_one_thread
 
-# Linux: what is written there sets back the peak that is read here (proc(5)).
+# Linux: writing to this file resets the peak memory that is read here (proc(5)).
 _RESETS_PEAK, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 
@@ -56,7 +65,7 @@ class _Clock:
 
 
 def _count_memory_anew() -> None:
-    """Give back what the allocator keeps of earlier work, and begin to count the peak here where the system can."""
+    """Return memory that the allocator keeps from earlier work, and reset the peak where the system allows it."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
     with suppress(OSError):
@@ -64,7 +73,7 @@ def _count_memory_anew() -> None:
 
 
 def _peak_rss_mb() -> float:
-    """Return the peak resident memory of this process; where the system cannot count anew, of all that ran in it."""
+    """Return the peak resident memory of this process; since the process began where it cannot be reset."""
     with suppress(OSError):
         peak = re.search(r"^VmHWM:\s+(\d+) kB$", _STATUS.read_text(encoding="ascii"), re.MULTILINE)
         if peak is not None:
@@ -129,7 +138,7 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
-    """Return the interrupt that an error comes from: compiled code passes one on behind errors of its own."""
+    """Return the KeyboardInterrupt behind an error, if any: compiled code raises errors of its own from it."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error
@@ -163,9 +172,9 @@ def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timin
 
 
 def with_divergence(run: Run, sequence: Sequence) -> Run:
-    """Return a run that came to its end with the status ``diverged``, and why in its log, where it contradicts itself.
+    """Return a completed run; where it has diverged, with the status ``diverged`` and the reason in its log.
 
-    ``sequence`` is what it read; the truth is not looked at.
+    ``sequence`` is what it read; the truth is not used.
     """
     reasons = [contradiction(trajectory, sequence) for trajectory in _trajectories_to_check(run)] + [
         gate_collapse(run.info, sequence.rig.track_noise)
@@ -175,7 +184,7 @@ def with_divergence(run: Run, sequence: Sequence) -> Run:
 
 
 def _trajectories_to_check(run: Run) -> Iterator[Trajectory]:
-    """Yield what contradicts nothing in a run that works.
+    """Yield the trajectories of a run that are tested for divergence.
 
     A final state without a covariance is at least as certain as the causal one was.
     """

@@ -1,4 +1,4 @@
-"""What comes in: one recording as immutable values, and the packets every estimator reads from it.
+"""The input: one recording as immutable values, and the packets every estimator reads from it.
 
 Observations are sparse, one row a sighting. Motion samples are cut at the frame times once, in
 :meth:`Sequence.packets`, so that every estimator integrates the same interval; one track in ten is withheld
@@ -39,15 +39,15 @@ from toolkit.track_noise import TrackNoise
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
-# The fact by which a recording says that it brings no tracks.
+# The fact stating that the recording has no tracks.
 NO_FEATURES = "no image features in this file"
-# The fact by which a recording says that its extrinsic may be inverted, or in camera axes x forward, y left, z up.
+# The fact stating that the extrinsic may be inverted, or in camera axes x forward, y left, z up.
 EXTRINSIC_IN_DOUBT = "the extrinsic's direction and camera axes are not certain in this format"
-# The fact by which a recording says that it was given one row for both images of a sighting.
+# The fact stating that the recording gives one image row for both images of a sighting.
 ONE_ROW_FOR_BOTH = "one row v stands for both images of a sighting in this file"
-# Of a recording or a trajectory: names become those of files, of which systems allow 255 bytes.
+# Longest name of a recording or a trajectory: it becomes part of file names, for which systems allow 255 bytes.
 LONGEST_NAME = 200
-# A calibration written with three decimals is off by less; a product of doubles is off by no more.
+# How far a rotation may be from orthonormal: written with three decimals, and as a product of doubles.
 _MOST_ROTATION_DEFECT, _ORTHONORMAL = 5e-3, 1e-14
 
 
@@ -215,9 +215,9 @@ class Provenance:
 class Sequence:
     """One recording: calibration, noise, frame stamps (K,), sightings, motion samples, and truth if there is any.
 
-    A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only
-    :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2; ``bridges``: where
-    motion samples are put in; ``track_budget``: of how many tracks a frame estimators see the sightings, None is all.
+    A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only :meth:`packets` insists on finite
+    values and increasing time. ``gravity_world`` (3,) m/s^2; ``bridges``: where motion samples are interpolated;
+    ``track_budget``: the most tracks a frame that estimators are given, None for all.
     """
 
     name: str
@@ -360,7 +360,7 @@ def check_runnable(sequence: Sequence) -> None:
 
 
 def why_not_sightings(sequence: Sequence) -> str:
-    """Return what keeps the observations from being sightings of the sequence's frames; empty where nothing does."""
+    """Return why the observations cannot be sightings of the sequence's frames; empty where they can."""
     seen = sequence.observations
     if not len(seen) == seen.track_id.size == len(seen.uv_px):
         return "the observations' columns differ in length"
@@ -373,7 +373,7 @@ def why_not_sightings(sequence: Sequence) -> str:
 
 
 def check_stated(sequence: Sequence) -> None:
-    """Raise DataError, which names the field, where a noise, a calibration or a name can be none."""
+    """Raise DataError, which names the field, where a noise, a calibration or a name is not valid."""
     if len(sequence.name) > LONGEST_NAME:
         raise DataError(f"a name of {len(sequence.name)} characters is too long for a recording; shorten it")
     rig = sequence.rig

@@ -6,9 +6,9 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-# Environment variables that set the number of threads of numeric libraries when these are loaded.
-# Of processes side by side: each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
+# Most worker processes on one machine: each has Python with GTSAM, 150 MB or more. --scheduler uses several machines.
 MOST_WORKERS = 1024
+# Environment variables that set the number of threads of numeric libraries when these are loaded.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -20,5 +20,5 @@ def on_one_thread() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _libraries(_modules: int) -> ThreadpoolController:
-    """Return the libraries of this process. Finding them takes 2 ms; it is done anew where more modules are loaded."""
+    """Return the libraries of this process. Finding them takes 2 ms and is repeated when more modules are loaded."""
     return ThreadpoolController()

@@ -1,8 +1,8 @@
 """How the errors of one track's sightings are correlated: white noise, a random walk, and an offset of its own.
 
-A tracker that follows a patch from image to image adds a little error at every step (a walk), and one that matched left
-and right once, at the track's birth, is wrong by the same disparity for the track's whole life (an offset). White noise
-alone is what simulators draw and what most estimators assume.
+A tracker that follows a patch from image to image adds a small error at every step (a random walk). One that matches
+left and right only in the first frame of a track has the same disparity error in all its frames (an offset). Simulators
+draw white noise alone, and most estimators assume it.
 """
 
 from dataclasses import dataclass

@@ -8,7 +8,7 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.parts.subsets import keep_frames, keep_samples
+from toolkit.audit.parts.edits import keep_frames, keep_samples
 from toolkit.audit.timing import clock_jump
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

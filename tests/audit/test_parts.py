@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.audit.parts.edits import split
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.audit.parts.robust import INFLATION, LEVEL, chance_bound, median, slope
-from toolkit.audit.parts.tracks import split
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.models.camera_motion import camera_motion

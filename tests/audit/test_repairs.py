@@ -9,7 +9,7 @@ import pytest
 from toolkit.audit import Finding, audit
 from toolkit.audit.fault import Evidence
 from toolkit.audit.parts.alignment import Alignment
-from toolkit.audit.parts.placement import is_excluded, is_there, way_gone
+from toolkit.audit.parts.extrinsic import is_excluded, is_there, way_gone
 from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence

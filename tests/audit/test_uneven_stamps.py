@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.audit.timing import uneven_stamps
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

@@ -251,7 +251,7 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
 def _who_disputes(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
     """Return of the estimators of a comparison who parts from the measured motion, or rests on one in doubt."""
     dispute = Dispute.of(row for name in names for row in rows.get(name, ()))
-    return {one.row.estimator for one in dispute.parted} | set(dispute.alone if dispute.doubts_motion else ())
+    return {one.row.estimator for one in dispute.too_far} | set(dispute.uncorrected if dispute.doubts_motion else ())
 
 
 def _unless_refused(make: Callable[[], Result]) -> Result | str:

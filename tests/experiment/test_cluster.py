@@ -13,7 +13,7 @@ import pytest
 from toolkit.experiment import cluster as clusters
 from toolkit.experiment.cluster import Cluster, ClusterError
 from toolkit.experiment.units import Outcome, Unit, run_unit
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.progress import SILENT
 
 # Asked for by name: to import it takes a twentieth of what all tests take to be found.
@@ -89,7 +89,7 @@ def test_a_unit_that_ends_its_worker_is_lost_alone(local: Any) -> None:
 
     with Cluster(local.scheduler_address) as cluster:
         found = dict(cluster.results([0, 1], kills_at_one, SILENT))
-    assert found == {0: 0, 1: Lost("the workers that tried it ended before they answered (2 of them)")}
+    assert found == {0: 0, 1: LostUnit("the workers that tried it ended before they answered (2 of them)")}
 
 
 def test_a_scheduler_that_is_not_there_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

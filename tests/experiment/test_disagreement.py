@@ -7,7 +7,7 @@ import pytest
 
 from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.disagreement import FARTHEST, Dispute, Parted, farthest
+from toolkit.experiment.disagreement import FARTHEST, Dispute, FarthestPose, farthest
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Outcome, Scored, Unit, outcome_of, run_estimator
 from toolkit.geometry import Array, se3_exp
@@ -38,7 +38,7 @@ def drawn(seed: int, sigma: Array = SIGMA) -> Array:
     return se3_exp(sigma * np.random.default_rng(seed).standard_normal((40, 6)))
 
 
-def apart(mine: Array, other: Array, cov: Array) -> Parted:
+def apart(mine: Array, other: Array, cov: Array) -> FarthestPose:
     found = farthest(row("other", other, cov, trend=1.0), Trajectory(STAMPS_NS, mine, cov=cov))
     assert found is not None
     return found
@@ -64,10 +64,10 @@ def test_without_a_covariance_or_over_seeds_nobody_parts() -> None:
     poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
     far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
     motion = row("dead-reckoning", poses, cov)
-    assert Dispute.of([motion, row("a", far, cov, 1.0)]).parted
-    assert not Dispute.of([motion, row("a", far, None, 1.0)]).parted
+    assert Dispute.of([motion, row("a", far, cov, 1.0)]).too_far
+    assert not Dispute.of([motion, row("a", far, None, 1.0)]).too_far
     outcome = motion.outcomes[0]
-    assert not Dispute.of([Row("causal", (outcome, replace(outcome, seed=1))), row("a", far, cov, 1.0)]).parted
+    assert not Dispute.of([Row("causal", (outcome, replace(outcome, seed=1))), row("a", far, cov, 1.0)]).too_far
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_the_motion_is_in_doubt_where_half_of_those_that_use_vision_dispute_it(
 ) -> None:
     rows = [row(f"filter-{i}", trend=trend) for i, trend in enumerate(trends)]
     dispute = Dispute.of([row("dead-reckoning"), *rows])
-    assert (dispute.alone, dispute.doubts_motion) == (("dead-reckoning",), doubted)
+    assert (dispute.uncorrected, dispute.doubts_motion) == (("dead-reckoning",), doubted)
     assert not Dispute.of(rows).doubts_motion
     assert len(list(dispute_lines(dispute))) == doubted
 
@@ -92,7 +92,7 @@ def test_one_that_parts_and_whose_corrections_cannot_be_checked_is_no_witness_ag
     held = Row("causal", (replace(held.outcomes[0], outputs={"causal": notes}),))
     motion = row("dead-reckoning", poses, cov)
     dispute = Dispute.of([motion, held])
-    assert [one.row.estimator for one in dispute.parted] == ["seed-ekf"]
+    assert [one.row.estimator for one in dispute.too_far] == ["seed-ekf"]
     assert not dispute.doubts_motion
     assert Dispute.of([motion, held, row("a", far, cov, 1.0)]).doubts_motion
 
@@ -111,9 +111,9 @@ def test_an_odometer_that_slips_is_reported_of_dead_reckoning_too_and_a_sound_on
     sound = simulate(replace(DRIVE, duration_s=8.0), 5)
     assert not any(True for _ in dispute_lines(Dispute.of(rows_of(sound))))
     slipping = Dispute.of(rows_of(faults.disturbed_motion(sound, 0.8, 5)))
-    assert (slipping.alone, slipping.doubts_motion) == (("dead-reckoning",), True)
+    assert (slipping.uncorrected, slipping.doubts_motion) == (("dead-reckoning",), True)
     assert set(slipping.disputing) <= {"ekf-slam", "msckf"} == set(slipping.witnesses)
-    assert "seed-ekf" in {one.row.estimator for one in slipping.parted}
+    assert "seed-ekf" in {one.row.estimator for one in slipping.too_far}
     parting, resting = dispute_lines(slipping)
     assert "vision and the measured motion alone disagree" in parting
     assert resting.startswith("dead-reckoning: nothing but the measured motion and the start, which ")

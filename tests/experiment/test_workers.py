@@ -19,7 +19,7 @@ from loky.backend.synchronize import SemLock
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment.units import Outcome, Scored, Unit, run_unit
-from toolkit.experiment.workers import Lost, WorkerProcess, results_of
+from toolkit.experiment.workers import LostUnit, WorkerProcess, results_of
 from toolkit.metrics import cost
 from toolkit.progress import SILENT
 
@@ -160,7 +160,7 @@ def _but_cost(scored: Scored) -> dict[str, float | None]:
 
 def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs: Jobs, work: ModuleType, tmp_path: Path) -> None:
     results = by_place(jobs((0, 1), ("dead-reckoning", "ekf", "batch")), 2, work.dies)
-    assert results[4] == Lost("its process was ended by signal 9 before it answered")
+    assert results[4] == LostUnit("its process was ended by signal 9 before it answered")
     del results[4]
     assert results == [(name, 0) for name in ("dead-reckoning", "ekf", "batch")] + [("dead-reckoning", 1), ("batch", 1)]
     assert (tmp_path / "mark").read_text() == "tried tried "
@@ -172,12 +172,12 @@ def test_a_process_that_dies_once_loses_nothing(jobs: Jobs, work: ModuleType) ->
 
 
 def test_a_process_that_leaves_without_a_word_says_its_status(jobs: Jobs, work: ModuleType) -> None:
-    assert by_place(jobs((0,)), 2, work.leaves) == [Lost("its process ended with status 3 before it answered")] * 2
+    assert by_place(jobs((0,)), 2, work.leaves) == [LostUnit("its process ended with status 3 before it answered")] * 2
 
 
 def test_a_unit_without_memory_is_lost_alone(jobs: Jobs, work: ModuleType) -> None:
     kept, lost = by_place(jobs((0, 1), ("ekf",)), 2, work.is_short_of_memory)
-    assert (kept, type(lost)) == (0, Lost)
+    assert (kept, type(lost)) == (0, LostUnit)
 
 
 def test_an_error_of_the_recording_ends_everything_at_once(jobs: Jobs, work: ModuleType) -> None:

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from toolkit.gate.significance import holm, paired_p, smallest_seen
+from toolkit.gate.significance import holm, paired_p, smallest_detectable
 
 
 @pytest.mark.parametrize("n", [2, 5, 24, 400])
@@ -76,11 +76,11 @@ def test_the_smallest_change_seen_is_seen_as_often_as_promised():
     # From the true spread, of which every set of seeds has an estimate only.
     exact = spread * rng.standard_normal(200_000)
     n_over = np.sqrt(exact.size / seeds)
-    shift = smallest_seen(exact, rate, power) * n_over
+    shift = smallest_detectable(exact, rate, power) * n_over
     caught = paired_p(rng.normal(shift, spread, (4000, seeds))) <= rate
     # Large samples have normal quantiles where 24 seeds have Student's: a little less power than promised.
     assert 0.80 < caught.mean() < 0.97
     few = rng.normal(0.0, spread, (300, seeds))
-    shifts = np.array([smallest_seen(one, rate, power) for one in few])
+    shifts = np.array([smallest_detectable(one, rate, power) for one in few])
     caught = paired_p(rng.normal(np.median(shifts), spread, (4000, seeds))) <= rate
     assert caught.mean() == pytest.approx(power, abs=0.03)

@@ -17,8 +17,7 @@ from toolkit.metrics import Scores
 from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.payload import evenly, payload_of, running_median, with_peaks
-from toolkit.report.run_directory import MadeBy, write_run
-from toolkit.report.run_files import read_run
+from toolkit.report.run_directory import MadeBy, read_run, write_run
 
 Json = dict[str, Any]
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

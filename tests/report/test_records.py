@@ -14,8 +14,8 @@ from toolkit.files.documents import parse, read, schema, to_line, to_text
 from toolkit.gate import baseline_file, trajectory_baseline
 from toolkit.metrics import describe
 from toolkit.report.records import read_check
-from toolkit.report.records.scores import PROMISED_KEYS
 from toolkit.report.schemas import RECORDS, schema_files
+from toolkit.report.score_records import PROMISED_KEYS
 
 Document = dict[str, Any]
 

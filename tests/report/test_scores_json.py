@@ -12,7 +12,7 @@ from toolkit.experiment.comparison import Comparison, Row, consistency_of
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
-from toolkit.report.records.scores import PROMISED_KEYS, Metrics
+from toolkit.report.score_records import PROMISED_KEYS, Metrics
 from toolkit.report.scores_json import metrics_document
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

@@ -14,8 +14,15 @@ from toolkit.settings import settings_of
 from toolkit.simulation.faults import few_tracks, identity_intrinsics
 from toolkit.track_errors import Fit, fit_track_noise, summary_of
 from toolkit.track_errors.adjustment import adjusted, started
-from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood, linearised
-from toolkit.track_errors.tracklets import MOST_SIGHTINGS, middle_of_pair, tracklets
+from toolkit.track_errors.tracklets import (
+    MOST_SIGHTINGS,
+    Residuals,
+    Tailed,
+    likelihood,
+    linearised,
+    middle_of_pair,
+    tracklets,
+)
 from toolkit.track_noise import TrackNoise
 
 WALK_PX, OFFSET_PX = 0.13, 0.7

@@ -1,9 +1,9 @@
 """The audit: faults of a recording, found from its data alone, reported and (by default) repaired.
 
-A file with a ``FAULT`` is a fault, found by being in one of the folders: ``timing``, ``tracks``, ``samples``,
-``calibration``, ``agreement`` (of vision with the motion) or ``truth``; ``parts`` is what several of them share.
-Read ``fault``, then ``tracks.no_disparity`` for the smallest fault, ``tracks.stale_frames`` and
-``calibration.mixed_axes`` for the others' kinds.
+A file with a ``FAULT`` in one of these folders is a fault and needs no registration: ``timing``, ``tracks``,
+``samples``, ``calibration``, ``agreement`` (of vision with the motion) and ``truth``; ``parts`` has computations that
+several faults share. Read ``fault``, then ``tracks.no_disparity`` (the smallest fault), then ``tracks.stale_frames``
+and ``calibration.mixed_axes`` (repairs of tracks and of the calibration).
 """
 
 import importlib
@@ -19,7 +19,7 @@ from toolkit.audit.fault import Evidence, Fault, Finding, Symptom, Undecided
 from toolkit.errors import UnknownNameError, no_such
 from toolkit.sequence import Sequence
 
-# Share of the sightings that a repair may drop; frames cut off with theirs do not count, for what stays is whole.
+# Share of the sightings that a repair may drop. Sightings of frames that are cut off do not count.
 MOST_LOST = 0.2
 
 __all__ = ["Audit", "Finding", "audit", "checked_again", "faults"]
@@ -27,9 +27,9 @@ __all__ = ["Audit", "Finding", "audit", "checked_again", "faults"]
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """The sequence after the audit's repairs, and what was found in it, in the order it was checked.
+    """The sequence after the audit's repairs, and the findings in the order in which faults are checked.
 
-    ``undecided`` has the faults that the recording does not allow to judge, and why: they may be there or not.
+    ``undecided`` names the faults that could not be decided from the recording, with the reason.
     """
 
     sequence: Sequence
@@ -61,7 +61,7 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
 
 
 def checked_again(found: Audit, name: str, sequence: Sequence) -> Audit:
-    """Return an audit with one fault, of those that nothing repairs, checked anew in what became of the recording."""
+    """Return an audit with one fault, which must have no repair, checked again in a changed recording."""
     fault = next(fault for fault in _ordered() if fault.name == name)
     findings = tuple(finding for finding in found.findings if finding.fault != name)
     undecided = {key: why for key, why in found.undecided.items() if key != name}

@@ -1,19 +1,17 @@
-"""What a fault is: a name, its place in the order, and a check that describes it and offers a repaired sequence."""
+"""A fault: its name, its place in the order, and a check that describes it and returns a repaired sequence."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-from toolkit.audit.parts.agreement import Agreement, agreement
 from toolkit.audit.parts.alignment import Alignment, alignment
+from toolkit.audit.parts.clocks import TruthClock, truth_clock
 from toolkit.audit.parts.deviations import Fallen, fallen_mps
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
-from toolkit.audit.parts.one_step import OneStep, one_step
+from toolkit.audit.parts.one_step import Agreement, OneStep, agreement, one_step, step_correlation
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.step_correlation import step_correlation
-from toolkit.audit.parts.truth_clock import TruthClock, truth_clock
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -42,7 +40,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Symptom:
-    """What a check found: a count, a description, and the sequence without the fault.
+    """The result of a check: a count, a description, and the sequence without the fault.
 
     ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
     the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks. One
@@ -72,14 +70,14 @@ class Symptom:
 
 @dataclass(frozen=True)
 class Undecided:
-    """That a check could not tell whether its fault is there, and why; one that has nothing to look at says None."""
+    """The result of a check that could not decide, with the reason; a check with nothing to examine returns None."""
 
     why: str
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The sequence as it stands when a fault is checked, with what several checks derive from it.
+    """The sequence at the time a fault is checked, with quantities that several checks derive from it.
 
     ``spoilt_by`` names a fault that is still there and leaves nothing to conclude from the tracks.
     """
@@ -94,12 +92,12 @@ class Evidence:
 
     @cached_property
     def one_step(self) -> OneStep:
-        """What each sighting makes of the next one of its track, by the camera's own motion."""
+        """The residual of each sighting in the next frame, by the camera's own motion."""
         return one_step(self.sequence, self.camera_motion)
 
     @cached_property
     def step_correlation(self) -> Scalar | None:
-        """How neighbouring steps of a track go together; None of too few tracks, or of such without errors."""
+        """The correlation of neighbouring one-step residuals; None with too few tracks, or tracks without errors."""
         return step_correlation(self.sequence, self.one_step)
 
     @cached_property
@@ -134,12 +132,12 @@ class Evidence:
 
     @cached_property
     def alignment(self) -> Alignment | None:
-        """The scale of vision and the place of the camera; None where ``intervals`` is, or where nothing tells them."""
+        """The scale of vision and the position of the camera; None where ``intervals`` is, or they are undetermined."""
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
     def self_calibration(self) -> SelfCalibration | None:
-        """The calibration that fits tracks and IMU; None beside anything else, or where it cannot be found."""
+        """The calibration that fits tracks and IMU; None without an IMU, or where it cannot be found."""
         if self.intervals is None or self.sequence.motion_kind != "imu":
             return None
         return self_calibration(self.sequence, self.camera_motion, self.intervals)
@@ -152,7 +150,7 @@ class Evidence:
 
     @cached_property
     def truth_clock(self) -> TruthClock | None:
-        """The truth's clock beside the frames'; None without a truth, or where nothing can be compared."""
+        """Offset and rate of the truth's clock; None without a truth, or where rotations cannot be compared."""
         truth = self.sequence.truth
         if truth is None or self.spoilt_by or not is_comparable(self.sequence):
             return None
@@ -161,7 +159,7 @@ class Evidence:
         return truth_clock(self.sequence, self.camera_motion, truth)
 
     def after(self, remedy: Sequence) -> "Evidence":
-        """Return the evidence after a repair; what tracks alone show is kept where it left them as they were."""
+        """Return the evidence after a repair; quantities from tracks alone are kept if these did not change."""
         now, before = Evidence(remedy, self.spoilt_by), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
@@ -174,7 +172,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of fault. ``after`` names those checked (and repaired) before it, but for what comes before these."""
+    """One kind of fault. ``after`` names faults that are checked (and repaired) before it."""
 
     name: str
     summary: str

@@ -126,7 +126,7 @@ def diff(options: argparse.Namespace) -> int:
     from toolkit.metrics import known_metrics, metrics_called
     from toolkit.report.differences import diff_document, diff_text, differences
     from toolkit.report.prose import width_of_output
-    from toolkit.report.run_files import read_run
+    from toolkit.report.run_directory import read_run
 
     columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
     found = differences(read_run(options.before), read_run(options.after))
@@ -162,7 +162,7 @@ def reproduce(options: argparse.Namespace) -> int:
     from toolkit.files.documents import to_text
     from toolkit.report.differences import diff_document, differences
     from toolkit.report.export import unpack_bundle
-    from toolkit.report.run_files import read_run
+    from toolkit.report.run_directory import read_run
 
     with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
         there = Path(folder) / "there"

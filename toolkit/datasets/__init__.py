@@ -1,4 +1,4 @@
-"""Read recordings. Every module here is a format or offers built-in sequences, found by being here.
+"""Reads recordings. Every module in this folder is a format or has built-in sequences, and is found by being here.
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
@@ -14,13 +14,13 @@ import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from toolkit.datasets.io.returned import check_types
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, ExtensionError, did_you_mean
@@ -28,12 +28,12 @@ from toolkit.estimate import Trajectory
 from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import Sequence, check_stated
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, check_stated, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Tracks
 
-# So many names of a folder are shown to somebody who asked for one that is not in it.
+# Names of a folder that are listed in the message for a name that is not in it.
 _SHOWN = 8
-# And so many are compared with what was asked for: a folder of images has a hundred thousand.
+# Names that are compared with the requested one: a folder of images may have a hundred thousand.
 _COMPARED = 1000
 
 _ADDRESS = re.compile(r"\w+://")
@@ -182,7 +182,7 @@ def load_sequence(
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
     _check_topics(source, reader, frontend)
-    # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
+    # The checks report bad values of a file, so that NumPy's warnings add nothing.
     with np.errstate(all="ignore"):
         if _of_images(reader, path, frontend):
             sequence = reader.load_from_images(path, frontend, progress)
@@ -193,7 +193,7 @@ def load_sequence(
         if not isinstance(sequence, Sequence):
             file, given = getattr(reader, "__file__", reader), type(sequence).__name__
             raise ExtensionError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
-        check_types(sequence)
+        _check_types(sequence)
         check_stated(sequence)
     return sequence
 
@@ -305,7 +305,7 @@ def _check_readable(path: Path, source: str) -> None:
 
 
 def _nearest_source(path: Path, source: str) -> str:
-    """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
+    """Return the end of a message about a missing source: the nearest name in its folder, or a built-in name."""
     if _ADDRESS.match(str(source)):
         return "; it is an address: download it and name the file"
     if path.parent != Path():
@@ -323,3 +323,22 @@ def _nearest_source(path: Path, source: str) -> str:
 def _some(names: list[str]) -> str:
     shown = sorted(names, key=lambda name: (name.startswith("."), name))[:_SHOWN]
     return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"
+
+
+def _check_types(sequence: Sequence) -> None:
+    """Raise DataError where a part of a loaded sequence has a wrong type, or a table a wrong length."""
+    whose = sequence.name if isinstance(sequence.name, str) else "a recording"
+    parts = {"name": str, "rig": StereoRig, "observations": Observations, "provenance": Provenance}
+    found = {part: (getattr(sequence, part), kind) for part, kind in parts.items()}
+    if isinstance(sequence.rig, StereoRig):
+        of_rig = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")
+        found |= {f"rig.{part}": (getattr(sequence.rig, part), Real) for part in of_rig}
+    for part, (value, kind) in found.items():
+        if not isinstance(value, kind):
+            raise DataError(f"{whose}: its {part} is of type {type(value).__name__}, expected {kind.__name__}")
+    for vector in getattr(sequence.motion, "VECTORS", ()):
+        if len(getattr(sequence.motion, vector)) != sequence.motion.t_ns.size:
+            rows, stamps = len(getattr(sequence.motion, vector)), sequence.motion.t_ns.size
+            raise DataError(f"{whose}: motion.{vector} has {rows} rows, and there are {stamps} stamps")
+    if why := why_not_sightings(sequence):
+        raise DataError(f"{whose}: {why}")

@@ -25,8 +25,8 @@ from toolkit.datasets.io.fields import (
     stamps_ns,
 )
 from toolkit.datasets.io.image_pairs import facts_of, rig_of
+from toolkit.datasets.io.npz_archive import ArrayLayout, Named, corners_of, sparse_array
 from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
-from toolkit.datasets.io.sparse import ArrayLayout, Named, corners_of, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend import (

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
-from toolkit.datasets.io.npz_archive import NpzArchive, array_names, opened
-from toolkit.datasets.io.sparse import corners_of
+from toolkit.datasets.io.npz_archive import NpzArchive, array_names, corners_of, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import TwistSamples

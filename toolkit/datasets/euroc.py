@@ -226,7 +226,7 @@ def _filmed(
         raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
     named = pairs_of_asl(mav0)
     check_one_trigger(mav0, named)
-    listed = named.there(_NEARLY_ALL)
+    listed = named.existing(_NEARLY_ALL)
     if named.pairs and not listed.pairs:
         first = named.pairs[0].left
         raise DataError(

@@ -1,4 +1,4 @@
-"""Which trajectories are there: of which system, on which sequence, in which run; and where each truth is."""
+"""Finds trajectory files by system, sequence and run, and the truth of each sequence."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from toolkit.gate.trajectory_files import files_by_sequence, trajectory_files
 
 @dataclass(frozen=True)
 class Item:
-    """One run of a system on a sequence: a file, or None where the system has none and ought to."""
+    """One run of a system on a sequence: a file, or None where the file is missing."""
 
     system: str
     sequence: str
@@ -32,12 +32,13 @@ _Found = dict[str, dict[str, tuple[Path, ...]]]
 
 
 def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gathered:
-    """Find the runs that some words name: NAME=FILE, FILE, NAME=FOLDER, or FOLDER with a folder a system.
+    """Find the runs that arguments name: NAME=FILE, FILE, NAME=FOLDER, or FOLDER with a folder for each system.
 
     With a truth that is a file there is one sequence, and the files of NAME=FOLDER are runs of it; with a folder of
-    truths SEQUENCE.tum, folders of systems hold SEQUENCE.tum or SEQUENCE/RUN.tum. A system that lacks a sequence
-    another has gets items without a file in their place, as many as it has runs elsewhere; and so does one that has
-    fewer than ``runs`` of a sequence. Raises DataError where a word names nothing, or nothing that has a truth.
+    truths SEQUENCE.tum, folders of systems hold SEQUENCE.tum or SEQUENCE/RUN.tum. A system without a sequence that
+    another system has gets items without a file, as many as it has runs of other sequences; a system with fewer than
+    ``runs`` runs of a sequence gets the missing ones likewise. Raises DataError where an argument names nothing, or
+    nothing that has a truth.
     """
     truths = {_name(truth): truth} if truth.is_file() else _truths_in(truth)
     found = _of_one_sequence(truth, given) if truth.is_file() else _of_folders(given)
@@ -57,12 +58,12 @@ def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gather
 
 
 def _runs_elsewhere(files: Mapping[str, tuple[Path, ...]], sequence: str) -> int:
-    """Return how many runs a system without any of a sequence ought to have: as many as of another one."""
+    """Return how many runs a system without any run of a sequence should have: as many as of another sequence."""
     return 0 if sequence in files else max(map(len, files.values()))
 
 
 def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
-    """Yield which systems have fewer runs of one sequence than of another, for one that crashed may have no file."""
+    """Yield which systems have fewer runs of one sequence than of another: a run that crashed may have left no file."""
     for name, files in found.items():
         counts = {sequence: len(files[sequence]) for sequence in scored if sequence in files}
         most = max(counts.values(), default=0)
@@ -136,7 +137,7 @@ def _left_out(truths: Mapping[str, Path], known: set[str]) -> Iterable[str]:
 
 
 def _named(word: str) -> tuple[str | None, Path]:
-    """Split NAME=PATH; a word that is the path of something, or has no name, is all path."""
+    """Split NAME=PATH; an argument that is an existing path, or has no name, is a path as a whole."""
     name, equals, path = word.partition("=")
     if not equals or not name.strip() or not path or Path(word).exists():
         return None, Path(word)
@@ -144,7 +145,7 @@ def _named(word: str) -> tuple[str | None, Path]:
 
 
 def _existing(path: Path) -> Path:
-    """Return the path; a file that is named and not there is a slip of the pen, and no failure of a system."""
+    """Return the path; raises DataError where it does not exist: a mistyped name is no failure of a system."""
     if not path.exists():
         raise DataError(f"{path}: there is no such file; check the path")
     return path

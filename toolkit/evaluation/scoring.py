@@ -1,4 +1,4 @@
-"""One trajectory file against the truth: matched in time, checked that it belongs to it, scored.
+"""One trajectory file against the truth: matched in time, checked to be of the same recording, scored.
 
 The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so is the rule of association: poses are
 paired on the stamps of the sparser of both, between whose neighbours the other is interpolated. ``max_dt_s`` asks for
@@ -77,22 +77,22 @@ _OF_THE_BODY = (
     *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
     *("end_drift_percent", *_NEES_KEYS),
 )
-# What a truth that repeats one position makes of errors.
+# Remark where the truth repeats one position.
 _OF_POSITIONS = tuple(metric.key for metric in ate.METRICS)
 _STANDS = (
     "the truth stands still, all its positions are one: these are the estimate's own motion, unless it ought to stand"
 )
-# What an estimate that repeats one pose, or leaps, makes of errors. It leaps where it goes so much farther (m) than the
-# truth from one pose to the next, and so many times as far as it does as a rule.
+# Remarks where an estimate repeats one pose, or leaps. It leaps where one of its steps is this much longer (m) than the
+# truth's, and this many times as long as its usual step.
 _STAYS = "the estimate stands still, all its positions are one: it has nothing but the truth's own motion for errors"
 _LOOKS_ONE_WAY = "the estimate's orientations are all one, as where none was written: these are the truth's own turns"
 _OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
 _LEAPS = "the estimate leaps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
-# Frames without stamps are taken to be so far apart where only their order matters.
+# Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
-# So many poses, evenly spread, are enough to compare how a body turns.
+# Number of poses, evenly spread, by which rotations are compared.
 _ENOUGH_TURNS = 1000
 _NONE = "the file states no covariance"
 
@@ -131,7 +131,7 @@ class TruthFile:
 
     @cached_property
     def reference(self) -> Reference:
-        """What shows whether a trajectory is of this sequence."""
+        """The reference by which a trajectory is checked to be of this sequence."""
         return Reference.of_truth(self.name, self.t_ns, self.poses)
 
     @property
@@ -182,7 +182,7 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
 
 
 def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
-    """Remark on an estimate that never moves or turns beside a truth that does, and on one that leaps."""
+    """Remark on an estimate that never moves or turns while the truth does, and on one that leaps."""
     truth, estimate = matched.truth, matched.estimate
     if _changes(truth[:, :3, 3]) and not _changes(estimate[:, :3, 3]):
         return scores.remarked(_OF_POSITIONS, _STAYS)
@@ -198,12 +198,12 @@ def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
 
 
 def _changes(values: Array) -> bool:
-    """Say whether any of values (n, ...) is not the same all along."""
+    """Say whether values (n, ...) change at all."""
     return bool(np.ptp(values, axis=0).max() > 0.0)
 
 
 def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
-    """Return the poses on their stamps, or on the truth's where the file has none and as many lines."""
+    """Return the poses on their stamps, or on the truth's where the file has no stamps but as many lines."""
     if file.t_ns is not None and truth.is_timed:
         return Poses(file.path, file.t_ns + round(offset_s * NS_PER_S), file.T_world_imu)
     if file.t_ns is not None:
@@ -286,7 +286,7 @@ def _or_reason(score: Callable[[AgainstTruth], Scores], pairs: AgainstTruth, met
 
 
 def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> str:
-    """Say how stamps were met where they are not the same: a reader of another tool's number needs to know."""
+    """Say how poses were paired where stamps differ, which is needed to compare with numbers of other tools."""
     if not truth.is_timed:
         return "paired line by line, for the files have no stamps"
     few, many = sorted((estimate.t_ns, truth.t_ns), key=lambda t_ns: t_ns.size)
@@ -321,8 +321,8 @@ def _lines_ns(count: int) -> IntArray:
 def _nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
     """Return the mean NEES of orientation and position over their 3 degrees of freedom, None with the reason.
 
-    In the truth's world where the first pose is plausible there under its own covariances; else it is placed on the
-    truth's, its heading and position alone where the vertical is measured (``level``).
+    They are computed in the truth's world if the first pose is plausible there under its own covariances. Otherwise the
+    first pose is placed on the truth's, by heading and position alone where the vertical is measured (``level``).
     """
     try:
         return _scores(file.covariances, estimate, truth, level=level)

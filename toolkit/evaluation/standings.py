@@ -1,4 +1,4 @@
-"""What many runs on many sequences say together; a run that failed is in every figure, as an infinitely bad one.
+"""Statistics over runs and sequences; a run that failed counts in each of them as infinitely bad.
 
 Over the runs of a system on a sequence: median and quartiles. Over sequences: ranks, and tests of each pair of systems
 by Wilcoxon's signed-rank test on the logarithms of the ratios of their medians (Wilcoxon, Biometrics Bulletin 1, 1945),
@@ -19,7 +19,7 @@ from toolkit.estimate import Status
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
@@ -28,9 +28,9 @@ from toolkit.progress import SILENT, Progress
 
 METRIC_BY_KEY: Mapping[str, Metric] = {metric.key: metric for metric in METRICS}
 RANKED_BY = "ate_se3_m"
-# Processes take a second to start, in which so many files are scored.
+# Processes take a second to start; a single process scores this many files in that time.
 _WORTH_PROCESSES = 200
-# As many signs as are counted exactly; beyond it the smallest p-value is below 1e-300 anyway.
+# Most signs that are counted exactly; beyond it the smallest p-value is below 1e-300 anyway.
 _MOST_EXACT = 1000
 
 
@@ -192,9 +192,9 @@ class EvaluatedSystems:
         return tuple(found) or self.sequences
 
     def _costs(self, system: str) -> Array:
-        """Return what is to be small (sequences,): the median of the metric, infinite where there is none.
+        """Return the cost (sequences,), smaller being better: the median of the metric, infinite where there is none.
 
-        Where the ideal is 1 it is the factor by which it is missed.
+        Where the ideal value is 1, the cost is the factor by which the median differs from it.
         """
         medians = [self.cells[system, sequence].median(self.ranked_by) for sequence in self.ranked_sequences]
         return np.array([np.inf if value is None else _cost(value, self.ranked_by) for value in medians])
@@ -239,8 +239,8 @@ def evaluate(
 ) -> EvaluatedSystems:
     """Score every run, in so many processes where they are many.
 
-    Raises DataError where a truth cannot be used, or not one of the runs can. A run that cannot is failed, with the
-    reason, as is one that covers too little of the truth's time.
+    Raises DataError where a truth cannot be used, or no run can. A single run that cannot be used counts as failed,
+    with the reason, and so does a run that covers too little of the truth's time.
     """
     truths = {name: read_truth(name, path) for name, path in gathered.truths.items()}
     by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
@@ -248,7 +248,7 @@ def evaluate(
     scored: dict[Item, EvaluatedRun] = {}
     processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
     for place, found in results_of(units, processes, _evaluated, progress):
-        if isinstance(found, Lost):
+        if isinstance(found, LostUnit):
             scored |= {item: EvaluatedRun(item, "failed", {}, {}, (found.why,)) for item in units[place].items}
         else:
             scored |= {run.item: run for run in found}
@@ -278,7 +278,7 @@ def _evaluated(unit: _Unit, progress: Progress) -> tuple[EvaluatedRun, ...]:
 
 
 def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:
-    """Score one run; what is wrong with its file is its log, and no error."""
+    """Score one run; a fault of its file goes into its log and is not raised."""
     if item.path is None:
         return EvaluatedRun(item, "failed", {}, {}, ("there is no trajectory",))
     try:
@@ -295,8 +295,8 @@ def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:
 def signed_rank_p(differences: Array) -> float:
     """Return the two-sided p-value of Wilcoxon's signed-rank test, exact whatever ties there are.
 
-    Differences (n,) of zero take no part; of those that are infinite all are equally large. Without any the answer
-    is 1. The distribution of the sum of the ranks over all 2^n signs is counted, ranks doubled to be whole.
+    Differences (n,) of zero are left out; infinite ones are all equally large. Without any difference the result is 1.
+    The distribution of the sum of the ranks over all 2^n signs is counted, ranks doubled to be whole.
     """
     given = differences[differences != 0.0][:_MOST_EXACT]
     if not given.size:

@@ -1,10 +1,10 @@
 """The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or on a cluster.
 
-Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
-kept of it, under a key that code_version is part of) -> references (what other systems estimated) -> pipeline ->
-comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics; disagreement (which
-estimators dispute the measured motion). configuration: a comparison as a file.
-What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
+Reading order: recording (the data) -> units (one run of one estimator) -> workers, cluster (where units run) ->
+outcome_store (results on disk, under a key that code_version is part of) -> references (estimates of other systems) ->
+pipeline -> comparison (the result, with verdicts on stated uncertainty) -> statistics; disagreement (estimators that
+contradict the measured motion). configuration: a comparison as a file. Names of the package are imported when first
+used, because its statistics need neither estimators nor GTSAM.
 """
 
 from importlib import import_module

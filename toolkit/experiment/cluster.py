@@ -1,8 +1,8 @@
 """Units of work on the machines of a Dask cluster, in the place of processes here; the results are the same.
 
-A worker that dies loses the unit it was busy with; the scheduler gives it to another, as often as its configuration
-``distributed.scheduler.allowed-failures`` says, and then it is lost. Every worker is asked for the version of its code,
-whenever it joins: one that runs another would compute something else.
+A worker that dies loses the unit it was busy with; the scheduler gives the unit to another worker, as often as its
+configuration ``distributed.scheduler.allowed-failures`` allows; after that the unit is lost. Every worker reports the
+version of its code when it joins: another version would compute other results.
 """
 
 import re
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from toolkit.errors import VislamError
 from toolkit.experiment.code_version import code_digest, numeric_versions
-from toolkit.experiment.workers import Lost, Needs, Work, nothing_kept
+from toolkit.experiment.workers import LostUnit, Needs, Work, nothing_kept
 from toolkit.progress import SILENT, Progress
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ class Cluster:
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, _needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there; the scheduler chooses the workers.
 
         An error that the work raises ends everything and is raised here. Raises ClusterError where the scheduler goes
@@ -81,7 +81,9 @@ class Cluster:
         try:
             return future.result()
         except KilledWorker as error:
-            return Lost(f"the workers that tried it ended before they answered ({error.allowed_failures + 1} of them)")
+            return LostUnit(
+                f"the workers that tried it ended before they answered ({error.allowed_failures + 1} of them)"
+            )
         except (CancelledError, CommClosedError, TimeoutError) as error:
             raise ClusterError(f"the scheduler at {self._address} went away; repeat with the same --out") from error
 
@@ -122,7 +124,7 @@ def _version() -> Version:
 
 
 def _do(work: Callable[[T, Progress], R], unit: T, version: Version) -> R:
-    """Do a unit of work on a worker, which must run the version of the side that asks."""
+    """Do a unit of work on a worker, which must run the same version as the client."""
     _check_version("that joined", _version(), version)
     return work(unit, SILENT)
 

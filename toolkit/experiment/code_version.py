@@ -1,4 +1,4 @@
-"""What results depend on besides data and settings: the code that makes them, and the packages it calls."""
+"""Versions of the code and of the numeric packages, on which results depend besides data and settings."""
 
 import hashlib
 import platform
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from toolkit import datasets, estimator, metrics
 
-# Distributions by the name a manifest gives them.
+# Distributions by their name in a manifest.
 NUMERIC_PACKAGES = {
     "numpy": "numpy",
     "scipy": "scipy",
@@ -18,7 +18,7 @@ NUMERIC_PACKAGES = {
     "opencv": "opencv-python-headless",
     "numba": "numba",
 }
-# The toolkit's parts above the experiment, which it cannot import: they change no result.
+# The toolkit's layers above the experiment, which it cannot import: they change no result.
 _ABOVE = ("api.py", "cli", "evaluation", "gate", "report", "verify")
 _CODE = (".py", ".so", ".pyd")
 _ANNOUNCED = (estimator.ENTRY_POINT_GROUP, metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP)

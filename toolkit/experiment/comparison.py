@@ -1,19 +1,19 @@
-"""What came of one sequence: every estimator under every seed, scored; the value that every report reads.
+"""The result of a comparison on one sequence: every estimator under every seed, scored. Every report is made from it.
 
-One seed is the common case and many are the same thing repeated: a line of the table is one kind of output of one
-estimator, and what stands in it is the value of the one run or the mean over the runs that are ok.
+A line of the table is one kind of output of one estimator. Its values are those of the single run or, over seeds, the
+means over the runs that are ok.
 
-A line also says whether its runs state more certainty than they have, or less. The NEES of a pose against an
-independent truth is, in a consistent estimator, a chi-square variable over its 6 degrees of freedom (Bar-Shalom, Li and
-Kirubarajan 2001, section 5.4). The poses of a run share their errors in a way nobody knows, so the band of its mean is
-derived for the worst: poses that share one error, whose mean scatters as a single NEES does. However they are
-correlated, a mean of equally distributed variables scatters no more than one of them (it is smaller in convex order:
-Shaked and Shanthikumar, "Stochastic orders", 2007, theorem 3.A.36). Over N seeds, which are independent, the mean has
-the band of N. Without such a truth the innovations are judged in the same way: those of one frame share the error of
-its pose and count as one stereo sighting; those of different frames of a consistent filter are independent. Both bands
-are wide on purpose; docs/metrics.md has what simulated consistent runs make of them. Innovations that are smaller than
-stated behind a gate that refused many of them are no sign of too large a covariance: few large ones and many small ones
-are of a distribution with heavy tails, of which no covariance is right.
+A line also says whether its runs are overconfident or timid. The NEES of a pose against an independent truth is, in a
+consistent estimator, a chi-square variable over its 6 degrees of freedom (Bar-Shalom, Li and Kirubarajan 2001, section
+5.4). The errors of the poses of a run are correlated in an unknown way, so the band of the mean is derived for the
+worst case: all poses share one error, and their mean scatters as a single NEES does. However they are correlated, a
+mean of equally distributed variables scatters no more than one of them (it is smaller in convex order: Shaked and
+Shanthikumar, "Stochastic orders", 2007, theorem 3.A.36). Over N seeds, which are independent, the mean has the band of
+N. Without such a truth the innovations are judged in the same way: those of one frame share the error of its pose and
+count as one stereo sighting; those of different frames of a consistent filter are independent. Both bands are wide on
+purpose; docs/metrics.md says where simulated consistent runs lie in them. Where a gate refused many innovations and the
+others are smaller than stated, the covariance is not marked as too large: few large and many small innovations have a
+distribution with heavy tails, for which no covariance is right.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ NEES, NIS = "nees_pose_mean", "nis_mean"
 class Consistency:
     """The mean over runs of a metric, 1 on average where consistent, and the band of 95 % of consistent estimators.
 
-    ``refused_much`` tells that a gate had taken far more from what the mean is of than of a consistent estimator's.
+    ``refused_much`` says that a gate had refused far more of the innovations than a consistent estimator's gate does.
     """
 
     metric: str
@@ -62,7 +62,7 @@ class Consistency:
 
     @property
     def verdict(self) -> Verdict:
-        """Return what the mean says of the stated uncertainty."""
+        """Return the verdict on the stated uncertainty by the mean."""
         if self.mean > self.high:
             return "contradicted" if self.metric == TREND else "overconfident"
         if self.mean >= self.low:
@@ -73,8 +73,8 @@ class Consistency:
 def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
     """Judge one kind of output of an estimator over one run or several: by NEES where there is one, else by NIS.
 
-    Unless these tell of too much certainty, corrections that lean one way beyond their limit decide. Returns None where
-    there is none of it: no covariance stated, or a final output without an independent truth.
+    Unless these show overconfidence, a correction trend beyond its limit decides. Returns None where none of these is
+    known: no covariance is stated, or a final output has no independent truth.
     """
     scored = list(runs)
     by_errors = _by_errors(scored)
@@ -84,7 +84,7 @@ def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
 
 
 def _contradicted(scored: Sequence[Scored]) -> Consistency | None:
-    """Return by what the corrections of runs lean one way, on average beyond the average of their limits, or None."""
+    """Return the mean correction trend of runs where it is beyond the mean of its limits, or None."""
     trends = [one.scores.values for one in scored if one.scores.values.get(TREND) is not None]
     if not trends:
         return None
@@ -169,7 +169,7 @@ class Row:
 
     @cached_property
     def good(self) -> tuple[Scored, ...]:
-        """What the runs that are ok gave; all that is aggregated is aggregated over these."""
+        """The outputs of the runs that are ok; everything that is aggregated is aggregated over these."""
         given = (o.outputs.get(self.output) for o in self.outcomes if o.status == "ok")
         return tuple(scored for scored in given if scored is not None)
 
@@ -190,7 +190,7 @@ class Row:
         return [v if o.status == "ok" else None for v, o in zip(self.values(key), self.outcomes, strict=True)]
 
     def spread(self, key: str) -> Spread | None:
-        """Return what a metric's values over the runs that are ok say, or None where there is no value."""
+        """Return mean, median and spread of a metric over the runs that are ok, or None where there is no value."""
         return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)
 
     def quantiles_of_all(self, metric: Metric) -> QuantilesOfAll | None:
@@ -212,7 +212,7 @@ class Row:
 
     @cached_property
     def consistency(self) -> Consistency | None:
-        """What the only run, however it ended, or the runs that are ok say of the stated uncertainty, or None."""
+        """The verdict on the stated uncertainty by the only run, or over seeds by the runs that are ok, or None."""
         only = self.outcomes[0].outputs.get(self.output) if len(self.outcomes) == 1 else None
         return consistency_of(self.good if only is None else (only,))
 
@@ -252,9 +252,10 @@ class Comparison:
 
     ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
-    changes against the rung before; ``white`` which estimators take noise of tracks that is stated for white, and why,
-    and ``lacking`` which are without an optional part of the noise model that is asked for, by part. ``undecided`` has
-    the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks, where asked for.
+    changes against the rung before; ``white`` which estimators treat the stated noise of tracks as white, and why;
+    ``lacking`` which estimators lack an optional part of the noise model that the settings ask for, by part.
+    ``undecided`` has the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks,
+    where asked for.
     """
 
     source: str
@@ -308,7 +309,7 @@ class Comparison:
 
     @property
     def hashes(self) -> tuple[str | None, ...]:
-        """The hash of what the estimators read under each seed, None where no run lived to tell it."""
+        """The hash of what the estimators read under each seed, None where no run completed."""
         known = {outcome.seed: outcome.sequence_hash for outcome in self.outcomes if outcome.sequence_hash}
         return tuple(known.get(seed) for seed in self.seeds)
 
@@ -331,5 +332,5 @@ def in_order(outcomes: Iterable[Outcome], estimators: Sequence[str], seeds: Sequ
 
 
 def plain_name(name: str) -> str:
-    """Return a name as one of a file, without blanks, brackets and the like; it may come out empty."""
+    """Return a name that is fit for a file, without blanks, brackets and the like; it may be empty."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._")

@@ -40,7 +40,7 @@ class Configuration(Struct, frozen=True):
 
 
 def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return what a file says of the comparison and of the settings, as nested values not yet checked.
+    """Return the comparison and the settings in a file, as nested values not yet checked.
 
     Raises SettingsError where it is neither TOML nor a manifest that holds settings.
     """

@@ -1,13 +1,13 @@
-"""Where the estimators of one comparison disagree about the measured motion: what no single run of them can tell.
+"""Finds estimators of one comparison that contradict the measured motion, which no single run of them can show.
 
-An estimator that uses no vision has no innovations: nothing in its run shows an odometer that slips or a start that is
-wrong. Those that correct the same motion by vision dispute it in two ways. Their answer parts from it by more than the
-covariances of both allow; for that the covariance of the difference is taken for the sum, and it is no more unless the
-errors are correlated negatively, while two estimators of the same motion from the same start share theirs. Or their
-corrections lean one way (:mod:`toolkit.metrics.correction_trend`). That two estimates differ tells that one is
-inconsistent, not which (Hausman 1978, "Specification tests in econometrics"). Those whose corrections can be judged
-are witnesses: where half of them dispute the motion, those that rest on it are in doubt. One that holds its biases
-parts from a sound motion by what they are, and is none.
+An estimator that uses no vision has no innovations: nothing in its run shows wheel slip or a wrong start. Estimators
+that correct the same motion by vision dispute it in two ways. First, their trajectory may differ from it by more than
+the covariances of both allow. The covariance of the difference is taken to be the sum of both; it is at most that,
+because estimators of the same motion from the same start share errors, which are then not negatively correlated.
+Second, their corrections may have a trend (:mod:`toolkit.metrics.correction_trend`). A difference of two estimates
+shows that one of them is inconsistent, not which (Hausman 1978, "Specification tests in econometrics"). Estimators
+whose corrections can be tested are witnesses: where half of them dispute the motion, estimators that rest on it alone
+are in doubt. An estimator that keeps its biases fixed differs from a sound motion by these biases, and is no witness.
 """
 
 from collections.abc import Iterable
@@ -24,14 +24,15 @@ from toolkit.metrics.correction_trend import NOTHING_CORRECTED, TREND
 from toolkit.models.state import POSE, POSITION, ROTATION
 from toolkit.resampling import NS_PER_S
 
-# Over its degrees of freedom, the squared distance of two consistent estimates of a pose is larger once in a million.
+# Squared distance of two consistent estimates of a pose, over its degrees of freedom, that is exceeded once in a
+# million.
 FARTHEST = float(chdtri(6, 1e-6)) / 6.0
 # Rounding of poses that are known exactly, as the first one may be: m and rad.
 _ROUNDING = 1e-6
 
 
-class Parted(NamedTuple):
-    """Where a row is farthest from the measured motion alone: when (s), by how much, and squared by the covariances.
+class FarthestPose(NamedTuple):
+    """The largest distance of a row from the measured motion alone: time (s), distance, squared Mahalanobis distance.
 
     ``squared`` is divided by its 6 degrees of freedom: 1 on average where both are consistent and independent.
     """
@@ -45,19 +46,20 @@ class Parted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Dispute:
-    """Estimators that rest on the measured motion ``alone``, ``witnesses`` of it, and what disputes it.
+    """Estimators that do not correct the measured motion, the ``witnesses``, and the evidence against the motion.
 
-    The ``parted`` are rows that are too far from it, the ``leaning`` estimators whose corrections lean one way.
+    ``uncorrected`` are the former, ``too_far`` the rows that are too far from the motion, ``with_trend`` the estimators
+    whose corrections have a trend.
     """
 
-    alone: tuple[str, ...]
+    uncorrected: tuple[str, ...]
     witnesses: tuple[str, ...]
-    parted: tuple[Parted, ...]
-    leaning: tuple[str, ...]
+    too_far: tuple[FarthestPose, ...]
+    with_trend: tuple[str, ...]
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Self:
-        """Hold the rows of a comparison against each other; over seeds, where no runs are kept, nobody parts."""
+        """Compare the rows of a comparison; over seeds no runs are kept, and ``too_far`` is empty."""
         rows = [row for row in rows if row.answered]
         uncorrected = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
         others = [row for row in rows if row.estimator not in (one.estimator for one in uncorrected)]
@@ -73,17 +75,17 @@ class Dispute:
     @property
     def disputing(self) -> tuple[str, ...]:
         """Return the witnesses that dispute the measured motion."""
-        parted = {one.row.estimator for one in self.parted}
-        return tuple(name for name in self.witnesses if name in parted or name in self.leaning)
+        too_far = {one.row.estimator for one in self.too_far}
+        return tuple(name for name in self.witnesses if name in too_far or name in self.with_trend)
 
     @property
     def doubts_motion(self) -> bool:
         """Say whether at least half of the witnesses dispute the motion, and others rest on it."""
-        return bool(self.alone and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
+        return bool(self.uncorrected and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
 
 
-def farthest(row: Row, motion: Trajectory) -> Parted | None:
-    """Return where a row is farthest from a trajectory by the covariances of both, or None where these are lacking."""
+def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
+    """Return the largest Mahalanobis distance of a row from a trajectory, or None where a covariance is lacking."""
     other = _trajectory(row)
     if other is None or other.cov is None or motion.cov is None:
         return None
@@ -97,7 +99,7 @@ def farthest(row: Row, motion: Trajectory) -> Parted | None:
     k = int(np.argmax(squared))
     t_s = (motion.t_ns[mine][known][k] - motion.t_ns[0]) / NS_PER_S
     distance_m, angle = np.linalg.norm(apart[known][k, POSITION]), np.linalg.norm(apart[known][k, ROTATION])
-    return Parted(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
+    return FarthestPose(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
 
 
 def _names(rows: Iterable[Row]) -> tuple[str, ...]:

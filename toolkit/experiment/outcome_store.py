@@ -1,8 +1,8 @@
-"""Outcomes that survive: each is added to a file of the run directory as it ends, and is looked up there afterwards.
+"""Outcomes kept on disk: each is added to a file of the run directory as it ends, and is found there afterwards.
 
-What is found again is what was kept, to the bit; an outcome of other data, settings or code has another key and is
-never taken for one asked for. A run whose process died is not kept: it is tried again. A line of the file
-``outcomes.jsonl`` holds one outcome, exactly, and all that it depends on (docs/scaling.md).
+An outcome is read back exactly as it was kept. An outcome of other data, settings or code has another key and is never
+returned instead. A run whose process died is not kept: it is tried again. A line of the file ``outcomes.jsonl`` holds
+one outcome, exactly, and all that it depends on (docs/scaling.md).
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from toolkit.geometry import Array
 from toolkit.metrics import Scores, repeated, without_requests
 from toolkit.settings import Settings, as_values
 
-# JSON has no word for these; null stands for NaN.
+# JSON has no such numbers; null stands for NaN.
 Infinite = Literal["inf", "-inf"]
 Number = float | Infinite | None
 Series = Annotated[tuple[Number, ...], Meta(description="one a frame; null where unknown")]
@@ -39,7 +39,7 @@ _FILES_START = b'{"schema":"vislam.outcome-files/1"'
 
 
 class UnitKey(Struct, frozen=True, kw_only=True):
-    """All that an outcome depends on: equal keys give equal outcomes, but for the times."""
+    """Everything that an outcome depends on: equal keys give equal outcomes, except for the times."""
 
     data: Annotated[str, Meta(description="SHA-256 of the recording as it is read under seed 0")]
     seed: int
@@ -218,7 +218,7 @@ class Conditions:
     keep: frozenset[str] = frozenset()
 
     def key(self, unit: Unit) -> UnitKey:
-        """Return all that the outcome of a unit depends on."""
+        """Return everything that the outcome of a unit depends on."""
         return UnitKey(
             data=self.data,
             seed=unit.seed,
@@ -230,13 +230,13 @@ class Conditions:
         )
 
     def fit(self, key: UnitKey) -> bool:
-        """Say whether a unit of the case, of some seed, estimator and settings, may have a key."""
+        """Say whether a key can be that of a unit of this case, with some seed, estimator and settings."""
         ours = (self.data, tuple(sorted(self.keep)), code_digest(), numeric_versions())
         return (key.data, key.keep, key.code, key.versions) == ours
 
 
 def _settings_of_a_run(settings: Settings, estimator: str) -> dict[str, object]:
-    """Return the settings that reach a run; which seeds there are and which metrics are asked for does not."""
+    """Return the settings that a run depends on: all but the number of seeds and the requested metrics."""
     values = as_values(settings)
     for name in ("first_seed", "seeds", "metrics"):
         del values[name]
@@ -269,7 +269,7 @@ class OutcomeStore:
 
     @property
     def unusable(self) -> int:
-        """Return how many outcomes are there of other data, code or repairs, which no unit of the case can have."""
+        """Return how many outcomes are of other data, code or repairs, so that no unit of the case can use them."""
         of_others = (not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
         return self._unchecked + sum(of_others)
 
@@ -279,8 +279,8 @@ class OutcomeStore:
         return self._lines is not None
 
     def find(self, unit: Unit) -> Outcome | None:
-        """Return the outcome of a unit with all that is asked of it, or None."""
-        if unit.build is not None:  # a function, which nobody can tell from another of its name
+        """Return the outcome of a unit with everything that is requested of it, or None."""
+        if unit.build is not None:  # a function, which cannot be told from another of its name
             return None
         metric_keys = unit.settings.metrics.requested()
         for record in self._records.get(self._conditions.key(unit).text(), []):

@@ -20,7 +20,7 @@ from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, 
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
-from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
+from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
@@ -156,8 +156,8 @@ def _prepare(recording: Recording, progress: Progress) -> Prepared:
     return prepare(recording, progress)
 
 
-def _unless_lost(result: Prepared | Lost, recording: Recording) -> Prepared:
-    if isinstance(result, Lost):
+def _unless_lost(result: Prepared | LostUnit, recording: Recording) -> Prepared:
+    if isinstance(result, LostUnit):
         raise DataError(f"{_name(recording.source)}: while it was loaded {result.why}; is there memory enough?")
     return result
 
@@ -195,8 +195,8 @@ def comparisons(
 ) -> Iterator[Comparison]:
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
-    What the ``stores``, one a case, have already is not run again. An estimator that fails is a row that says so.
-    Raises DataError where a recording cannot be used under a seed.
+    Outcomes that the ``stores``, one a case, have already are not run again. An estimator that fails is a row that says
+    so. Raises DataError where a recording cannot be used under a seed.
     """
     entries = find_all(plan.estimators)
     kept_in = stores or [NOWHERE] * len(cases)
@@ -247,7 +247,7 @@ def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]
     source = case.source if plan.scheduler is None else _located(case.source)
     single = len(plan.seeds) == 1
     for seed in plan.seeds:
-        # What is ready here is not made ready again, but a cluster's workers had to be sent all of it.
+        # Processes here use the prepared recording; workers of a cluster prepare it themselves and need not be sent it.
         is_ready = single or (seed == plan.seeds[0] and plan.scheduler is None)
         recording = case.prepared if is_ready else plan.recording(source, seed)
         for name in names:
@@ -256,13 +256,13 @@ def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]
 
 
 def _located(source: str | Recorded) -> str | Recorded:
-    """Return a path where it leads from here, anything else as it is."""
+    """Return a path as an absolute path, anything else unchanged."""
     if isinstance(source, Recorded) or source in built_ins():
         return source
     return str(Path(source).expanduser().absolute())
 
 
-def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:
+def _outcome(result: Outcome | LostUnit, unit: Unit, store: Store) -> Outcome:
     if isinstance(result, Outcome):
         return store.keep(unit, result)
     return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
@@ -293,14 +293,14 @@ def _comparison(
 
 
 def _taken_for_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
-    """Return which estimators take the noise of tracks for white whatever the rig states, and why."""
+    """Return which estimators treat the noise of tracks as white whatever the rig states, and why."""
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
 
 def lacking(
     entries: Mapping[str, EstimatorEntry], noise: Noise, decisive: frozenset[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Return, for each optional part of the noise model that is asked for and decisive, the estimators without it."""
+    """Return, for each optional part of the noise model that is requested and matters, the estimators without it."""
     requested = {
         "disparity_scale": noise.disparity_scale is not None,
         "bridge_gaps": noise.bridge_gaps,
@@ -311,14 +311,14 @@ def lacking(
 
 
 def decisive_parts(prepared: Prepared) -> frozenset[str]:
-    """Return the optional parts of the noise model without which answers on a recording may be others."""
+    """Return the optional parts of the noise model that can change estimates on a recording."""
     correlated = any(finding.fault == "correlated-tracks" for finding in prepared.findings)
     known = {"disparity_scale": True, "bridge_gaps": to_bridge(prepared.sequence), "match_tracks": correlated}
     return frozenset(part for part, decides in known.items() if decides)
 
 
 def to_bridge(sequence: Recorded) -> bool:
-    """Say whether a sequence has measured twists and an interval without a common track, as a bridge wants it."""
+    """Say whether a sequence has measured twists and an interval without a common track, which a bridge needs."""
     seen, count = sequence.visible, sequence.frame_count
     key = seen.track_id * (count + 1) + seen.frame
     tied = np.unique(seen.frame[np.isin(key + 1, key)])

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from toolkit.audit import Audit, Finding, audit, checked_again
-from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
@@ -36,7 +36,7 @@ STARTS: dict[Start, Callable[[Sequence], Prior]] = {
 class Part:
     """Which frames of a recording are used: seconds after its first frame, ends included, and one frame in so many.
 
-    Motion samples and truth stay whole. Raises SettingsError for a time or a step that is no part of anything.
+    Motion samples and truth stay whole. Raises SettingsError for a time or a step that selects nothing.
     """
 
     from_s: float = 0.0
@@ -61,12 +61,12 @@ WHOLE = Part()
 
 @dataclass(frozen=True)
 class Recording:
-    """A source under one seed, and what is made of it before an estimator sees it.
+    """A source under one seed, and how it is prepared before an estimator reads it.
 
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
-    reports and leaves as they are. ``part`` is what is used of it, ``max_frames`` the first frames of that;
-    ``duration_s`` cuts it before, and a simulation of ``duration_s`` is made that long. ``vary`` says what the seed
-    draws of a simulation; ``card`` asks for the card of its tracks, which comes with a fitted noise in any case.
+    reports and leaves as they are. ``part`` selects the frames that are used, ``max_frames`` the first of these;
+    ``duration_s`` cuts the recording before that, and a simulation is made that long. ``vary`` says which parts of a
+    simulation the seed draws; ``card`` requests the card of its tracks, which a fitted noise always includes.
     """
 
     source: str | Sequence
@@ -86,7 +86,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A recording as the estimators read it, what the audit found in it before, and the state they start from.
+    """A recording as the estimators read it, the findings of the audit in it before, and the state they start from.
 
     ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why;
     ``card`` is that of the tracks the noise was fitted to.
@@ -130,7 +130,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:
-    """Return a finding as it concerns the part that is run: a warning of other times is none of its results."""
+    """Return a finding for the part that is run: a warning about other times does not concern its results."""
     first_ns, last_ns = sequence.frames_t_ns[[0, -1]].tolist()
     if not finding.spans_ns or any(begin <= last_ns and end >= first_ns for begin, end in finding.spans_ns):
         return finding
@@ -138,13 +138,13 @@ def _of_part(finding: Finding, sequence: Sequence) -> Finding:
 
 
 def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:
-    """Load a recording and audit it whole: slow faults (a bias, a lag) show better so. Raises as :func:`prepare`.
+    """Load a recording and audit it whole, which shows slow faults (a bias, a lag) better. Raises as :func:`prepare`.
 
-    A simulation whose errors are as it states them is audited as far as it is run, but so far at least as tells as much
-    as the whole of it; only where something is found there is it audited whole.
+    A simulation of a scenario with ``audited_s`` is audited only over the part that is run, or over a longer part that
+    is enough to find what the whole would show. Where something is found there, the whole is audited.
     """
     sequence = _loaded(recording, progress)
-    # The audit looks for what is not finite: what NumPy would say of it on the way says nothing more.
+    # The audit itself reports values that are not finite, so that NumPy's warnings about them add nothing.
     with np.errstate(all="ignore"):
         beginning = _to_audit(sequence, recording)
         found = audit(beginning, recording.keep)
@@ -154,7 +154,7 @@ def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audi
 
 
 def _to_audit(sequence: Sequence, recording: Recording) -> Sequence:
-    """Return a recording; of a simulation, where its scenario says what tells enough, that and what is run of it."""
+    """Return a recording; of a simulation whose scenario says how much is enough, that much or the part that is run."""
     scenario = SCENARIOS.get(recording.source) if isinstance(recording.source, str) else None
     if scenario is None or scenario.audited_s is None:
         return sequence
@@ -213,7 +213,7 @@ def _first_seconds(sequence: Sequence, duration_s: float) -> Sequence:
 
 
 def _part(sequence: Sequence, part: Part) -> Sequence:
-    """Return a part of the frames, which the facts tell; raises DataError where it has no two."""
+    """Return a part of the frames, recorded in the facts; raises DataError where it has fewer than two."""
     end_s = np.inf if part.to_s is None else part.to_s
     kept = np.flatnonzero((sequence.frames_s >= part.from_s) & (sequence.frames_s <= end_s))[:: part.every]
     if kept.size < 2:
@@ -230,7 +230,7 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
 def _with_truth_at_frames(sequence: Sequence) -> Sequence:
     """Return a sequence that lacks frames with the truth at those it has, where it has one at each of them.
 
-    Between frames so far apart an estimate would be interpolated to be scored, and err by that.
+    Otherwise estimates would be interpolated between frames far apart, and their scores would include that error.
     """
     truth = sequence.truth
     if truth is None or not np.isin(sequence.frames_t_ns, truth.t_ns).all():
@@ -253,7 +253,7 @@ def _with_noise(sequence: Sequence, requested: Noise) -> Sequence:
 
 
 def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
-    """Return the sequence with a budget of tracks a frame for estimators, if there is one, which the facts tell."""
+    """Return the sequence with a budget of tracks a frame for estimators, if there is one, recorded in the facts."""
     if budget is None:
         return sequence
     thinned = replace(sequence, track_budget=budget)
@@ -264,7 +264,7 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
 
 
 def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, float]:
-    """Return the sequence without the sightings that move against the rest, which the facts tell, and their share."""
+    """Return the sequence without the sightings that move against the rest, recorded in the facts, and their share."""
     at_rest, counts = without_moving_tracks(sequence, prior)
     share = counts.sightings / max(counts.of_sightings, 1)
     fact = (
@@ -278,7 +278,7 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
-    """Return what was found, with the tracks held against the noise that the settings state in the place of another."""
+    """Return the audit's findings, with the tracks tested against the noise that the settings state instead."""
     with np.errstate(all="ignore"):
         return checked_again(audited, "track-scatter", used)
 
@@ -290,7 +290,7 @@ def _stated_track_noise(requested: Noise) -> TrackNoise:
 
 
 def _with_doubts(whole: Sequence, used: Sequence) -> Sequence:
-    """Return the whole recording; a fact tells where the tracks that are used contradict the noise that was stated."""
+    """Return the whole recording, with a fact where the tracks that are used contradict the stated noise."""
     assert used.rig.track_noise is not None
     doubt = contradicted(used.rig.track_noise, used)
     if doubt is None:

@@ -1,4 +1,4 @@
-"""What other systems estimated from a recording, as runs that were not made here."""
+"""Estimates of other systems from a recording, as runs that were not made here."""
 
 from collections.abc import Mapping
 
@@ -29,13 +29,13 @@ _AS_FINAL = "it stands as final, for a file does not tell whether its poses know
 
 
 def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each estimate that a recording brings, with what it says of the frames as causal output."""
+    """Return a run for each estimate in a recording, with its poses at the frames as causal output."""
     read = "read from a file of the recording"
     return tuple(_run(name, trajectory, sequence, "causal", read) for name, trajectory in references.items())
 
 
 def external_runs(files: Mapping[str, PosesFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each trajectory file, with what it says of the frames as final output.
+    """Return a run for each trajectory file, with its poses at the frames as final output.
 
     ``recording`` is the whole of it, of which ``sequence`` may be a part. Raises DataError where a file
     is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
@@ -71,7 +71,7 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
 
 
 def _of_another_scale(trajectory: Trajectory, sequence: Sequence) -> list[str]:
-    """Remark on steps that are longer or shorter than those that the stereo tracks alone show, where no truth tells."""
+    """Remark, where there is no truth, on steps that are longer or shorter than the stereo tracks alone show."""
     found = steps_beside_camera(sequence, Truth(trajectory.t_ns, trajectory.T_world_imu))
     if found is None:
         return []

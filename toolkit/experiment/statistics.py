@@ -1,9 +1,9 @@
-"""What many seeds say together: every metric's mean, median and spread, and the NEES averaged over the seeds.
+"""Statistics over seeds: every metric's mean, median and spread, and the NEES averaged over the seeds.
 
-A mean is over the runs that ended well; quartiles over all runs have the others in them, as infinitely bad ones.
+A mean is over the runs that ended well; quartiles over all runs count the others as infinitely bad.
 
-Two estimators are compared in pairs, for under each seed they read the same recording (Montgomery, "Design and analysis
-of experiments", 2013, sections 2.4 and 2.5).
+Two estimators are compared in pairs, because under each seed they read the same recording (Montgomery, "Design and
+analysis of experiments", 2013, sections 2.4 and 2.5).
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
 over N independent runs the mean NEES of a consistent estimator stays within the chi-square band for N runs.
@@ -23,7 +23,7 @@ from toolkit.metrics.parts.scores import Best
 
 @dataclass(frozen=True)
 class Spread:
-    """What the n values of a metric say together; ``std`` (n - 1 in its divisor) is None for a single one."""
+    """Mean, median and spread of the n values of a metric; ``std`` (n - 1 in its divisor) is None for a single one."""
 
     n: int
     mean: float
@@ -39,7 +39,7 @@ class Spread:
 class QuantilesOfAll:
     """Quartiles over n runs of which ``bad`` did not end well; None where so many are bad that they decide it.
 
-    A run that did not end well counts as infinitely bad: what it scored until then says nothing of where it would go.
+    A run that did not end well counts as infinitely bad: its score until then does not show how it would have gone on.
     """
 
     n: int
@@ -55,7 +55,7 @@ class QuantilesOfAll:
         return f"{self.bad} of {self.n} runs did not end well, and each counts as infinitely bad" if lacking else ""
 
 
-# How often chance alone tells two equal estimators apart, and how often enough seeds tell different ones apart.
+# Level of the test (false alarms for equal estimators), and power to be reached with enough seeds.
 _LEVEL, _POWER = 0.05, 0.9
 
 

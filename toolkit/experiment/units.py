@@ -54,7 +54,7 @@ class Scored:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """How one estimator fared under one seed; ``outputs`` lacks the kinds of output it did not give.
+    """The result of one estimator under one seed; ``outputs`` lacks the kinds of output it did not give.
 
     ``sequence_hash`` is that of the recording it read; ``run`` is there where it was asked for. ``final_is_causal``
     tells that the final output only repeats the causal one, as a filter's does. ``tum`` has, where they are to be kept,
@@ -84,13 +84,13 @@ class Outcome:
 
 
 def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
-    """Return what computed in some outcomes of an estimator; None where it has NumPy alone, or never ran."""
+    """Return whether compiled code or NumPy ran in outcomes of an estimator; None without compiled code or any run."""
     ran = {outcome.arithmetic for outcome in outcomes} - {None}
     return "both" if len(ran) > 1 else next(iter(ran), None)
 
 
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
-    """Run the estimator of a unit and score what it gave.
+    """Run the estimator of a unit and score its outputs.
 
     Raises DataError where the recording cannot be used, EstimatorError where the estimator cannot be used.
     """
@@ -167,6 +167,6 @@ def _nis_dof(evaluation: Evaluation) -> float | None:
 
 
 def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) -> None:
-    """Enter values (n,) at stamps (n,) into a series (K,) by frame; what belongs to no frame is left out."""
+    """Enter values (n,) at stamps (n,) into a series (K,) by frame; stamps of no frame are left out."""
     row, is_frame = rows_of(t_ns, frames_t_ns)
     series[row[is_frame]] = values[is_frame]

@@ -1,11 +1,11 @@
 """Units of work side by side, in processes of one numeric thread each (loky's).
 
-A process that dies takes the unit it was busy with along and nothing else: that unit is tried once more when all others
-are done, with nothing beside it, and is lost where its process dies again. Units that need the same recording go to
-the process that has it ready, as long as there is other work for the others.
+When a process dies, only its current unit is affected: the unit is tried once more when all others are done, with no
+other process running, and is lost if its process dies again. Units that need the same recording go to the process that
+has it prepared, as long as there is other work for the others.
 
-An interrupt is the parent's alone to handle: it ends the processes it started, and where it is itself killed they end
-by themselves. Loky's processes do not run the caller's main module again, so a script needs no guard.
+Only the parent handles interrupts: it ends the processes it started. If the parent itself is killed, they end by
+themselves. Loky's processes do not run the caller's main module again, so a script needs no guard.
 """
 
 import os
@@ -36,17 +36,17 @@ from toolkit.threads import THREAD_VARIABLES
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T, Progress], R]
-# Equal for units that use what a process keeps ready of one for the next; None where it keeps nothing.
+# Key of the data that a process keeps from one unit for the next; equal keys share it. None where nothing is kept.
 Needs = Callable[[T], Hashable]
 
-# Loky takes growth by 300 MB for a leak and begins the process anew; a recording and a smoother's graph are none.
+# Loky takes growth by 300 MB for a leak and restarts the process; a recording and a smoother's graph are no leak.
 _ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
 _PARENT_POLL_S, _POLL_S = 1.0, 0.1
 # Signals that a terminal sends to every process of its group, and that the parent alone handles.
 _OF_A_TERMINAL = (signal.SIGINT, signal.SIGHUP)
-# How far a unit has come, as its process writes it and the parent reads it.
+# Progress of a unit, written by its process and read by the parent.
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
-# Shown for each unit: its frames take the first half, what a smoother does in the end the second.
+# Progress steps of each unit: its frames are the first half, a smoother's final solve the second.
 _STEPS = 100
 
 
@@ -57,13 +57,13 @@ class WorkerProcess:
         self._executor: ProcessPoolExecutor | None = None
 
     def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
-        """Have the process do some work after what it has to do already; where it dies, BrokenProcessPool is raised.
+        """Queue work for the process; BrokenProcessPool is raised where the process dies.
 
-        A signal waits until the process is started: half-made, what it shares would be left behind and be told of.
-        Raises SystemLimitError where the system lets no process be started.
+        Signals are held back until the process is started; otherwise resources of a half-started process would be left
+        behind. Raises SystemLimitError where the system lets no process be started.
         """
         with uninterrupted(), _interrupts_held_back(), _refusals_shown():
-            # Started with the first process, Python's own tracker would let interrupts through to it again.
+            # Python's resource tracker unblocks interrupts when it starts, so it is started before the first process.
             resource_tracker.ensure_running()
             if self._executor is None:
                 self._executor = _executor()
@@ -83,7 +83,7 @@ class WorkerProcess:
 
 
 def how_it_ended(error: BrokenProcessPool) -> str:
-    """Return how a process ended, of what loky says of it."""
+    """Return how a process ended, from loky's message."""
     named = re.search(r"exit codes of the workers are \{(\w+)\((-?\d+)\)", str(error))
     if named is None:
         return "ended"
@@ -95,7 +95,7 @@ def _executor() -> ProcessPoolExecutor:
 
 
 def _begin(parent: int) -> None:
-    """Leave interrupts to the parent, and end where it ends; the whole of a process' preparation."""
+    """Prepare a process: leave interrupts to the parent, and end when the parent ends."""
     for number in _OF_A_TERMINAL:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_A_TERMINAL)
@@ -111,10 +111,10 @@ def _end_with(parent: int) -> None:
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """Keep from processes started here what a terminal sends to all of its group: Ctrl-C, and that it is closed.
+    """Keep signals that a terminal sends to its whole process group (Ctrl-C, hang-up) from processes started here.
 
-    A signal that comes meanwhile is delivered afterwards. Loky's tracker of what is shared ignores Ctrl-C alone and
-    stays with the other one held back: were it to die of it, the next one would tell what it does not know.
+    A signal that comes meanwhile is delivered afterwards. Loky's resource tracker ignores Ctrl-C by itself, and keeps
+    the hang-up signal blocked: if it died, its successor would warn about resources that it does not know.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_A_TERMINAL)
     try:
@@ -125,7 +125,7 @@ def _interrupts_held_back() -> Iterator[None]:
 
 @contextmanager
 def _refusals_shown() -> Iterator[None]:
-    """Raise SystemLimitError for what the system refuses to a new process: it needs files, and room in /dev/shm."""
+    """Raise SystemLimitError where the system cannot start a process, which needs open files and room in /dev/shm."""
     try:
         yield
     except (OSError, ImportError) as error:  # the latter where the system has no semaphores at all
@@ -137,8 +137,8 @@ def _refusals_shown() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Lost:
-    """What became of a unit whose process died twice: how, in words."""
+class LostUnit:
+    """The result of a unit whose process died twice: how the process ended, in words."""
 
     why: str
 
@@ -149,13 +149,13 @@ def usable_cpus() -> int:
 
 
 def nothing_kept(_unit: object) -> Hashable:
-    """Return that units need nothing which one leaves ready for the next."""
+    """Return None: units share no data."""
     return None
 
 
 def results_of(
     units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-) -> Generator[tuple[int, R | Lost], None, None]:
+) -> Generator[tuple[int, R | LostUnit], None, None]:
     """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress, needs)
@@ -174,7 +174,7 @@ class Pool(Protocol):
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there; an error of the work is raised."""
 
 
@@ -207,7 +207,7 @@ class Workers:
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there.
 
         An error that the work raises ends everything and is raised here.
@@ -246,20 +246,20 @@ class _Share:
 
 
 def _share_done(stages: Any, done: Any, total: Any) -> Any:
-    """Return how many of its steps a unit has done, or units (n,)."""
+    """Return how many of its steps a unit, or units (n,), have done."""
     half = _STEPS // 2
     return half * done // np.maximum(total, 1) + half * (np.asarray(stages) > 0)
 
 
 def _step_label(stage: str, done: int) -> str:
-    """Return what a smoother does in the end, nothing where it has not come to that."""
+    """Return the name of a smoother's current step at the end; empty before that."""
     return f"{stage}, iteration {done + 1}" if stage else ""
 
 
 class _HandingOut(Generic[R]):
-    """Gives each process its next task as soon as it is free, however busy the reader of the results is (a thread).
+    """A thread that gives each process its next task as soon as it is free, independent of the reader of the results.
 
-    ``tasks`` are functions with their arguments, ``needs`` what a process keeps ready for each.
+    ``tasks`` are functions with their arguments, ``needs`` the keys of the data that processes keep for them.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class _HandingOut(Generic[R]):
         self._stopped.set()
         self._thread.join()
 
-    def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | Lost], None, None]:
+    def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of each task as it is there, and call ``meanwhile`` while there is none."""
         died = []
         for _ in self._tasks:
@@ -290,7 +290,7 @@ class _HandingOut(Generic[R]):
             else:
                 yield place, result
         for place in died:
-            yield place, self._alone(place, meanwhile)
+            yield place, self._retry_alone(place, meanwhile)
 
     def _next_answer(self, meanwhile: Callable[[], None]) -> tuple[int, "Future[R]"]:
         while True:
@@ -303,7 +303,7 @@ class _HandingOut(Generic[R]):
                 raise answer
             return answer
 
-    def _alone(self, place: int, meanwhile: Callable[[], None]) -> R | Lost:
+    def _retry_alone(self, place: int, meanwhile: Callable[[], None]) -> R | LostUnit:
         """Try a task once more, in a process of its own."""
         process = WorkerProcess()
         try:
@@ -312,7 +312,7 @@ class _HandingOut(Generic[R]):
                 meanwhile()
             return future.result()
         except BrokenProcessPool as error:
-            return Lost(f"its process {how_it_ended(error)} before it answered")
+            return LostUnit(f"its process {how_it_ended(error)} before it answered")
         finally:
             process.end()
 
@@ -331,7 +331,7 @@ class _HandingOut(Generic[R]):
                     place, process = busy.pop(future)
                     free.append(process)
                     self._answers.put((place, future))
-        except Exception as error:  # whatever it is, the reader of the results is to meet it
+        except Exception as error:  # any error is raised where the results are read
             self._answers.put(error)
 
     def _next_for(self, process: WorkerProcess) -> int:
@@ -347,7 +347,7 @@ class _HandingOut(Generic[R]):
 
 
 class _Board:
-    """How far each unit has come, in a file that the processes write."""
+    """Progress of each unit, in a file that the processes write."""
 
     def __init__(self, path: Path, count: int) -> None:
         self.path, self.total = path, _STEPS * count
@@ -359,7 +359,7 @@ class _Board:
         self._under_way[place] = False
 
     def progress(self) -> tuple[int, int, str]:
-        """Return the steps that are done, of how many, and what the first smoother that has come to its end does."""
+        """Return the steps done, of how many, and the current step of the first smoother in its final solve."""
         entries = np.array(self._entries[: self._under_way.size])[self._under_way]
         shares = _share_done(entries["stages"], entries["done"], entries["total"])
         ending = entries[entries["stage"] != b""][:1]

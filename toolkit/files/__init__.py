@@ -1,4 +1,4 @@
-"""Files that come in and go out, each in one way, with an error that says what stands in the way and what to do.
+"""Reading and writing of files, each in one way, with errors that say what is wrong and what to do.
 
 Read ``reading`` (regular files only), ``writing`` (whole or not at all), then ``documents``: JSON as typed records.
 """

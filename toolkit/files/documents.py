@@ -2,7 +2,7 @@
 
 A record is a frozen ``msgspec.Struct`` whose first field, ``schema``, is the document's name and version. Its types,
 their bounds and its ``__post_init__`` are the contract: what breaks one of them is refused on reading, with the file
-and the place in it. Fields a record does not know are passed over, for a later version may add some.
+and the place in it. Unknown fields are ignored, because a later version may add some.
 """
 
 import json
@@ -23,11 +23,11 @@ Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
 Older = Mapping[str, Callable[[Json], Json]]
 Count = Annotated[int, Meta(ge=0)]
-# Of a metric; a count stays an integer when it is read and written again.
+# A value of a metric; a count stays an integer when it is read and written again.
 Value = int | float | None
 
 _DIGITS = 6
-# What msgspec calls a type, in JSON's words.
+# JSON's names of the types in msgspec's messages.
 _KINDS = {
     "int": "integer",
     "float": "number",
@@ -49,7 +49,7 @@ def _as_it_is(value: Any) -> Any:
 
 
 def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is, **given: Any) -> Record:
-    """Return the record whose fields are given, or ``made`` of the attributes that a value has of the same names."""
+    """Return the record with the given fields and, for the others, the value's attributes of the same names."""
     rest = [name for name in record.__struct_fields__ if name not in given]
     return record(**given, **{name: made(getattr(value, name)) for name in rest})
 
@@ -60,7 +60,7 @@ def rounded(value: float) -> float:
 
 
 def number(value: float) -> float | None:
-    """Return a value with six digits, or None where it is not finite, for JSON has no word for that."""
+    """Return a value with six digits, or None where it is not finite, which JSON cannot express."""
     return rounded(value) if math.isfinite(value) else None
 
 
@@ -134,7 +134,7 @@ def schema(record: type[msgspec.Struct]) -> Json:
 
 
 class _NotFinite:
-    """What stands in a document in place of NaN or infinity, which JSON does not have: it is of no record's type."""
+    """Placeholder for NaN or infinity in a document, which JSON does not allow: no record accepts its type."""
 
     def __init__(self, written: str) -> None:
         self._written = written
@@ -158,7 +158,7 @@ def _schema_of(document: object) -> object:
 
 
 def readable(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:
-    """Say what is wrong and where, with the keys that msgspec leaves out of its paths."""
+    """Return a message that says what is wrong and where, with the keys that msgspec leaves out of its paths."""
     what, path = _parts(why)
     steps = _place(path, document, record)
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps).removeprefix(".")
@@ -167,7 +167,7 @@ def readable(why: msgspec.ValidationError, document: object, record: type[msgspe
 
 
 def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
-    """Return what msgspec says, and the path at which: of a key, that of the object it is in."""
+    """Return msgspec's message and its path; for a wrong key, the path of the object that it is in."""
     placed = _PLACED.fullmatch(str(why))
     return (placed["what"], placed["path"]) if placed else (str(why), "")
 
@@ -216,9 +216,9 @@ def _each(kind: inspect.Type) -> Iterator[inspect.Type]:
 
 
 def _place(path: str, document: object, record: type[msgspec.Struct]) -> tuple[str | int, ...]:
-    """Return the steps to what is wrong, in which every entry of an object is named if it can be told.
+    """Return the steps to the wrong value, with the key of every entry of an object where it can be found.
 
-    Of an object's entries the wrong one is that which, alone in the object, is refused at the same path.
+    The wrong entry of an object is the one that, alone in the object, is refused at the same path.
     """
     steps: list[str | int] = []
     value: Any = document

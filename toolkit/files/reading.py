@@ -1,6 +1,6 @@
-"""Files that come in, opened in one way: regular files only, and an error that says what stands in the way.
+"""Input files are opened in one way: regular files only, with an error that says what is wrong.
 
-A pipe would be waited for without end, and a device may never end.
+Reading a pipe may wait forever, and a device may never end.
 """
 
 import errno
@@ -66,7 +66,7 @@ def check_regular(path: Path) -> None:
 
 
 def is_regular(path: Path) -> bool:
-    """Say whether a path is a regular file that can be looked at, whatever else stands there."""
+    """Say whether a path is a regular file; False where it cannot be examined."""
     try:
         return stat.S_ISREG(path.stat().st_mode)
     except (OSError, ValueError):

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from toolkit.errors import OutputError
 
-# Returns what in a directory was written by us and may be replaced: files by their relative path, folders with a slash.
+# Returns the entries of a directory that the toolkit wrote and may replace: relative paths, folders with a slash.
 Owner = Callable[[Path], Collection[str]]
-# What asks a program to end; one that comes while something is put in its place waits until that is done.
+# Signals that ask a program to end; while a result is moved to its place they are held back.
 _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# What a table of numbers may begin with: a comment, a sign, a digit.
+# First characters of a table of numbers: a comment, a sign, a digit.
 _OF_TABLES = tuple(c.encode() for c in "#+-.0123456789")
 
 
@@ -46,7 +46,7 @@ def check_parent(directory: Path) -> None:
 
 
 def _check_ours(directory: Path, owner: Owner, named: Path) -> None:
-    """Raise OutputError, which calls the directory ``named``, for the first thing in it that we did not write."""
+    """Raise OutputError, which calls the directory ``named``, for the first entry that the toolkit did not write."""
     ours = owner(directory)
     for entry in sorted(directory.rglob("*")):
         name = entry.relative_to(directory).as_posix()
@@ -59,7 +59,7 @@ def _check_ours(directory: Path, owner: Owner, named: Path) -> None:
 
 
 def _probe(target: Path) -> None:
-    """Make what a directory needs to be written, as deep and with names as long, and take it away again."""
+    """Test that a result can be written: create and remove entries as deep and with names as long as it needs."""
     with _parents_of(target) as parents:
         partial = _beside(target, "probe")
         partial.mkdir()
@@ -85,7 +85,7 @@ class _Parents:
 
 @contextmanager
 def _parents_of(target: Path) -> Iterator[_Parents]:
-    """Make the directories above a place; where what is done there fails, remove those again."""
+    """Make the directories above a place; if the block fails, remove them again."""
     missing = [parent for parent in target.absolute().parents if not parent.exists()]
     parents = _Parents(missing)
     try:
@@ -98,13 +98,13 @@ def _parents_of(target: Path) -> Iterator[_Parents]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold back what asks the program to end until the block is left; a part of a rename is neither old nor new."""
+    """Hold back signals that end the program until the block is left, so that no rename is interrupted."""
     requested: list[int] = []
     try:
         before = {number: signal.getsignal(number) for number in _ENDING}
         for number in before:
             signal.signal(number, lambda got, _frame: requested.append(got))
-    except ValueError:  # signals are the main thread's
+    except ValueError:  # only the main thread may set signal handlers
         yield
         return
     try:
@@ -270,7 +270,7 @@ def whole_lines(content: bytes) -> list[bytes]:
 
 
 def _swap(new: Path, target: Path, owner: Owner) -> None:
-    """Rename ``new`` to ``target``; what was there comes back if that fails, or if it holds what is not ours by now."""
+    """Rename ``new`` to ``target``; the old content is restored if that fails, or if others have added files to it."""
     old = _beside(target, "replaced")
     try:
         if target.exists():
@@ -284,7 +284,7 @@ def _swap(new: Path, target: Path, owner: Owner) -> None:
 
 
 def _beside(target: Path, kind: str) -> Path:
-    """Return a place for what comes before or after ``target``, whose name may be as long as names can be."""
+    """Return a temporary path beside ``target``, whose name may have the greatest length already."""
     return target.parent / f".vislam.{kind}-{os.getpid()}"
 
 

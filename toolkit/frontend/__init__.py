@@ -1,4 +1,4 @@
-"""From images to stereo tracks, with OpenCV: what every estimator reads, made once for all of them.
+"""Stereo tracks from images, with OpenCV, made once for all estimators.
 
 Read ``tracker`` first: it is the algorithm; its steps are ``corners``, ``motion`` and ``patches``. ``tracking`` runs
 it over a recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills`` draw what it found.

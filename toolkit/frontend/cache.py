@@ -1,8 +1,8 @@
-"""What the front end has on disk: tracks under the hash of what they were made of, and images unpacked for it.
+"""The front end's files on disk: tracks under the hash of their inputs, and images unpacked from other files.
 
-Tracks depend on images, calibration, settings and this front end. Images that come inside of another file are written
-one by one, for the front end reads image files, and go when their spool is closed, is no longer used or the program
-ends. ``VISLAM_CACHE`` names the folder, by default ``vislam`` in the user's folder for caches; any of it may go.
+Tracks depend on images, calibration, settings and this front end. Images inside another file are written one by one,
+because the front end reads image files. They are removed when their spool is closed, is no longer used or the program
+ends. ``VISLAM_CACHE`` names the folder, by default ``vislam`` in the user's cache folder; all of it may be deleted.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from toolkit.settings import Frontend
 
 # Raised with every change of the front end that changes its tracks.
 _FRONT_END = 6
-# Settings that say where images are from, and not what becomes of them.
+# Settings that select the images and do not affect the tracks.
 _OF_THE_SOURCE = ("tracks", "topics")
 _ARRAYS = ("t_ns", "frame", "track_id", "corners_px")
 _HASHERS = 2
@@ -61,7 +61,7 @@ def load(key: str) -> dict[str, Any] | None:
 
 
 def save(key: str, tracks: Mapping[str, Any]) -> None:
-    """Keep tracks under a key; a disk that cannot take them only means that they are made again."""
+    """Keep tracks under a key; if they cannot be written, they are made again next time."""
     path = _path(key)
     arrays = {name: tracks[name] for name in _ARRAYS}
     with suppress(OSError, OutputError):
@@ -93,7 +93,7 @@ def _digest(path: Path) -> str:
 class ImageSpool:
     """A folder of unpacked images that is there as long as the spool is.
 
-    ``source`` is what they were unpacked of, and what messages call the folder, which nobody knows.
+    ``source`` is the file they were unpacked from; messages name it instead of the folder.
     """
 
     def __init__(self, source: str) -> None:

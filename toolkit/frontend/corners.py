@@ -1,8 +1,8 @@
-"""Corners: where new tracks may begin, where they are in the right image, and where they went in the next.
+"""Corners: detection for new tracks, matching in the right image, and tracking into the next image.
 
-Beginnings are spread over a grid, away from the tracks there are (Shi & Tomasi 1994); a partner in the right image is
-sought by normalised correlation along the row, at half the resolution; from one image to another they are followed by
-pyramidal Lucas-Kanade, there and back (Bouguet 2001).
+New corners are spread over a grid, away from existing tracks (Shi & Tomasi 1994); their match in the right image is
+found by normalised correlation along the row, at half the resolution; from image to image they are tracked by pyramidal
+Lucas-Kanade, forward and backward (Bouguet 2001).
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _BLOCK_PX = 5
 _HALF_PX = 5  # the template is 11 x 11 px of the halved image
 _ROWS_PX = 1  # rows searched above and below
 _LEAST_CORRELATION = 0.7
-# Of Lucas-Kanade; on the way back no pyramid is needed: it begins near the true place.
+# Of Lucas-Kanade; backward tracking needs no pyramid, because it starts near the true place.
 _ITERATIONS, _STOP_PX = 30, 0.01
 _LEVELS_BACK = 1
 
@@ -119,7 +119,7 @@ class Flow:
     def follow(self, before: Image, after: Image, points_px: Array, guesses_px: Array) -> tuple[Array, BoolArray]:
         """Return where points (N, 2) of an image are in another, sought from guesses (N, 2), and whether found (N,).
 
-        Found is what leads back to where it came from.
+        A point is found if backward tracking returns to it.
         """
         if len(points_px) == 0:  # of no points OpenCV gives back None
             return np.empty((0, 2)), np.zeros(0, dtype=bool)

@@ -1,6 +1,6 @@
-"""Image files of a stereo pair: read whole, as grey images of 8 bits, some pairs ahead of who uses them.
+"""Image files of a stereo pair, read as grey images of 8 bits, some pairs ahead of their use.
 
-What cannot be used is an answer and no exception: a recording of thousands of images is not lost for one of them.
+An unusable image is returned as such and raises no exception, because one of thousands should not stop a recording.
 """
 
 import struct
@@ -138,7 +138,7 @@ def _is_whole_png(content: bytes) -> bool:
 
 
 def read_ahead(requested: Iterable[_Requested], read: Callable[[_Requested], _Given]) -> Iterator[_Given]:
-    """Yield what is read for each thing asked, in order; another thread is a few of them ahead, and no more."""
+    """Yield the result for each request, in order; another thread reads at most a few of them ahead."""
     with ThreadPoolExecutor(1, thread_name_prefix="images") as reader:
         coming: deque[Future[_Given]] = deque()
         try:

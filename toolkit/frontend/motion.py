@@ -1,13 +1,13 @@
-"""The camera's motion as most tracks agree on it: what to expect of a track, and which have left their points.
+"""The camera's motion by consensus of the tracks: predicts tracks, and finds tracks that have left their points.
 
-From one pair to the next, points triangulated in the pair before and their places now give the pose by RANSAC on three
-points (Fischler & Bolles 1981; Gao et al. 2003). Depth is known from stereo, so that neither standstill nor a plane nor
-a pure rotation is a special case, as it is for the fundamental matrix.
+From one pair to the next the pose is estimated from points triangulated in the last pair, by RANSAC on three points
+(Fischler & Bolles 1981; Gao et al. 2003). Depth is known from stereo, so that neither standstill nor a plane nor a pure
+rotation is a special case, as it is for the fundamental matrix.
 
-A slow slide passes every test from one pair to the next. So points triangulated some pairs ago are moved by the motion
-since then, too: a track that is elsewhere, by far more than tracks are in general, has left its point. Where an edge
-passes before what is behind it, the place in which they cross wanders with the camera, and the patch around it looks
-alike all the time.
+A slow drift of a track passes every test from one pair to the next. So points triangulated some pairs ago are also
+moved by the motion since then: a track that is farther from its prediction than most tracks by a large factor has left
+its point. An example is the crossing of two edges at different depths: it moves with the camera, while the patch around
+it looks the same.
 """
 
 from dataclasses import dataclass, replace
@@ -74,7 +74,7 @@ class StereoMotion:
     def moved(self, rows: IntArray, left_px: Array) -> tuple["StereoMotion", BoolArray]:
         """Find the motion from where some of the tracks (rows) are now (M, 2) px, and which of them agree with it (M,).
 
-        Where they are too few to tell, all agree and the motion is unknown.
+        If there are too few tracks, all agree and the motion is unknown.
         """
         unknown = replace(self, T_now_before=None), np.ones(len(rows), dtype=bool)
         if self.points is None:
@@ -160,7 +160,7 @@ class Rigidity:
     def agrees(self, left_px: Array, right_px: Array, track_ids: IntArray) -> BoolArray:
         """Say of tracks (N,) at (N, 2) px whether they are where their points of some pairs ago should be.
 
-        What is new since then is, and so are all where the motion since then cannot be told.
+        Tracks that are newer agree, and all agree where the motion since then is unknown.
         """
         sound = np.ones(len(track_ids), dtype=bool)
         if not self.earlier or self.earlier[0].pairs < _PAIRS_BACK:

@@ -1,9 +1,9 @@
-"""Does a track still show what it began with? Its first patch, fitted into today's image by an affine warp.
+"""Tests whether a track still shows its first patch, which is fitted into the present image by an affine warp.
 
-Frame-to-frame tracking drifts from one structure to the next in small steps that look right one by one; against the
-first patch the sum of them shows (Shi & Tomasi 1994), and can be taken out. Inverse compositional (Baker & Matthews
-2004) on patches of zero mean and unit norm, which takes out gain and bias of the exposure; the gradients of the first
-patch serve for all time.
+Frame-to-frame tracking may drift from one structure to another in small steps that each look right; comparison with the
+first patch shows their sum (Shi & Tomasi 1994), and can be taken out. Inverse compositional (Baker & Matthews 2004) on
+patches of zero mean and unit norm, which takes out gain and bias of the exposure; the gradients of the first patch
+serve for all time.
 """
 
 from dataclasses import dataclass

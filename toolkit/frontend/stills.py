@@ -1,4 +1,4 @@
-"""Tracks drawn over the images they were made of: what a reader looks at before believing a number."""
+"""Draws tracks over the images they were made of, so that they can be checked by eye."""
 
 from collections.abc import Iterator
 from pathlib import Path

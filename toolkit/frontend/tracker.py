@@ -1,4 +1,4 @@
-"""Stereo tracks from one rectified pair of images to the next: follow, verify, begin anew where there is room.
+"""Stereo tracks from one rectified pair of images to the next: track, verify, start new tracks where there is room.
 
 A corner is matched along its row at birth; from then on it is followed in time in the left image and from left to
 right, and measured in both where its first patch fits. It ends, and its id with it, where one of the tests says that
@@ -18,9 +18,9 @@ from toolkit.frontend.patches import Floats, Patches, as_floats, inverse
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.settings import Frontend
 
-# Almost all loss is at birth: so many times more corners are matched than are wanted.
+# Most corners are lost in the first match, so this many times the wanted number are matched.
 _CANDIDATES = 3
-# A corner that found no partner is not tried again for so many frames, within so many pixels.
+# A corner without a match is not tried again for this many frames, within this many pixels.
 _COOL_DOWN_FRAMES, _COOL_DOWN_PX = 5, 4
 # Fewer than this share of the tracks found in the right image, and of no fewer tracks: it belongs to another instant.
 _LEAST_PAIRED, _FEWEST_TO_TEST = 0.25, 20
@@ -40,7 +40,7 @@ class _Tracks:
     """Tracks as the last pair has them: ids (N,), places left and right (N, 2) px, and their first patches.
 
     ``right_warps`` (N, 2, 2) are those that fit the first patches into the right image. A track that is not ``sound``
-    (N,) has left its point: it is followed on so that none begins in its place, which would leave it again.
+    (N,) has left its point. It is still tracked, so that no new track starts in its place and leaves the point again.
     """
 
     ids: IntArray
@@ -134,7 +134,7 @@ class Tracker:
         patches, fitted_px, correlation = before.patches.select(rows).fitted(floats, left_px[rows])
         off_px = np.linalg.norm(fitted_px - left_px[rows], axis=1)
         same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
-        # Where the first patch fits is where the track is: KLT's small errors, added up, would walk away from it.
+        # The position of a track is where its first patch fits: the accumulated errors of KLT would drift away from it.
         rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
         shift_px = here_px - before.left_px[rows]
         right_warps = before.right_warps[rows] @ inverse(before.patches.warps[rows]) @ patches.warps

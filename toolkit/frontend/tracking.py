@@ -1,7 +1,7 @@
-"""A recording's images made stereo tracks: read, rectified, tracked, and kept for the next time.
+"""Makes stereo tracks of a recording's images: reads, rectifies, tracks, and caches the result.
 
-A pair that cannot be used is named and left out; the tracks go on behind it. Before the first step it is checked that
-left and right are what they are called, and that the calibration is theirs.
+A pair that cannot be used is named and left out; the tracks continue after it. Before the first step it is checked that
+left and right are not exchanged, and that the calibration fits the images.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,9 +20,9 @@ from toolkit.geometry import Array, IntArray
 from toolkit.progress import SILENT, Progress
 from toolkit.settings import Frontend
 
-# Pairs that are looked at before all others, spread over the recording.
+# Pairs that are checked before all others, spread over the recording.
 _LOOKED_AT = 5
-# Of the wanted corners a sound pair finds a third or more in the right image; one that is no pair hardly any.
+# A valid pair has matches for a third or more of the wanted corners, two images that are no pair hardly any.
 _LEAST_MATCHED, _MOST_SWAPPED = 0.08, 2.0
 _MISPAIRED = "left and right image are not of the same instant", "pair the images by when they were taken"
 _REPEATED = "it and its partner are those of the pair before"
@@ -155,8 +155,8 @@ def _without_repeats(
 ) -> Iterator[tuple[Image, Image] | Unusable]:
     """Yield what was read of each pair; a pair that is the last one once more, to the last grey value, is unusable.
 
-    No sensor is so quiet: the camera stalled, or its files were copied. Tracks that stand still while the camera moves
-    would contradict every other measurement.
+    Sensor noise makes identical images impossible: the camera stalled, or files were copied. Tracks that stand still
+    while the camera moves would contradict every other measurement.
     """
     last: tuple[Image, Image] | None = None
     for images, pair in zip(read, pairs, strict=True):

@@ -1,7 +1,7 @@
-"""The accuracy gate: has a change made accuracy, consistency, held-out reprojection or speed other than a baseline's?
+"""The accuracy gate: tests whether accuracy, consistency, held-out reprojection or speed differ from a baseline's.
 
-Reading order: baseline (what is kept), baseline_file (as JSON) -> measuring -> verdict, significance (how a metric is
-tested) -> judging (a case) -> checking (the whole). Beside it: interleaved (speed against another version of the code,
-each in a process of timing_child), and trajectory_files -> trajectory_baseline -> trajectory_check (another system's
-files, without a run). How it is used and how well it sees: docs/gate.md.
+Reading order: baseline (its values), baseline_file (as JSON) -> measuring -> verdict, significance (the tests of a
+metric) -> judging (a case) -> checking (the whole). Besides: interleaved (speed against another version of the code,
+each in a process of timing_child), and trajectory_files -> trajectory_baseline -> trajectory_check (files of another
+system, without a run). Use, and power of the tests: docs/gate.md.
 """

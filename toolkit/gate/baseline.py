@@ -1,4 +1,4 @@
-"""What a baseline keeps: what was run, with which releases, on which measurements, what came of it, what is worse."""
+"""The content of a baseline: cases, releases, hashes of the measurements, results, and the criteria for "worse"."""
 
 import math
 from collections.abc import Mapping
@@ -12,12 +12,12 @@ from toolkit.settings import DEFAULTS, Settings
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]
-# Another GTSAM may linearise otherwise, another NumPy draw otherwise; NumPy's third number is for repairs alone.
+# Another GTSAM may linearise differently, another NumPy draw other numbers; NumPy's patch releases do not.
 _DIGITS_THAT_MATTER = {"gtsam": 3, "numpy": 2}
 
 
 class BaselineError(VislamError):
-    """A baseline that cannot be used, here or at all."""
+    """A baseline that cannot be used, with the installed releases or at all."""
 
     exit_status: ClassVar[int] = 3
 
@@ -26,8 +26,8 @@ class BaselineError(VislamError):
 class Criterion:
     """When a metric is worse, and by how many percent it may be.
 
-    On simulated sequences ``percent`` is a margin: the mean worsening that nobody minds. On recorded ones it is the
-    bound a single value must keep. For ``away from 1`` it is in percent of the ratio to 1.
+    On simulated sequences ``percent`` is a margin: the mean worsening that is accepted. On recorded ones it is the
+    bound for the single value. For ``away from 1`` it is in percent of the ratio to 1.
     """
 
     worse: Worse
@@ -35,16 +35,16 @@ class Criterion:
 
     @property
     def margin(self) -> float:
-        """The worsening that nobody minds, as a log ratio."""
+        """The worsening that is accepted, as a log ratio."""
         return math.log1p(self.percent / 100.0)
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What counts as worse: criteria by metric, for simulated and for recorded sequences, and the limits of all.
+    """Criteria for "worse" by metric, for simulated and for recorded sequences, and limits for all.
 
-    ``coverage_points`` (percent of the frames) may be lost under any seed; ``speed_ratio`` times slower, against the
-    reference workload, may a run become.
+    Under any seed a run may lose ``coverage_points`` (percent of the frames) of its coverage, and may become
+    ``speed_ratio`` times slower against the reference workload.
     """
 
     simulated: Mapping[str, Criterion]
@@ -98,8 +98,8 @@ class Case:
 class Series:
     """One estimator on one case, by seed: how it ended, its time over the reference's, metrics by kind of output.
 
-    ``why`` says what the first run that did not end well had to say; ``arithmetic`` what computed where the estimator
-    has compiled code, None where it has not, or the baseline is too old to say.
+    ``why`` is the reason of the first run that did not end well; ``arithmetic`` says whether compiled code or NumPy
+    ran, None where the estimator has no compiled code, or the baseline is too old to say.
     """
 
     status: tuple[Status, ...]
@@ -111,7 +111,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Measured:
-    """What came of a case: hash and fingerprint of what the estimators read by seed, and the series by estimator.
+    """The results of a case: hash and fingerprint of what the estimators read by seed, and the series by estimator.
 
     ``absent`` says why an estimator has no series, ``unreadable`` why the sequence itself could not be read.
     """

@@ -1,4 +1,4 @@
-"""The whole of the gate: measure a new baseline, or measure an old one again and judge what became of it."""
+"""The whole gate: measure a new baseline, or measure an old one again and judge the differences."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from toolkit.settings import DEFAULTS, Settings
 
 @dataclass(frozen=True)
 class How:
-    """How to run: so many processes, whether time counts, with which settings, and what passes.
+    """How to run a check: number of processes, whether time is judged, settings, and what passes.
 
     ``accept_better`` lets what moved pass unless it is worse; ``speed_against`` names another version of the code, a
     git revision or a wheel, to take turns with for speed.
@@ -32,7 +32,7 @@ class How:
 
     @property
     def terms(self) -> CheckTerms:
-        """On which terms each case is judged; time that is told otherwise is not judged twice."""
+        """The terms on which each case is judged; speed that is judged in turns with other code is not judged twice."""
         return CheckTerms(self.speed and self.speed_against is None, self.accept_better)
 
 
@@ -46,7 +46,7 @@ def new_baseline(
     """Measure a baseline; a check of it will run with the same settings.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a sequence that cannot be
-    had; both before the first run.
+    read; both before the first run.
     """
     check_options(settings)
     for case in cases:
@@ -81,7 +81,7 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
 def judge_all(
     collected: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
 ) -> Check:
-    """Test what awaits its test, all at once, and put the verdicts together."""
+    """Test all metrics of the check together, and collect the verdicts."""
     tested = judge_pairs(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {
         (case.source, name): (i, k)

@@ -1,10 +1,10 @@
-"""Is the code slower than it was? Old and new code take turns, run by run, on the same recording and processor.
+"""Tests whether the code became slower: old and new code run in turns on the same recording and processor.
 
-What else the machine does slows both sides of a pair alike, so that 15 % shows where times measured apart scatter by
-as much. How many pairs are run is decided by how the first ones scatter, not by what they say (Stein, "A two-sample
-test for a linear hypothesis whose power is independent of the variance", Annals of Mathematical Statistics 16, 1945).
-The test is Wilcoxon's signed-rank test, which a run that was interrupted does not spoil. The other version of the code,
-a git revision or a wheel, is unpacked beside the installed one while it is timed.
+Other load of the machine slows both sides of a pair alike, so that a change of 15 % is found although times measured
+separately scatter by as much. The number of pairs is decided by the scatter of the first ones, not by their mean
+(Stein, "A two-sample test for a linear hypothesis whose power is independent of the variance", Annals of Mathematical
+Statistics 16, 1945). The test is Wilcoxon's signed-rank test, which is robust to single runs that were delayed. The
+other version of the code, a git revision or a wheel, is unpacked beside the installed one while it is timed.
 """
 
 import io
@@ -35,7 +35,7 @@ from toolkit.progress import Progress, ProgressFor
 from toolkit.settings import changes_of
 from toolkit.threads import THREAD_VARIABLES
 
-# Slower by 5 % is accepted; slower by 15 % must be found.
+# A slowdown by 5 % is accepted; one by 15 % must be found.
 MARGIN, TO_SEE = 0.05, 0.15
 FEWEST_PAIRS, MOST_PAIRS = 16, 60
 # Enough to be timed; a batch smoother's whole drive takes seconds.
@@ -60,7 +60,7 @@ class TimedPairs:
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """What was timed, and what to know beside it."""
+    """The times, and remarks on them."""
 
     timed: tuple[TimedPairs, ...]
     notes: tuple[str, ...]
@@ -68,7 +68,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class Speeds:
-    """What became of the comparison: a verdict for each estimator and case, and what to know beside them."""
+    """The result of the comparison: a verdict for each estimator and case, and remarks."""
 
     verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...]
@@ -112,7 +112,7 @@ def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iter
         finding: Finding = "regressed" if p <= rate else "better" if p_faster <= rate else "same"
         ratio, (was, is_) = float(np.exp(np.median(timed.differences))), np.median(timed.cpu_s, axis=0).tolist()
         message = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
-        seen = 100.0 * float(np.expm1(_seen(timed.differences, rate / len(found))))
+        seen = 100.0 * float(np.expm1(_detectable(timed.differences, rate / len(found))))
         yield Verdict(
             timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else message, was, is_,
             100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
@@ -121,25 +121,25 @@ def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iter
 
 def _beyond_p(differences: Array) -> float:
     """Return the p-value that the median of differences (n,) exceeds the margin."""
-    from scipy.stats import wilcoxon  # its import takes as long as all the others', and most checks do without
+    from scipy.stats import wilcoxon  # its import takes as long as all others together, and most checks do not need it
 
     excess = differences - np.log1p(MARGIN)
     return float(wilcoxon(excess, alternative="greater").pvalue) if np.any(excess) else 1.0
 
 
 def _scale(differences: Array) -> float:
-    """Return the standard deviation of differences (n,), from the tenth of them on either side."""
+    """Return the standard deviation of differences (n,), from their 10 % and 90 % quantiles."""
     return float(np.ptp(np.percentile(differences, _TAILS_PERCENT))) / (2.0 * _TAILS_OF_NORMAL)
 
 
-def _seen(differences: Array, rate: float) -> float:
-    """Return the change that one test at ``rate`` sees with 95 % power; its efficiency is 3/pi of the t-test's."""
+def _detectable(differences: Array, rate: float) -> float:
+    """Return the change that one test at ``rate`` finds with 95 % power; its efficiency is 3/pi of the t-test's."""
     error = _scale(differences) * np.sqrt(np.pi / 3.0 / differences.size)
     return float(np.log1p(MARGIN) + (ndtri(POWER) - ndtri(rate)) * error)
 
 
 def pairs_needed(differences: Array) -> int:
-    """Return how many pairs see TO_SEE for certain, by the scatter of the first ones (n,)."""
+    """Return how many pairs are needed to find TO_SEE, by the scatter of the first ones (n,)."""
     excess = np.log1p(TO_SEE) - np.log1p(MARGIN)
     # Five standard errors: 3.2 for the test at 0.05 over some 60 of them, 1.6 for the power, and some in hand.
     needed = np.ceil(np.pi / 3.0 * (5.0 * _scale(differences) / excess) ** 2)
@@ -147,7 +147,7 @@ def pairs_needed(differences: Array) -> int:
 
 
 class Process:
-    """A version of the code in a process of its own, which is asked in JSON."""
+    """A version of the code in a process of its own, which answers requests in JSON."""
 
     def __init__(self, process: "subprocess.Popen[str]", what: str) -> None:
         self._process, self._what = process, what

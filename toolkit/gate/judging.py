@@ -1,13 +1,13 @@
-"""A case as it was against the same case now: what is missing, what is tested, what is held to a bound.
+"""Compares a case of the baseline with the same case now: what is missing, what is tested, what has a bound.
 
-A recording is the same every time and so is what is computed from it, up to rounding: any change is real. It is shown
-from one part in a million on, and fails beyond its bound in either direction.
+On a recording results are the same every time, up to rounding, so that any change is real. It is shown from one part in
+a million on, and fails beyond its bound in either direction.
 
-A metric that was changed is told from a trajectory that was, for the same poses cannot have another error. The median
-reprojection of withheld tracks, the errors of the positions and the NEES are all computed from the same poses. Where
-one of them is the same to six digits under every seed, so are the poses, and whatever else moved by a thousandth is
-computed otherwise than it was. A NEES may also move with the covariance alone: it shows that poses are the same, and is
-never itself called changed.
+A change of a metric's formula is distinguished from a change of the trajectory, because the same poses cannot have
+another error. The median reprojection of withheld tracks, the errors of the positions and the NEES are all computed
+from the same poses. Where one of them is the same to six digits under every seed, the poses are the same, and any of
+the others that moved by a thousandth is computed by another formula. A NEES may also move with the covariance alone: an
+unchanged NEES shows that poses are the same, but a NEES is never called changed.
 """
 
 import math
@@ -40,7 +40,7 @@ _SAME_POSES_BY = {"ate_": ("heldout_", "nees_"), "rpe_": ("heldout_", "nees_"), 
 
 @dataclass(frozen=True)
 class CheckTerms:
-    """On which terms to judge: whether time counts, and whether what moved passes unless it is worse."""
+    """Terms of the judgement: whether time counts, and whether a metric that moved passes unless it is worse."""
 
     speed: bool = True
     accept_better: bool = False
@@ -51,7 +51,7 @@ USUAL_TERMS = CheckTerms()
 
 @dataclass
 class CaseVerdicts:
-    """What is decided about a case already, what awaits the tests of the whole check, and what is worth a note."""
+    """Verdicts that are decided already, metrics to be tested together with those of the whole check, and notes."""
 
     verdicts: list[Verdict] = field(default_factory=list)
     tests: list[Pairs] = field(default_factory=list)
@@ -87,9 +87,9 @@ def judge_case(
 
 
 def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
-    """Say under which seeds the estimators read something else than for the baseline; nothing where nowhere.
+    """Say under which seeds the estimators read other measurements than for the baseline; empty where there are none.
 
-    A seed without a hash had no run that lived to tell it; its statuses fail the check.
+    A seed without a hash had no completed run; its statuses fail the check.
     """
     if len(now.fingerprints) != len(before.fingerprints):
         return f"{len(now.fingerprints)} runs, the baseline has {len(before.fingerprints)}"
@@ -102,7 +102,7 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
 
 
 def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -> Iterator[str]:
-    """Say where an estimator's times were made with other arithmetic, as far as both sides tell."""
+    """Say where an estimator's times were measured with other arithmetic, as far as both sides record it."""
     if before.arithmetic and now.arithmetic and before.arithmetic != now.arithmetic:
         was, is_ = _ARITHMETIC[before.arithmetic], _ARITHMETIC[now.arithmetic]
         yield (
@@ -163,7 +163,7 @@ def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdi
 def _ends(
     case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, terms: CheckTerms
 ) -> Iterator[Verdict]:
-    """Fail where runs end otherwise than they did; where that is accepted, note those that end well now."""
+    """Fail where runs end differently than before; where that is accepted, note those that end well now."""
     pairs = list(zip(case.seeds, before.status, now.status, strict=True))
     worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
     if worse:
@@ -238,7 +238,7 @@ def _distance(before: float, after: float) -> float:
 
 
 def judge_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
-    """Fail where any seed lost more of its frames than allowed; a good score over fewer frames is no good score."""
+    """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
     for output, metrics in before.outputs.items():
         pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
         if not pairs:
@@ -276,7 +276,7 @@ def judge_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:
-    """Return the metrics of one output that were changed, each with the metric that says so.
+    """Return the metrics of one output whose formula changed, each with the metric that proves it.
 
     ``values`` are those before and now (n,) of each metric, under the seeds that both sides have.
     """

@@ -1,7 +1,7 @@
-"""Run what a baseline lists, in processes side by side, and gather what came of it by estimator, metric and seed.
+"""Run the cases of a baseline in parallel processes, and collect the results by estimator, metric and seed.
 
-A run's processor time is taken over that of a reference workload beside it, which says what the machine is worth now in
-the terms of what the estimators do all day: small dense updates in NumPy, a joint filter's matrix products, and
+A run's processor time is divided by that of a reference workload before and after it, which measures the present speed
+of the machine in the operations of estimators: small dense updates in NumPy, a joint filter's matrix products, and
 preintegration and elimination in GTSAM. The ratio may be compared between machines and days.
 """
 
@@ -32,7 +32,7 @@ from toolkit.experiment.units import (
     recording_to_prepare,
     run_estimator,
 )
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
 from toolkit.geometry import Array
 from toolkit.progress import Progress
@@ -57,7 +57,7 @@ class TimedOutcome:
 def recordings_of(case: Case, settings: Settings) -> list[Recording]:
     """Return the recording of a case under each of its seeds.
 
-    Files are found here, by whole paths: a process that reads them may stand elsewhere, in another environment.
+    Paths are made absolute here: a process that reads them may have another working directory and environment.
     """
     source, truth = located(case.source), None if case.truth is None else Path(located(case.truth))
     return [
@@ -76,7 +76,7 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
 
 
 def located(source: str) -> str:
-    """Return the whole path to where a source leads (:func:`place_of`); a built-in name, or nowhere, as it is."""
+    """Return the absolute path of a source (:func:`place_of`); a built-in name, or a path to nothing, unchanged."""
     place = None if source in built_ins() else place_of(source)
     return source if place is None else str(place.absolute())
 
@@ -91,8 +91,8 @@ def place_of(path: str) -> Path | None:
 def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int, progress: Progress) -> Measured:
     """Run every estimator of a case under every seed.
 
-    An estimator that is not there is ``absent``, a sequence that cannot be read ``unreadable``; nothing of that is
-    raised, for a check has to say all that is missing.
+    An estimator that is not there is ``absent``, a sequence that cannot be read ``unreadable``; neither is raised as an
+    error, because a check reports everything that is missing.
     """
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
@@ -155,15 +155,15 @@ def _why_absent(name: str) -> str:
     return ""
 
 
-def _timed(result: TimedOutcome | Lost, unit: Unit) -> TimedOutcome:
-    """Return what came of a unit; of one whose process died nothing but its status."""
-    if isinstance(result, Lost):
+def _timed(result: TimedOutcome | LostUnit, unit: Unit) -> TimedOutcome:
+    """Return the result of a unit; of one whose process died only the status."""
+    if isinstance(result, LostUnit):
         return TimedOutcome(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
     return result
 
 
 def _over(run: Run, reference: float) -> float | None:
-    """Return a run's processor time over the reference's; of a run cut short it would say nothing."""
+    """Return a run's processor time over the reference's; None for a run that ended early."""
     ended: tuple[Status, ...] = ("ok", "diverged")
     return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
 

@@ -1,11 +1,11 @@
-"""What chance explains and what it does not: the statistical tests of the gate, on logarithms of metrics.
+"""The statistical tests of the gate, on logarithms of metrics.
 
-Simulated sequences are tested in pairs, for under each seed both sides read the same measurements. What is compared is
-the logarithm of a metric, so that a mean difference is a ratio. Two questions are asked of each. Has it *moved*, up or
-down, by more than another processor's rounding moves it? And has it become *worse* by more than its margin? A NEES is
-worse the farther its mean over the seeds is outside the chi-square band of as many runs, on either side (Bar-Shalom, Li
-and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4); a NIS, the farther it is
-from 1. Whatever became worse has moved as well: both questions share one rate.
+Simulated sequences are tested in pairs, because under each seed both sides read the same measurements. The logarithms
+of a metric are compared, so that a mean difference is a ratio. Two hypotheses are tested for each metric: that it
+*moved*, up or down, by more than another processor's rounding, and that it became *worse* by more than its margin. A
+NEES is worse the farther its mean over the seeds is outside the chi-square band of as many runs, on either side
+(Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4); a NIS,
+the farther it is from 1. Whatever became worse has moved as well: both questions share one rate.
 
 Student's paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
 section 2.5; the correction is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
@@ -27,19 +27,19 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
-# Its mean over runs scatters by chance; a NIS is a mean over so many innovations that it does not.
+# The mean NEES over runs scatters by chance; a NIS is a mean over so many innovations that it hardly does.
 _WITH_BAND = ("nees_pose_mean",)
 # Another processor's rounding moves a metric by less than this, relative (docs/gate.md).
 ROUNDING = 1e-6
-# Below this a value is one of rounding, and its logarithm says nothing.
+# A value below this is rounding, and its logarithm is not used.
 _LEAST = 1e-12
-# Fewer runs than this on either side tell nothing of their spread, and are held to the bound alone.
+# With fewer runs than this on either side their spread is unknown, and only the bound is applied.
 FEWEST_RUNS = 3
 
 
 @dataclass(frozen=True)
 class Where:
-    """What a verdict is about."""
+    """The subject of a verdict."""
 
     sequence: str
     estimator: str
@@ -86,7 +86,7 @@ def worse_p(pairs: Pairs) -> Array:
 
 
 def _band(pairs: Pairs) -> tuple[float, float]:
-    """Return between which logarithms the mean over the seeds is as it should be."""
+    """Return the band of logarithms within which the mean over the seeds is consistent."""
     if pairs.where.metric not in _WITH_BAND:
         return 0.0, 0.0
     low, high = (float(log_of(np.array(edge))) for edge in nees_band(POSE_DOF, pairs.before.shape[-1]))
@@ -125,13 +125,13 @@ def judge_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False)
         if finding == "moved" and accept_better:
             finding = "better" if _is_nearer(pairs) else "worse"
         margin = pairs.criterion.margin if accept_better else ROUNDING
-        seen = smallest_seen(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
+        seen = smallest_detectable(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
         verdicts.append(_verdict(pairs, finding, p_worse if finding == "regressed" else p, seen))
     return verdicts
 
 
 def _is_nearer(pairs: Pairs) -> bool:
-    """Say whether a metric is nearer to what it should be than it was."""
+    """Say whether a metric is nearer to its ideal value than before."""
     was, is_ = float(log_of(pairs.before).mean()), float(log_of(pairs.after).mean())
     return is_ < was if pairs.criterion.worse == "larger" else abs(is_) < abs(was)
 
@@ -162,9 +162,8 @@ def geometric_mean(values: Array) -> float:
 def paired_p(differences: Array, margin: float | Array = 0.0) -> Array:
     """Return the p-value (...) of the one-sided paired t-test that the mean of differences (..., n) exceeds a margin.
 
-    Small means: the mean is above the margin, and chance is a poor explanation. Differences that are all equal have
-    no spread to judge by; then the answer is certain: 0 where they exceed the margin, otherwise 1. One difference
-    alone says nothing: 1.
+    A small value means that the mean is above the margin by more than chance. Differences that are all equal have no
+    spread; the result is then 0 where they exceed the margin, otherwise 1. For a single difference it is 1.
     """
     given = np.asarray(differences, dtype=float)
     n = given.shape[-1]
@@ -198,7 +197,7 @@ def holm(p_values: Array) -> Array:
     return adjusted
 
 
-def smallest_seen(differences: Array, rate: float, power: float) -> float:
+def smallest_detectable(differences: Array, rate: float, power: float) -> float:
     """Return the excess of the mean over the margin that one test at ``rate`` sees with ``power``.
 
     From the spread of the differences (n,) themselves: (t(1 - rate) + t(power)) standard errors, the usual
@@ -235,6 +234,6 @@ class MeanChange:
             return 0.0 if excess > 0.0 else 1.0
         return float(stdtr(self.dof, -excess / self.error))
 
-    def seen(self, margin: float, rate: float) -> float:
+    def detectable(self, margin: float, rate: float) -> float:
         """Return the change that one test at ``rate`` sees with 95 % power."""
         return margin + float(stdtrit(self.dof, 1.0 - rate) + stdtrit(self.dof, POWER)) * self.error

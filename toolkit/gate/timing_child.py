@@ -1,7 +1,7 @@
-"""What runs within each of two versions of the code while they are timed in turn; :mod:`toolkit.gate.interleaved`.
+"""The script that runs in each of two versions of the code while they are timed (:mod:`toolkit.gate.interleaved`).
 
-It is started as a script with one version first on the path, so that it imports that version's estimators, and does
-what the lines of its standard input ask: JSON there, JSON back. It must get by with what earlier versions have.
+It is started with one version first on the path, so that it imports that version's estimators. Requests are lines of
+JSON on standard input, answers lines of JSON on standard output. It must use only functions that earlier versions have.
 """
 
 import gc
@@ -68,8 +68,8 @@ class Timer:
 
 
 def main() -> None:
-    """Answer until nobody asks."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one who asks ends this process
+    """Answer requests until standard input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # nothing that is printed shall look like an answer
     timer = Timer()

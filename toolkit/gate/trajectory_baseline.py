@@ -1,7 +1,7 @@
-"""What the trajectories of another system are held against, and the file that keeps it.
+"""The baseline for trajectories of another system, and its file.
 
 The contract is ``vislam.trajectory-baseline/1`` (docs/gate.md). It holds the scores of each sequence's runs, never the
-trajectories, and by content which truth they were scored against.
+trajectories, and the hash of the truth they were scored against.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from toolkit.gate.baseline_file import MetricValues, Percent, json_text
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Align, Scoring
 
 _REMEDY = "make the baseline with vislam baseline --trajectories"
-# An error that grows by less is no regression (percent), and so much of the time may be lost (percentage points).
+# Growth of an error that is no regression (percent), and loss of time coverage that is accepted (percentage points).
 BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
 
 

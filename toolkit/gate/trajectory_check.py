@@ -1,4 +1,4 @@
-"""Hold a folder of trajectories against a baseline, or make the baseline of one."""
+"""Compare a folder of trajectories with a baseline, or make the baseline of one."""
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -210,5 +210,5 @@ def _tested(
         where.sequence, where.estimator, where.output, where.metric, finding, message,
         before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
-        seen_percent=100.0 * float(np.expm1(spread.seen(one.criterion.margin, each))),
+        seen_percent=100.0 * float(np.expm1(spread.detectable(one.criterion.margin, each))),
     )  # fmt: skip

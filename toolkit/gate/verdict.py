@@ -1,4 +1,4 @@
-"""What the gate says of one metric and of the whole check; as JSON, the contract ``vislam.check/2`` (docs/gate.md)."""
+"""The verdict on one metric and on the whole check; as JSON, the contract ``vislam.check/2`` (docs/gate.md)."""
 
 import math
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """The state every estimator starts from, found without truth: from the first stereo frames and the motion samples.
 
 Read ``start`` first: it says what each kind of motion needs. ``first_guess`` solves for it linearly, ``adjustment``
-makes it exact and says how sure it is.
+makes it exact and gives its covariance.
 """
 
 from toolkit.initialization.adjustment import GYRO_BIAS_SIGMA

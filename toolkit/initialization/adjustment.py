@@ -1,7 +1,7 @@
 """The first frames adjusted together: poses, velocities, biases and landmarks, with the factors the smoothers use.
 
-Tracks that do not fit are left out, and how sure the result is comes from what is left: by the graph's covariance, and
-by how much more than stated the tracks scatter about it.
+Tracks that do not fit are left out. The covariance of the result is that of the graph of the others, scaled by how much
+more than stated these tracks scatter.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ from toolkit.sequence import Sequence, StereoFrame
 GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02
 # Standard deviation of a turn rate that is not measured (rad/s).
 TURN_SIGMA = 2.0
-# The estimators read the window's measurements again: in the start they count for a ninth.
+# The estimators read the window's measurements again, so that in the start they have a ninth of their weight.
 INFLATION = 9.0
 # The start's own, whatever the estimators use: Huber's threshold is the median norm of a sound whitened residual.
 _HUBER = 1.5
 _PROBABILITY = 0.95
-# Tracks that did not fit are left out so many times at most; each time the others fit better.
+# Rounds in which tracks that do not fit are left out.
 _ROUNDS = 4
 # Tracks that scatter by more than this many of their stated sigmas are not explained by these motions at all.
 _MOST_SIGMAS = 5.0
@@ -76,7 +76,7 @@ def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What stays the same whichever tracks are used."""
+    """The part of the adjustment that does not depend on the tracks that are used."""
 
     model: MotionModel
     increments: list[Increment]
@@ -136,7 +136,7 @@ def _tracks(frames: list[StereoFrame]) -> IntArray:
 
 
 def _fit(frames: list[StereoFrame], values: gtsam.Values, sequence: Sequence) -> tuple[float, IntArray]:
-    """Return how much larger the tracks' residuals squared are than stated, in the median, and tracks beyond that.
+    """Return the median ratio of the tracks' squared residuals to the stated noise, and the tracks that do not fit it.
 
     A track of n sightings has 3 n - 3 degrees of freedom, its landmark taken out.
     """

@@ -1,9 +1,8 @@
-"""Where an adjustment of the first frames begins: each unknown by linear equations, so that no motion is too hard.
+"""The first guess for the adjustment of the first frames: each unknown by linear equations, for any motion.
 
-The camera's motion from its own tracks turns as the gyro says but for the gyro's bias; with attitudes free of it,
-velocity and gravity in the first frame are linear in the motion that remains. Source: Qin & Shen, "Robust
-initialization of monocular visual-inertial estimation on aerial robots" (2017), section V; with stereo the scale is
-known.
+The rotation of the camera by its tracks and the gyro's differ by the gyro's bias. With attitudes corrected for it, the
+motion is linear in the velocity and in the gravity in the first frame. Source: Qin & Shen, "Robust initialization of
+monocular visual-inertial estimation on aerial robots" (2017), section V; with stereo the scale is known.
 """
 
 from dataclasses import dataclass
@@ -20,15 +19,15 @@ from toolkit.models.imu import Preintegration, preintegrate, preintegration_para
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Steps for the gyro's bias: the second corrects for what the first neglects.
+# Iterations for the gyro's bias: the second corrects for the linearisation of the first.
 _BIAS_STEPS = 2
 _REWEIGHTINGS, _HUBER = 5, 1.5
 # Median norm of a normal vector of three unit variances.
 _MEDIAN_NORM = 1.54
 # Velocity and gravity are six unknowns, and their scatter needs some intervals more than the two they take.
 _FEWEST_INTERVALS = 6
-# Gravity tells which way is up where so many of its sigmas are within this share of its length; where it is then off
-# by more than both, vision and accelerometer are not of one motion.
+# The direction of gravity is known where this many of its sigmas are within this share of its length. If its length is
+# then wrong by more than both, vision and accelerometer contradict each other.
 _GRAVITY_SHARE, _GRAVITY_SIGMAS = 0.15, 4.0
 
 
@@ -36,7 +35,7 @@ _GRAVITY_SHARE, _GRAVITY_SIGMAS = 0.15, 4.0
 class FirstGuess:
     """Rough states of K frames: poses (K, 4, 4), velocities (K, 3) m/s in the world, and the biases (6,).
 
-    ``contradiction`` says in words why vision and the motion samples cannot be of one motion, if they cannot.
+    ``contradiction`` says why vision and the motion samples cannot be of one motion, if so.
     """
 
     T_world_imu: Array
@@ -54,7 +53,7 @@ class _SeenMotion(NamedTuple):
 
 def guess_from_vision(sequence: Sequence) -> FirstGuess:
     """Return the states that the tracks alone show; the world is the first IMU frame."""
-    poses = np.array(list(accumulate(_seen(sequence).T_before_after, np.matmul, initial=np.eye(4))))
+    poses = np.array(list(accumulate(_vision_motion(sequence).T_before_after, np.matmul, initial=np.eye(4))))
     t_s = sequence.frames_s
     return FirstGuess(poses, np.gradient(poses[:, :3, 3], t_s, axis=0), np.zeros(6))
 
@@ -65,10 +64,10 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
     Which way is up is the direction of gravity where vision determines it, else of the mean specific force.
     """
     assert isinstance(sequence.noise, ImuNoise)
-    seen, params = _seen(sequence), preintegration_params(sequence.noise, sequence.gravity_world)
+    seen, params = _vision_motion(sequence), preintegration_params(sequence.noise, sequence.gravity_world)
     bias = np.zeros(6)
     for _ in range(_BIAS_STEPS):
-        bias[3:] += _gyro_bias_left([preintegrate(motion, bias, params) for motion in motions], seen)
+        bias[3:] += _gyro_bias_residual([preintegrate(motion, bias, params) for motion in motions], seen)
     path = _Path.of([preintegrate(motion, bias, params) for motion in motions])
     fallen = float(np.linalg.norm(sequence.gravity_world))
     gravity, contradiction = _gravity(path, seen, fallen)
@@ -78,7 +77,7 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
     return FirstGuess(poses, path.velocities(v_first, gravity) @ level[:3, :3].T, bias, contradiction)
 
 
-def _seen(sequence: Sequence) -> _SeenMotion:
+def _vision_motion(sequence: Sequence) -> _SeenMotion:
     moved = camera_motion(sequence)
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     T_imu_cam = sequence.rig.T_imu_cam
@@ -86,8 +85,8 @@ def _seen(sequence: Sequence) -> _SeenMotion:
     return _SeenMotion(np.asarray(T_imu_cam @ T_before_after @ se3_inverse(T_imu_cam)), moved.known)
 
 
-def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
-    """Return the rate (3,) rad/s by which the gyro turns faster than the tracks, of all known intervals.
+def _gyro_bias_residual(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
+    """Return the rate (3,) rad/s by which the gyro turns faster than the tracks show, over all known intervals.
 
     A bias b over dt turns by exp(-b dt) on the right, to first order.
     """
@@ -102,7 +101,7 @@ def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """What the IMU alone says of N intervals, in the axes of the first frame.
+    """The motion over N intervals by the IMU alone, in the axes of the first frame.
 
     ``t_s`` (N + 1,), ``attitudes`` (N + 1, 3, 3), and ``gained_mps``, ``gained_m`` (N + 1, 3): velocity and position
     that the specific force has given since the first frame, from rest and without gravity.
@@ -133,8 +132,8 @@ class _Path:
         """Return the velocities (N + 1, 3) m/s from the first velocity and gravity (3,)."""
         return np.asarray(self.gained_mps + v_first + self.t_s[:, None] * gravity)
 
-    def left(self, seen: _SeenMotion) -> Array:
-        """Return what of the seen translations (M, 3) m, where known, the specific force does not explain."""
+    def translation_residuals(self, seen: _SeenMotion) -> Array:
+        """Return the known translations of the camera (M, 3) m less those that the specific force explains."""
         seen_m = (self.attitudes[:-1] @ seen.T_before_after[:, :3, 3:])[..., 0]
         return np.asarray((seen_m - np.diff(self.gained_m, axis=0))[seen.known])
 
@@ -144,17 +143,17 @@ class _Path:
             return np.zeros(3)
         per_gravity = 0.5 * np.diff(self.t_s**2)[seen.known]
         per_velocity = np.diff(self.t_s)[seen.known, None, None] * np.eye(3)
-        return _robust(per_velocity, self.left(seen) - per_gravity[:, None] * gravity)[0]
+        return _robust(per_velocity, self.translation_residuals(seen) - per_gravity[:, None] * gravity)[0]
 
 
 def _gravity(path: _Path, seen: _SeenMotion, length: float) -> tuple[Array, str | None]:
-    """Return gravity (3,) m/s^2 in the first frame, and why it cannot be so, if it cannot."""
+    """Return gravity (3,) m/s^2 in the first frame, and the contradiction, if there is one."""
     down = -path.gained_mps[-1]
     contradiction = None
     if seen.known.sum() >= _FEWEST_INTERVALS:
         per_velocity, per_gravity = (np.diff(t)[seen.known] for t in (path.t_s, 0.5 * path.t_s**2))
         design = np.concatenate([per_velocity[:, None, None] * np.eye(3), per_gravity[:, None, None] * np.eye(3)], 2)
-        found, cov = _robust(design, path.left(seen))
+        found, cov = _robust(design, path.translation_residuals(seen))
         uncertain = _GRAVITY_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))
         share = _GRAVITY_SHARE * length
         if uncertain < share:

@@ -1,9 +1,10 @@
 """The state every estimator starts from, found without truth: from the first stereo frames and the motion samples.
 
-A twist needs none of it: the world is the first IMU frame. So it is where no motion was measured; velocity and turn
-rate then come from a short bundle adjustment over the first frames, with the motion model of the smoothers. With raw
-IMU samples roll, pitch, velocity and biases come from such an adjustment, visual-inertial, whose first guess is linear:
-no standstill is needed, and no gentle motion. Heading and position are the gauge and start at zero.
+With measured twists nothing has to be found: the world is the first IMU frame. It is also the first IMU frame where no
+motion was measured; velocity and turn rate then come from a short bundle adjustment over the first frames, with the
+motion model of the smoothers. With raw IMU samples roll, pitch, velocity and biases come from such an adjustment,
+visual-inertial, whose first guess is linear: it needs neither a standstill nor slow motion. Heading and position are
+the gauge and start at zero.
 """
 
 from dataclasses import replace
@@ -28,7 +29,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Packet, Prior, Sequence, StereoFrame
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
-# Without enough vision: unknown speed (m/s), and the tilt (rad) an acceleration of 1 m/s^2 feigns.
+# Without enough vision: sigma of the unknown speed (m/s), and of the tilt (rad), by an acceleration of 1 m/s^2.
 _BLIND_VELOCITY_SIGMA, _BLIND_TILT_SIGMA = 10.0, 0.1
 _SOURCE = {"imu": "the specific force and stereo of the first", "none": "stereo alone, of the first"}
 # The start's own, whatever the estimators use: each frame is triangulated by itself, so its landmarks need a depth that

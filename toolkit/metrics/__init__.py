@@ -1,11 +1,11 @@
-"""Score a run. Every module here is a metric file, found by being here; other packages bring more of them.
+"""Scores a run. Every module in this folder is a metric file and is found without being listed; so are other packages'.
 
-A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with all that tables and files
-say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why
-its metrics belong to the causal output alone, where they do. ``GROUP`` is a name that stands for all of them where a
+A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with its presentation in tables and
+files), ``ORDER`` (its place among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why its
+metrics belong to the causal output alone, where they do. ``GROUP`` is a name that stands for all of them where a
 table's columns are asked for. ``ON_REQUEST`` names the setting ``metrics.<name>`` without which metrics that take long
-are not computed.
-Read :mod:`toolkit.metrics.parts.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
+are not computed. Read :mod:`toolkit.metrics.parts.evaluation`, then ``ate``, then the others; docs/metrics.md defines
+each number.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
 """
@@ -169,7 +169,7 @@ def score_run(
     evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
-    with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
+    with np.errstate(all="ignore"):  # a diverged run may overflow; the value is then None with its reason, below
         for file in _files_of(only):
             scores = _score_file(file, evaluation, requested)
             if not isinstance(scores, Scores) or list(scores.values) != _keys(file):
@@ -190,7 +190,7 @@ def _files_of(names: Collection[str] | None) -> tuple[MetricFile, ...]:
 
 
 def repeated(causal: Scores) -> Scores:
-    """Return the scores of a final output that only repeats the causal one: the same, but what is causal alone."""
+    """Return the scores of a final output that repeats the causal one: the same but for metrics of causal outputs."""
     final = causal
     for file in _found().files:
         if reason := _causal_only(file):

@@ -53,9 +53,9 @@ METRICS = (
         in_contract=True,
     ),
 )
-# A world this far from level (deg), which explains more than half of the squared error of the fit that keeps the
-# vertical, is worth a remark; less is the estimator's own error, or that of a start that was given. A straight path
-# leaves its roll undetermined and explains nothing by it.
+# A remark is made where the estimate's world is tilted by this angle (deg) and the tilt explains more than half of the
+# squared error of the fit that keeps the vertical. A smaller tilt is the estimator's own error, or that of a given
+# start. A straight path leaves the roll undetermined, which then explains nothing.
 _TILTED_DEG, _EXPLAINED = 1.0, 0.5
 _DISAGREE = (
     "the estimate's vertical and the truth's differ by about {:.0f} deg, which is most of this error and is in "
@@ -65,7 +65,7 @@ _UNMEASURED = (
     "without a measured vertical the tilt of an estimator's world, its first frame, in the truth's depends on where it "
     "begins, and is most of this error; compare ate_se3_m"
 )
-# Another scale is worth a remark where it is off by so much, and the positions fit so many times as well with it.
+# A remark is made where the scale is wrong by this share, and positions fit this many times as well with another one.
 _LEAST_SCALE, _TIMES_BETTER = 0.02, 3.0
 _LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "miles": 1609.344, "kilometres": 1000.0}
 _SCALED = (

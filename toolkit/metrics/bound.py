@@ -1,12 +1,13 @@
-"""How close to the limit: the Cramér-Rao bound of the recording, and what the estimator loses against it.
+"""The Cramér-Rao bound of the recording, and the estimator's excess error over the efficient estimate.
 
 Van Trees, "Detection, estimation and modulation theory", part I (1968), section 2.4; how bound and efficient estimate
-are computed is in :mod:`toolkit.metrics.parts.cramer_rao`. The error of an unbiased estimator is that of the
-efficient one on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P
-and that of d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
+are computed is in :mod:`toolkit.metrics.parts.cramer_rao`. The error of an unbiased estimator is the error of the
+efficient one on the same measurements plus a part ``d`` that is not correlated with it, so its covariance is the bound
+P plus that of d. The error of a single run itself is mostly due to the noise that both share, above all the error of
+the start.
 
-A recording without an exact truth has the bound that the model claims, linearised at the run's own last answer. The
-error over it is then a test of the model: where both are honest, it is about 1.
+Without an exact truth the bound that the model claims is used, linearised at the run's own final estimate. The ratio of
+the error to it is then a test of the model: about 1 where model and estimator are consistent.
 """
 
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ METRICS = (
 
 @dataclass(frozen=True, eq=False)
 class AgainstBound:
-    """An output beside its bound at stamps (n,): what it errs beyond the efficient estimate (n, d), what it states.
+    """An output and its bound at stamps (n,): its errors beyond the efficient estimate (n, d), its stated covariances.
 
     ``bound`` and ``stated`` (n, d, d) are covariances in the layout's order.
     """
@@ -80,7 +81,7 @@ class AgainstBound:
 
 
 def against_bound(evaluation: Evaluation) -> AgainstBound:
-    """Return an output beside the bound of what it could know: at each frame, or from the whole recording.
+    """Return an output with its bound: that of the data up to each frame, or of the whole recording.
 
     Raises Unavailable where the recording has no bound, or the output no stated covariance of the whole state.
     """
@@ -113,7 +114,7 @@ def _in_order(values: dict[str, float | None], notes: dict[str, str]) -> Scores:
 
 
 def _against_claimed_bound(evaluation: Evaluation, why: str) -> Scores:
-    """Score against the bound at the run's own last answer; ``why`` there is no other."""
+    """Score against the bound at the run's own final estimate; ``why`` is the reason for the lack of an exact one."""
     run, sequence, estimate = evaluation.run, evaluation.sequence, evaluation.estimate
     bound = claimed_bound(sequence, run.final or run.causal or estimate, evaluation.output)
     lost = ["efficiency_percent", *(f"excess_{key}" for key in _BLOCKS)]

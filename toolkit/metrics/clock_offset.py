@@ -1,9 +1,9 @@
-"""The clock of an estimate beside the truth's: by how much its stamps must be shifted for its positions to fit best.
+"""The offset of an estimate's clock from the truth's: the shift of its stamps by which its positions fit best.
 
 A constant offset of two clocks displaces each position along its velocity. It is fitted together with the alignment
 that ATE fits, as in Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems"
 (IROS 2013), section III, with the truth's positions in the place of a spline of them. A clock that runs fast displaces
-them by more and more; its rate is fitted likewise, from the middle of the recording outwards.
+them increasingly; its rate is fitted in the same way, from the middle of the recording outwards.
 """
 
 from collections.abc import Callable
@@ -41,15 +41,15 @@ METRICS = (
     ),
 )
 _ITERATIONS, _SETTLED_S = 20, 1e-6
-# So many pairs are needed, at most these steps of the median one apart: a path is not known across a gap.
+# Pairs that are needed, and their largest distance in median steps: a path is not known across a gap.
 _FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
 # Where less of the velocity (share) is left beside the alignment, a shift in time looks like one in space.
 _LEAST_LEFT = 0.02
-# An offset is told from so many standard errors and from a millisecond on: few stamps are better than that.
+# An offset is reported from this many standard errors and from a millisecond on; few stamps are more accurate.
 _SIGMAS, _LEAST_S = 5.0, 1e-3
-# A rate is told from so much on and up to as much, for beyond that other stretches of a path fit as well; it makes the
-# positions fit so many times as well as any offset does, and shifts no larger share of the time than that. The fit
-# begins with this share of the pairs about the middle and takes in more and more of them.
+# A rate is reported between the first two values (beyond the second, other stretches of a path fit as well, and the
+# shift of the time is limited likewise) if positions fit this many times as well as with any offset. The fit takes in
+# these shares of the pairs about the middle, one after the other.
 _LEAST_RATE, _MOST_RATE, _TIMES_BETTER, _SHARES = 1e-3, 0.1, 3.0, (0.15, 0.3, 0.6, 1.0)
 _RATE_REMARK = (
     "time passes {:.4f} +- {:.4f} times as fast by its stamps as by the truth's: with that its positions fit to "
@@ -105,7 +105,9 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
     usable = _beside_no_gap(t_s)
     if usable.sum() < _FEWEST_PAIRS:
         raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
-    from scipy.interpolate import CubicSpline  # its import takes a tenth of a process's start, and most do without
+    from scipy.interpolate import (
+        CubicSpline,
+    )  # slow to import, and most processes do not need it
 
     path = CubicSpline(t_s, true)
     offset_s = 0.0

@@ -1,11 +1,11 @@
-"""Do the corrections of a causal answer lean one way for longer than chance has it?
+"""Tests whether the corrections of a causal output have a trend: push the state one way for longer than by chance.
 
-Row errors, a turned camera, an odometer that slips or stamps that are late do the same to all tracks of a frame: each
-track has so little of it that it passes its gate, and the innovations stay near their covariance while they turn the
-state one way, frame after frame. The corrections of a consistent estimator are independent from frame to frame, and
-their sum over a stretch of time has the covariance that they took away (:mod:`toolkit.models.corrections`): its squared
-length is chi-square distributed. Corrections are the answers less what the measured motion predicts from the answers
-before, with the noise that the estimator took it for; where that is what is stated, nothing else has to be reported.
+Row errors, a rotated camera, wheel slip or late stamps affect all tracks of a frame alike. Each track is affected so
+little that it passes its gate, and the innovations stay near their covariance while they push the state one way, frame
+after frame. The corrections of a consistent estimator are independent from frame to frame, and their sum over a stretch
+of time has the covariance that they took away (:mod:`toolkit.models.corrections`): its squared length is chi-square
+distributed. A correction is an estimate less the prediction by the measured motion from the estimate before, with the
+noise of the motion that the estimator assumed: the stated one, unless the estimator reports ``motion_noise_scale``.
 """
 
 from collections.abc import Iterator
@@ -19,18 +19,18 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models.corrections import Correction, CorrectionTest
-from toolkit.models.predicted_steps import PredictedStep, predicted_steps
+from toolkit.models.motion import PredictedStep, predicted_steps
 from toolkit.models.state import Belief
 
 ORDER = 73
 CAUSAL_ONLY = "corrections from frame to frame belong to the causal output"
 TREND, LIMIT = "correction_trend", "correction_trend_limit"
-# What all tracks of some frames share adds up within it; longer ones lose what biases absorb.
+# Length of a stretch (s): errors shared by all tracks add up within it; in longer stretches biases absorb them.
 _STRETCH_S = 1.0
 NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
-# A consistent estimator is beyond half of the limit less than once in a million runs. The other half is for filters
-# that linearise at estimates they have since corrected, and so count some information twice: chosen with 36 sound
-# simulated runs of each of three filters in view, one of which it leaves beyond the limit (docs/metrics.md).
+# A consistent estimator exceeds half of the limit less than once in a million runs. The other half allows for filters
+# that linearise at estimates which they have since corrected, and so count some information twice. It was chosen by
+# looking at 36 sound simulated runs of each of three filters, of which one exceeds the limit (docs/metrics.md).
 _BY_CHANCE, _BY_LINEARISATION = 1e-6, 2.0
 METRICS = (
     Metric(
@@ -98,7 +98,7 @@ def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:
 
 
 def _answer(before: Belief, trajectory: Trajectory, cov: Array, row: int) -> Belief:
-    """Return a state of the trajectory as a belief; what it lacks is as predicted."""
+    """Return a state of the trajectory as a belief; parts that it lacks are those of the prediction."""
     v_world = before.v_world if trajectory.v_world is None else trajectory.v_world[row]
     bias = before.bias if trajectory.bias is None else trajectory.bias[row]
     return Belief(before.layout, trajectory.T_world_imu[row], v_world, bias, cov[row])

@@ -1,4 +1,4 @@
-"""What the run cost: time per frame, time in all, memory."""
+"""The cost of the run: time per frame, total time, memory."""
 
 import numpy as np
 

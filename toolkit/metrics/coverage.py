@@ -1,4 +1,4 @@
-"""Over how much of the sequence the other metrics are computed."""
+"""The share of the sequence over which the other metrics are computed."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
-"""How much of what an estimator tested its outlier gate let through.
+"""The share of the tested measurements that an estimator's outlier gate accepted.
 
-Behind a gate the innovations that remain look as they should, however wrong the model is: what shows it is how many do
-not remain. Of a consistent estimator without outliers the gate accepts its own probability.
+The innovations that pass a gate look consistent however wrong the model is; a wrong model shows in the share that is
+rejected. The gate of a consistent estimator without outliers accepts the share that is its probability.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 ORDER = 72
 CAUSAL_ONLY = INNOVATIONS_ARE_CAUSAL
 ACCEPTED = "gate_accepted_percent"
-# In 258 sound simulated runs of all estimators no gate accepted less than 85 %; of real course files and drives, where
-# errors of tracks are not white, it accepts 40 to 96 %. Chosen with these in view.
+# In 258 sound simulated runs of all estimators no gate accepted less than 85 %; on real course files and drives, where
+# errors of tracks are not white, gates accept 40 to 96 %. Chosen by looking at these.
 _LEAST_USUAL_PERCENT = 80.0
 METRICS = (
     Metric(
@@ -35,7 +35,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def refuses_much(accepted_percent: float) -> bool:
-    """Say whether a gate refused so much that it tells of mismatches or of a model that does not hold."""
+    """Say whether a gate refused so many measurements that there are mismatches or the model is wrong."""
     return accepted_percent < _LEAST_USUAL_PERCENT
 
 

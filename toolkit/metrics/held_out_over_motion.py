@@ -1,9 +1,9 @@
-"""Held-out reprojection beside that of the measured motion alone, track by track: has vision helped, or done harm?
+"""Held-out reprojection over that of the measured motion alone, track by track: shows whether vision helped.
 
-An estimator has the measured motion and corrects it by the tracks that it is given. Where it explains withheld tracks
-worse than that motion does without any vision, its corrections were wrong, or, in a causal answer, take back more than
-they gain, whatever its covariance says. The motion is integrated from the output's own first state. Errors are paired
-over the tracks, which differ far more from each other than two estimates of one track do.
+An estimator corrects the measured motion by the tracks that it is given. Where it explains withheld tracks worse than
+the motion alone, its corrections were wrong or, in a causal output, jump back and forth by more than they gain,
+whatever its covariance. The motion is integrated from the output's own first state. Errors are paired over the tracks,
+which differ far more from each other than two estimates of one track do.
 """
 
 from typing import NamedTuple
@@ -20,13 +20,13 @@ from toolkit.sequence import Sequence
 
 ORDER = 61
 RATIO, ERROR = "heldout_over_motion", "heldout_over_motion_error"
-# Added to both errors, in squares: differences far below a tenth of a pixel, as without noise, do not count.
+# Added to both errors, in squares, so that differences far below a tenth of a pixel, as without noise, do not count.
 _FLOOR_PX = 0.1
-# So many tracks, drawn evenly, give the ratio to a few percent; of fewer than the second it is not computed.
+# This many tracks, drawn evenly, give the ratio to a few percent; with fewer than the second number it is not computed.
 _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
-# A run does harm that is worse by this factor, or by that one in the worst of ten stretches, both beyond so many
-# standard errors. Of 365 sound simulated runs the first bound is 1.03 at most beside twists and 2.0 beside an IMU,
-# which is smoother from frame to frame than any causal answer that is corrected. Chosen with them in view.
+# Vision did harm where a run is worse by the first factor, or by the second in the worst of ten stretches, both by more
+# than this many standard errors. In 365 sound simulated runs the ratio is 1.03 at most with twists, and 2.0 with an
+# IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at them.
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
 _OF_CAUSAL = ": it revises itself by so much, or follows tracks that are wrong"
@@ -58,7 +58,7 @@ class _Paired(NamedTuple):
 def score(evaluation: Evaluation) -> Scores:
     """Score how many times as far the evaluated poses miss withheld tracks as the measured motion alone does.
 
-    Where they do harm by that, a remark on the ratio says so, and when they do most.
+    Where vision did harm, a remark on the ratio says so, and in which stretch most.
     """
     paired = _paired(evaluation)
     ratio, error = _mean(paired.log_ratio)
@@ -116,7 +116,7 @@ def _of_some_tracks(track_ids: IntArray) -> BoolArray:
 
 
 def _harm(paired: _Paired, kind: str) -> str:
-    """Say by how much, and when most, the poses miss withheld tracks farther than the motion alone; else nothing."""
+    """Say by how much, and in which stretch most, vision did harm; empty where it did not."""
     whole, notes = _mean(paired.log_ratio), list[str]()
     if _least(whole) > np.log(MOST_RATIO[kind]):
         ratio = float(np.exp(whole[0]))

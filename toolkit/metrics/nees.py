@@ -1,4 +1,4 @@
-"""Normalised estimation error squared: are the errors as large as the stated covariance expects?
+"""Normalised estimation error squared: compares the errors with the stated covariance.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """

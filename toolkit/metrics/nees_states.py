@@ -1,7 +1,7 @@
-"""Normalised estimation error squared of what moves the pose: velocity and biases.
+"""Normalised estimation error squared of velocity and biases.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4. A filter
-may state its pose honestly and its biases not; the error then shows in the pose much later.
+may be consistent in its pose and not in its biases; the error shows in the pose much later.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Normalised innovation squared: are the innovations as large as their stated covariance expects?
+"""Normalised innovation squared: compares the innovations with their stated covariance.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 An innovation that a chi-square gate lets through is a truncated variable: its sum is divided by the mean of that

@@ -7,6 +7,6 @@ belief, prediction), ``motion`` (what a motion model offers filters and graphs) 
 (thresholds and their sources) and ``noise`` (for files that state none).
 
 For some settings and recordings: ``correlated_noise`` (errors along tracks), ``gap_bridge`` (no common tracks),
-``moving_tracks`` (vehicles). From the tracks alone: ``camera_motion``. What judges an estimate: ``predicted_steps``
-(its steps beside the measured motion) and ``corrections`` (against what they take of the covariance).
+``moving_tracks`` (vehicles). From the tracks alone: ``camera_motion``. To judge an estimate: ``motion.predicted_steps``
+(its steps beside the measured motion) and ``corrections`` (tested against the covariance they take away).
 """

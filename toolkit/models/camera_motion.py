@@ -1,4 +1,4 @@
-"""The camera's motion from each frame to the next, from its own stereo tracks and nothing else.
+"""The camera's motion from each frame to the next, from its stereo tracks alone.
 
 Points triangulated in the earlier frame are projected into the later one; Gauss-Newton on that residual with
 Cauchy weights, from "no motion", many intervals of a recording at once. The points are corrected with the motion, and
@@ -20,21 +20,21 @@ from toolkit.models.stereo import disparity_px, project, projection_jacobian, tr
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, StereoRig
 
-# After so many the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of where it would end.
+# After this many iterations the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of convergence.
 ITERATIONS = 6
 # Sum of the weights below which an interval's motion is not used: six unknowns, three equations a track.
 LEAST_SUPPORT = 8.0
-# A residual that is this many times the scatter of its interval has half the weight.
+# A residual of this many times the scatter of its interval has half the weight.
 CAUCHY_SIGMAS = 2.0
 # Floor of an interval's squared scatter, for recordings without noise.
 LEAST_SCALE2 = 1e-6
 # Relative ridge of matrices that one track, or a calibration far off, leaves singular: far below any noise.
 RIDGE = 1e-12
-# Where a point goes that the motion puts behind or beyond everything.
+# Depth given to a point that the motion puts behind the camera or at infinity.
 MOST_DEPTH_M = 1e5
 # Median of a chi-square variable with three degrees of freedom.
 CHI2_3_MEDIAN = 2.366
-# So many pairs of sightings at a time: what is computed of them takes some 10 MB, however long the recording.
+# Pairs of sightings that are computed at a time: they take about 10 MB, however long the recording.
 PAIRS_AT_A_TIME = 10_000
 
 
@@ -110,7 +110,7 @@ def usable_pairs(sequence: Sequence) -> Neighbours:
 def camera_motion(sequence: Sequence, start: Array | None = None) -> CameraMotion:
     """Estimate the camera's twist over every interval between frames.
 
-    ``start`` (K - 1, 4, 4) is where to begin, else at rest: what lies far from the next frame needs it.
+    ``start`` (K - 1, 4, 4) is the first guess, "at rest" by default; large motions need a better one.
     """
     intervals = max(sequence.frame_count - 1, 0)
     views = _two_views(sequence, intervals)
@@ -178,7 +178,7 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     # The ridge keeps an interval without tracks where it is; it is far below one sighting's information.
     hessian = np.moveaxis(_ridged(normal[:6, :6]), -1, 0) + 1e-6 * np.eye(6)
     step = np.asarray(np.linalg.solve(hessian, np.moveaxis(normal[:6, 6:], -1, 0))[..., 0], dtype=np.float64)
-    # The best point is between what the two views say of it: the first one's, corrected by its share of the residual.
+    # The best point for both views is the first view's, corrected by its share of the residual.
     share_px = np.einsum("jip,jp->ip", _product(whitener, spread), white)
     points = views.points + _applied(d_point_d_uv, before_px + share_px)
     points[2] = np.clip(points[2], LEAST_DEPTH_M, MOST_DEPTH_M)

@@ -1,4 +1,4 @@
-"""The errors of a track's sightings made independent: what correlated noise of tracks does to residuals.
+"""Correlated noise of tracks: residuals of a track's sightings are transformed so that they are independent.
 
 A track's error in each channel (:data:`toolkit.track_noise.CHANNELS`) is ``white + b``, where ``b`` begins as the
 offset, with the walk to the first sighting at hand, and walks on from frame to frame. With the covariance C = L L^T of
@@ -15,13 +15,14 @@ from toolkit.models.left_only import applied, left_whitener
 from toolkit.sequence import StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# Part of every sighting's error whatever is stated, a fiftieth of what a tracker resolves: a covariance needs some.
+# White noise (px) that every sighting has, whatever is stated: a fiftieth of a tracker's resolution. It keeps
+# covariances positive definite.
 LEAST_WHITE_PX = 0.01
 _TO_UV = np.linalg.inv(CHANNELS)
 
 
 def white_rig(noise: TrackNoise, rig: StereoRig) -> StereoRig:
-    """Return a rig whose sightings err by the white part alone, each by itself."""
+    """Return a rig whose sightings have the white part of the noise alone."""
     to_uv = np.linalg.inv(CHANNELS) * np.maximum(noise.white_px, LEAST_WHITE_PX)
     return replace(rig, cov_uv_px2=to_uv @ to_uv.T, track_noise=None)
 
@@ -35,11 +36,12 @@ def walked_variance(noise: TrackNoise, ages: IntArray) -> Array:
 def decorrelation(
     noise: TrackNoise, rig: StereoRig, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
 ) -> Array:
-    """Return matrices (F, 3 W, 3 W) that make residuals of F tracks independent, of sightings (F, W) of given ages.
+    """Return matrices (F, 3 W, 3 W) that make the residuals of F tracks independent; sightings (F, W) have given ages.
 
-    They apply to residuals that are whitened as if each sighting stood for itself (``StereoRig.whitener``), stacked
-    by sighting, and to their Jacobians. Rows of what was not seen mix with no others, nor does uR of what is
-    ``left_only`` (F, W), in which no channel but v is measured: there C is that of uL, uR and v together.
+    They apply to residuals whitened as if the sightings were independent (``StereoRig.whitener``), stacked by sighting,
+    and to their Jacobians. Rows of sightings that were not made mix with no other rows, nor do rows of uR where a
+    sighting is ``left_only`` (F, W). In a ``left_only`` sighting no channel but v is measured: there C is the
+    covariance of uL, uR and v together.
     """
     tracks, window = seen.shape
     to_channels = CHANNELS @ np.linalg.inv(rig.whitener)
@@ -67,7 +69,7 @@ class LastError(NamedTuple):
 def error_of_the_last(
     noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
 ) -> LastError:
-    """Return what walk and offset have come to in F tracks at the last of W places, where all are seen.
+    """Return the error by walk and offset of F tracks at the last of W places, where all tracks are seen.
 
     ``ages`` (F, W) in frames; ``seen`` and ``left_only`` (F, W).
     """
@@ -169,13 +171,13 @@ class Chain:
     def of(cls, noise: TrackNoise, track: IntArray, ages: IntArray, left_only: BoolArray | None = None) -> "Chain":
         """Return the chain of sightings of tracks (N,) with ages (N,), those of a track in the order of time.
 
-        It is the Markov chain whose sightings have their variances, and whose successive ones their covariances:
-        exact for noise that is all white, and for a walk and an offset without white noise. In between it forgets a
-        part of the offset at every step: the share of the white variance in that of the sighting.
+        It is the Markov chain whose sightings have their variances, and whose successive ones their covariances: exact
+        for noise that is all white, and for a walk and an offset without white noise. In between, it forgets at every
+        step a part of the offset: the share of the white variance in that of the sighting.
 
-        What is ``left_only`` (N,) follows the sighting before it in uL and v (:func:`channels_of`), what both images
-        show the last that both showed: in between there is no disparity to go on from. The walk of uL over such a gap
-        counts twice.
+        A ``left_only`` (N,) sighting follows the sighting before it in uL and v (:func:`channels_of`). A sighting by
+        both images follows the last one by both, because no disparity was measured in between. The walk of uL over such
+        a gap counts twice.
         """
         left = np.zeros(track.size, dtype=bool) if left_only is None else left_only
         before, both = _row_before(track), np.flatnonzero(~left)
@@ -189,7 +191,7 @@ class Chain:
 
     @classmethod
     def without_memory(cls, count: int) -> "Chain":
-        """Return the chain of sightings that err each by itself, with unit variance in their channels."""
+        """Return the chain of sightings with independent errors of unit variance in their channels."""
         return cls(np.full(count, -1), np.zeros((count, 3)), np.ones((count, 3)))
 
     def of_tracks(self, kept: BoolArray) -> "Chain":
@@ -208,6 +210,6 @@ class Chain:
         return np.asarray(in_channels(channels, values[self.before]))
 
     def whitened(self, own: Array, before: Array) -> Array:
-        """Return what is left of values (N, 3, ...) in the channels, less what was carried on, in sigmas."""
+        """Return values (N, 3, ...) in the channels, less their prediction from the sighting before, in sigmas."""
         shape = (-1, 3) + (1,) * (own.ndim - 2)
         return np.asarray((own - self.carried.reshape(shape) * before) / self.sigma_px.reshape(shape))

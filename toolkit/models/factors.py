@@ -1,4 +1,4 @@
-"""What graphs of every kind share: the keys, the stereo measurement as factors, priors, and marginal covariances."""
+"""Parts that all graphs share: the keys, the stereo measurement as factors, priors, and marginal covariances."""
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -17,7 +17,7 @@ X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_s
 SCALE: int = gtsam.symbol("s", 0)
 # A key is a character above an index of so many bits (gtsam/inference/Symbol.h); a Symbol takes several times as long.
 _INDEX_BITS = 56
-# GTSAM's Python has linear factors on so many variables; on more it has conditionals, which are such factors too.
+# GTSAM's Python wraps linear factors on up to this many variables; on more, only conditionals, which are factors too.
 _MOST_TERMS = 3
 
 
@@ -112,7 +112,7 @@ def linear_factor(terms: list[tuple[int, Array]], residual: Array) -> gtsam.Jaco
 
 
 class EliminatedGraph(Protocol):
-    """What has marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
+    """An object with marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
 
     def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
         """Return the joint marginal of some variables."""
@@ -121,9 +121,9 @@ class EliminatedGraph(Protocol):
 def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
     """Return the joint covariance (d, d) of variables, in the order of the keys and in GTSAM's tangent spaces.
 
-    Only the path from the variables to the root of the Bayes tree is touched: for states that were eliminated last
-    that is next to nothing, however long the graph (Kaess & Dellaert 2009). Raises RuntimeError, as GTSAM does,
-    where the graph does not determine them.
+    Only the path from the variables to the root of the Bayes tree is used. For states that were eliminated last it is
+    short, however long the graph (Kaess & Dellaert 2009). Raises RuntimeError, as GTSAM does, where the graph does not
+    determine them.
     """
     cov = tree.jointMarginalCovariance(keys).fullMatrix()
     return np.asarray(0.5 * (cov + cov.T))

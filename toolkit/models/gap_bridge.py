@@ -1,10 +1,10 @@
-"""Where no track leads from one frame to the next, the body's twist there is like the twist before and after.
+"""A factor for frames without a common track: the body's twist there is close to the twist before and after.
 
-Across such a gap the poses before and behind are tied by the measured twist alone, and what it errs in heading turns
-all that follows. A car's twist does not change as fast as a noisy sensor says: between neighbouring intervals it is the
-same but for white noise on its change (Barfoot, "State estimation for robotics" (2017), section 3.4). The factor is on
-the three poses of two intervals, at least one of them a gap, beside the measured twist of both. Everywhere else the
-tracks tell the motion better than such a prior, which would hold all turns and speeds back and shrink the world.
+Across such a gap only the measured twist connects the poses, and its error in heading turns all later poses. A car's
+twist changes more slowly than a noisy sensor shows: between neighbouring intervals it is constant but for white noise
+on its change (Barfoot, "State estimation for robotics" (2017), section 3.4). The factor is on the three poses of two
+intervals, at least one of them a gap, beside the measured twist of both. Everywhere else the tracks determine the
+motion better than this prior, which would damp turns and speeds and shrink the map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ from toolkit.models.factors import X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import StereoFrame
 
-# The scatter of the measured twists, a first guess of the change, counts for as many intervals of its own.
+# The first guess of the change, from the scatter of the measured twists, has the weight of this many intervals.
 _STATED_FOR = 10
-# Larger changes count for so many standard deviations: they are revisions of the answer, not motion.
+# Larger changes are clipped to this many standard deviations: they are revisions of the estimate, not motion.
 _MOST_SIGMAS = 3.0
-# Measured twists that change by less than so many times the mean square of what the body's does are not noisy.
+# Measured twists are noisy where their change is at least this many times the body's, in mean square.
 _NOISY = 2.0
-# Share of the stated noise that is taken for rounding, where twists do not change at all.
+# Smallest standard deviation of the change, as a share of the stated noise, where twists do not change at all.
 _ROUNDING = 1e-6
 
 
@@ -38,10 +38,10 @@ def gaps(frames: Sequence[StereoFrame]) -> IntArray:
 
 
 class TwistChange:
-    """Learns from the poses where tracks lead on how much the twist changes from one interval to the next.
+    """Learns how much the twist changes from one interval to the next, from poses between which tracks continue.
 
-    At first it is what the white noise of two measured twists makes of it: a bridge then tells little. Errors of the
-    poses count as change as well, so that it is rather too much.
+    The first value follows from the white noise of two measured twists; a bridge then has little weight. Errors of the
+    poses count as change as well, so that the change is overestimated.
     """
 
     def __init__(self, measured: TwistNoise) -> None:
@@ -50,13 +50,13 @@ class TwistChange:
         self._stated = np.zeros(6)
 
     def learn(self, t_ns: IntArray, poses: Array, measured: Array) -> None:
-        """Take in three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks lead on.
+        """Learn from three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks continue.
 
         ``measured`` (2, 6) are the twists [rad/s, m/s] that were measured between them.
         """
         before_s, after_s = (np.diff(t_ns) / NS_PER_S).tolist()
         between_s = 0.5 * (before_s + after_s)
-        # Every frame is learnt from: GTSAM's logarithm of one pose takes a hundredth of NumPy's time.
+        # This runs at every frame: GTSAM's logarithm of one pose takes a hundredth of NumPy's time.
         before, after = (gtsam.Pose3.Logmap(a.between(b)) for a, b in pairwise(map(gtsam.Pose3, poses)))
         change = np.square(after / after_s - before / before_s) / between_s
         if not self._count:
@@ -73,7 +73,7 @@ class TwistChange:
 
     @property
     def noise(self) -> TwistChangeNoise | None:
-        """Return the noise on the change; None as long as nothing was seen of it."""
+        """Return the noise on the change; None before the first change was learnt."""
         if not self._count:
             return None
         density = np.sqrt(self._mean_squares)
@@ -85,7 +85,7 @@ class TwistChange:
 
 
 class KeptTwist(NamedTuple):
-    """That the twist of an interval is that of the one before, which last some seconds each, but for noise.
+    """The constraint that two successive intervals, with durations in seconds, have the same twist but for noise.
 
     The noise is white noise on the change over the time between the middles of the intervals.
     """
@@ -116,9 +116,9 @@ class KeptTwist(NamedTuple):
 
 
 class GapBridge:
-    """Says frame by frame where a twist is to be kept, as surely as it was seen to stay the same before.
+    """Decides frame by frame where a bridge is added; its noise is learnt from the frames before.
 
-    For estimators that keep so many seconds of states.
+    For estimators that keep states for a limited number of seconds.
     """
 
     def __init__(self, window_s: float, measured: TwistNoise) -> None:
@@ -131,11 +131,11 @@ class GapBridge:
 
     @property
     def noise(self) -> TwistChangeNoise | None:
-        """Return the noise on the twist's change so far; None where measured twists are no noisier than that."""
+        """Return the noise on the twist's change so far; None where measured twists are not noisier than the change."""
         return self._change.noise if self._change.is_below_that_measured else None
 
     def added(self, frame: StereoFrame, motion: Motion | None) -> KeptTwist | None:
-        """Return what a frame adds, and the motion before it: that the last two twists are the same, or nothing."""
+        """Return the bridge over the last two intervals that a frame and the motion before it call for, or None."""
         self._frames = [*self._frames[-2:], frame]
         self._blind = [*self._blind[-1:], bool(gaps(self._frames[-2:]).size)]
         if isinstance(motion, TwistMotion):
@@ -147,11 +147,11 @@ class GapBridge:
         if noise is None:
             return None
         before_s, after_s = _durations_s(self._frames)
-        # Of two states further apart the first had left when the second came.
+        # States farther apart than the window are never in it together.
         return KeptTwist(before_s, after_s, noise) if before_s <= self._window_s else None
 
     def learn(self, T_world_imu: Array) -> None:
-        """Take in the pose (4, 4) that was found for the last frame."""
+        """Learn from the pose (4, 4) that was found for the last frame."""
         self._poses = [*self._poses[-2:], T_world_imu]
         if len(self._poses) == 3 and not any(self._blind):
             t_ns = np.array([frame.t_ns for frame in self._frames])
@@ -159,18 +159,18 @@ class GapBridge:
 
 
 def gap_bridge_for(measured: MotionNoise, window_s: float) -> GapBridge | None:
-    """Return the bridge of an estimator that keeps so many seconds of states; None where no twists are measured."""
+    """Return the bridge of an estimator that keeps states for some seconds; None where no twists are measured."""
     return GapBridge(window_s, measured) if isinstance(measured, TwistNoise) else None
 
 
 def bridges(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> dict[int, KeptTwist]:
-    """Return what is kept over the gaps of frames (K,), by the last of the three frames that it concerns."""
+    """Return the constraints over the gaps of frames (K,), by the last of the three frames that each concerns."""
     ends = sorted({k for place in gaps(frames).tolist() for k in (place, place + 1) if 2 <= k < len(frames)})
     return {k: KeptTwist(*_durations_s(frames[k - 2 : k + 1]), noise) for k in ends}
 
 
 def bridged(over: Mapping[int, KeptTwist]) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of bridges, of frames that have the poses X(k)."""
+    """Return the factors of bridges between the poses X(k) of frames."""
     graph = gtsam.NonlinearFactorGraph()
     for k, kept in over.items():
         graph.add(kept_twist(kept, k))

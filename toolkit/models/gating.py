@@ -1,8 +1,8 @@
 """Which sightings may inform an estimate: the tests every estimator shares, and their thresholds, each with its source.
 
-What a user may choose among them is a setting (:class:`toolkit.settings.Outliers`). Two users have constants of their
-own, so that neither moves with an estimator's: the search for a start, which triangulates each frame by itself, and
-the held-out metric, which judges all estimators alike.
+What a user may choose among them is a setting (:class:`toolkit.settings.Outliers`). Two places have constants of their
+own, which do not change with those of the estimators: the search for a start, which triangulates each frame by itself,
+and the held-out metric, which must be the same for all estimators.
 """
 
 import numpy as np
@@ -10,23 +10,24 @@ from scipy.special import chdtr, chdtrc, chdtri
 
 from toolkit.geometry import Array, IntArray
 
-# At a disparity of this and a pixel of noise the depth is uncertain by as much as itself: wait for a better view.
+# At this disparity and a pixel of noise the depth is uncertain by 100 %: a landmark waits for a better view.
 LEAST_DISPARITY_PX = 1.0
-# A point nearer to the camera than this is not triangulated: no lens of ours is focused there.
+# A point nearer to the camera than this is not triangulated: stereo lenses are not focused there.
 LEAST_DEPTH_M = 0.1
-# A landmark that only one pose has seen ties no poses together.
+# A landmark that only one pose has seen constrains no motion.
 FEWEST_SIGHTINGS = 2
 # A track whose NIS is this many times the gate's bound holds a mismatch: by chance twice the 95 % quantile is exceeded
 # once in 740 tracks of three degrees of freedom (two sightings), once in 30,000 of twelve (five sightings).
 MISMATCHED_TRACK_FACTOR = 2.0
-# Mismatches come one by one. Where more of the tracks than this disagree with the state, it is the state that is wrong.
+# Mismatches are single tracks. Where a larger share of the tracks than this disagrees with the state, the state is
+# wrong.
 MOST_MISMATCHED = 0.5
 
 
 def chi2_bound(dof: IntArray | int, probability: float | None) -> Array:
-    """Return the value that chi-square variables with ``dof`` (N,) degrees of freedom stay below so often.
+    """Return the quantile of chi-square variables with ``dof`` (N,) degrees of freedom at the given probability.
 
-    Without a probability it is infinite: there is no gate.
+    It is infinite where the probability is None: there is no gate.
     """
     return np.asarray(chdtri(dof, 1.0 - (1.0 if probability is None else probability)), dtype=float)
 

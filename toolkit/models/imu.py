@@ -1,8 +1,8 @@
 """Motion by raw IMU samples, through one preintegration that filter and smoother share.
 
-The preintegration is GTSAM's ``PreintegratedCombinedMeasurements``: the filter predicts with it, the smoother
-makes its ``CombinedImuFactor`` of the very same object, so both see the same residual, Jacobians and noise
-(Forster et al. 2017, eqs. 26-38). The state is pose, velocity and both biases.
+The preintegration is GTSAM's ``PreintegratedCombinedMeasurements``: the filter predicts with it, the smoother makes its
+``CombinedImuFactor`` of the same object, so both have the same residual, Jacobians and noise (Forster et al. 2017, eqs.
+26-38). The state is pose, velocity and both biases.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,8 +42,8 @@ def preintegration_params(noise: ImuNoise, gravity_world: Array) -> gtsam.Preint
 def preintegrate(motion: ImuMotion, bias: Array, params: gtsam.PreintegrationCombinedParams) -> Preintegration:
     """Preintegrate one interval about a bias (6,) [accel, gyro].
 
-    GTSAM turns each specific force by the attitude at the start of its step; ours stand for the middle, so
-    they are turned by half the step's rotation first. That makes the integration second order: 20 s of a
+    GTSAM rotates each specific force by the attitude at the start of its step. The samples here are for the middle of
+    the step, so they are first rotated by half the step's rotation. That makes the integration second order: 20 s of a
     200 Hz flight drift by 1 mm instead of 9 cm.
     """
     return _preintegrated(motion, _from_mid_step(motion.dt_s, motion.gyro_radps, motion.accel_mps2, bias), bias, params)
@@ -58,7 +58,7 @@ def _from_mid_step(dt_s: Array, gyro_radps: Array, accel_mps2: Array, bias: Arra
 def _preintegrated(
     motion: ImuMotion, accel_mps2: Array, bias: Array, params: gtsam.PreintegrationCombinedParams
 ) -> Preintegration:
-    """Preintegrate an interval with specific forces (n, 3) that stand for the starts of its steps."""
+    """Preintegrate an interval with specific forces (n, 3) given at the starts of its steps."""
     preintegration = Preintegration(params, constant_bias(bias))
     for accel, gyro, dt_s in zip(accel_mps2, motion.gyro_radps, motion.dt_s.tolist(), strict=True):
         preintegration.integrateMeasurement(accel, gyro, dt_s)

@@ -1,9 +1,9 @@
-"""Sightings by the left image alone: the one place that knows what of (uL, uR, v) is then measured, and how well.
+"""Sightings by the left image alone: which of (uL, uR, v) are measured then, and with which noise.
 
-Where uR is missing (NaN) it is as if it had been measured with an infinite variance: its rows of residual and Jacobian
-are zero, the noise of uL and v does not depend on it, and the sighting has two degrees of freedom. So it keeps three
-rows, of which one says nothing, and what works on whole frames needs no second path. Every function returns the rig's
-one noise, and three degrees of freedom, where no right image is missing.
+A missing uR (NaN) is treated as measured with an infinite variance: its rows of residual and Jacobian are zero, the
+noise of uL and v does not depend on it, and the sighting has two degrees of freedom. A sighting so keeps three rows,
+one of them zero, and code that works on whole frames needs no second path. Every function returns the rig's one noise,
+and three degrees of freedom, where no right image is missing.
 """
 
 from collections.abc import Callable

@@ -1,26 +1,28 @@
-"""What moves the IMU between two frames, for filters and smoothers alike; nobody else asks which kind of motion it is.
+"""The motion of the IMU between two frames, for filters and smoothers alike; no other file asks for the kind of motion.
 
 A motion model integrates what was measured between two frames, once, about a bias. A filter predicts from that
 increment (mean, F, Q), a smoother makes its factors of the same one. There is one implementation a file:
 :mod:`toolkit.models.twist`, :mod:`toolkit.models.imu` and, where nothing was measured,
-:mod:`toolkit.models.smooth_twist`.
+:mod:`toolkit.models.smooth_twist`. ``predicted_steps`` predicts each step of a given trajectory.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections import abc
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
 
 from toolkit.estimate import Estimate, Trajectory
 from toolkit.geometry import Array
-from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise
+from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise, with_noise_scaled
 from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
 from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
-from toolkit.sequence import Prior
+from toolkit.sequence import Prior, Sequence
 
 
 class Increment(Protocol):
@@ -91,8 +93,10 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     return ImuModel(noise, gravity_world)
 
 
-def integrated(model: MotionModel, motions: Sequence[Motion], biases: Sequence[Array]) -> Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,): what can be, all at once."""
+def integrated(
+    model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
+) -> abc.Sequence[Increment]:
+    """Return the motions between frames, each integrated about its own bias (6,), all at once where the model can."""
     if isinstance(model, TwistModel | ImuModel) and motions:
         return model.integrate_each(motions, biases)
     return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
@@ -107,7 +111,7 @@ def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Ar
 
 
 def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:
-    """Return the belief carried over a measured motion; as it is where there was none, before the first frame."""
+    """Return the belief carried over a measured motion; unchanged where there is none, at the first frame."""
     if motion is None:
         return belief
     return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
@@ -119,3 +123,47 @@ def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
     v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
     bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
     return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
+
+
+class PredictedStep(NamedTuple):
+    """A step between the rows ``start`` and ``end``: the state at its start, its length and what the motion predicts.
+
+    The belief has no covariance, because that of the trajectory may have another layout.
+    """
+
+    start: int
+    end: int
+    belief: Belief
+    dt_s: float
+    prediction: Prediction
+
+
+def layout_of(sequence: Sequence) -> Layout:
+    """Return where the blocks of the error state stand that the kind of motion of a sequence needs."""
+    return motion_model(sequence.noise, sequence.gravity_world).layout
+
+
+def predicted_steps(
+    trajectory: Trajectory, sequence: Sequence, noise_scale: Array | None = None
+) -> Iterator[PredictedStep]:
+    """Yield the steps between neighbouring frames of which the trajectory has both. Its stamps must be frames'.
+
+    ``noise_scale`` (N,) is how many times its stated variance the noise of the motion up to each row is taken for.
+    """
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    intervals = list(_intervals(trajectory, sequence))
+    if noise_scale is not None:
+        intervals = [(start, end, with_noise_scaled(motion, noise_scale[end])) for start, end, motion in intervals]
+    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
+    increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
+    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
+        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), increment.predict(belief))
+
+
+def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
+    """Yield the motions between neighbouring frames of which the trajectory has both, with the rows of these."""
+    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
+    for before, packet in pairwise(sequence.packets()):
+        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
+        if start is not None and end is not None and packet.motion is not None:
+            yield start, end, packet.motion

@@ -1,20 +1,20 @@
-"""Which tracks move against the measured motion and most other tracks: on vehicles, stuck to the image, slipped.
+"""Finds tracks that move against the measured motion and most other tracks: on vehicles, fixed in the image, slipped.
 
-Decided frame by frame from the past alone, before any estimator and for all alike. A private filter of the motion, in
-the state the estimators have, predicts how the body moved since the frame before, and how surely. Every track is put
-there from its last sound sighting; what is left of it, whitened by the noise of both sightings, is linear in the
-motion's error. The motion taken is that of most posterior probability where a track counts by its chi-square, or where
-that is beyond its bound by the bound (truncated least squares), and none the prediction's covariance excludes: so a
-consensus of vehicles cannot pass for the motion where odometry says otherwise, unless nine tracks in ten agree. It is
-looked for from the prediction on, residuals beyond the bound losing their weight by and by (Black & Rangarajan 1996,
-"On the unification of line processes, outlier rejection, and robust statistics in early vision") and, where that leaves
-many tracks out, among the motions that three tracks each show (Fischler & Bolles 1981, "Random sample consensus").
+This is decided frame by frame from the past alone, before any estimator runs, and is the same for all. A filter of the
+motion, with the state that estimators have, predicts the motion since the frame before with its covariance. Every track
+is predicted from its last accepted sighting; its residual, whitened by the noise of both sightings, is linear in the
+error of the motion. The motion is the most probable one by truncated least squares: a track counts by its chi-square,
+at most by the bound. A motion that the covariance of the prediction excludes is not taken, so that a consensus of
+vehicles cannot be mistaken for the motion where odometry disagrees, unless nine tracks in ten agree. The search starts
+at the prediction and lowers the weight of residuals beyond the bound step by step (Black & Rangarajan 1996, "On the
+unification of line processes, outlier rejection, and robust statistics in early vision") and, where that leaves many
+tracks out, also tries the motions that three tracks determine (Fischler & Bolles 1981, "Random sample consensus").
 
-About that motion each track is tested once more from a sighting some frames ago, along the motions found since: there a
-vehicle shows that is too slow, or too far away, to show from one frame to the next.
+Each track is then tested once more from a sighting some frames ago, along the motions found since. This test finds
+vehicles that are too slow, or too far away, to be found from one frame to the next.
 
-A sighting beyond the bound in either test is left out; a track refused in three frames running stays out for the
-rest of its life. Where fewer than half of the tracks agree, motion or noise are not as stated: none is refused.
+A sighting beyond the bound in either test is left out; a track refused in three successive frames stays out for the
+rest of its life. Where fewer than half of the tracks agree, motion or noise are not as stated, and no track is refused.
 """
 
 from dataclasses import dataclass, replace
@@ -31,19 +31,19 @@ from toolkit.models.state import POSE, Belief, Prediction
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.sequence import Packet, Prior, Sequence, StereoRig, is_held_out, is_left_only
 
-# One sound sighting in a thousand is refused, and one motion in a thousand taken for impossible.
+# Of sound sightings one in a thousand is refused, of correct motions one in a thousand taken for impossible.
 PROBABILITY = 0.999
-# A track that is refused in so many frames running stays away: a single bad sighting spoils one.
+# A track refused in this many successive frames stays out; a single bad sighting spoils one frame.
 REFUSALS = 3
-# A track is tested from its last sound sighting and from one about so many frames ago, where slow motion shows.
+# A track is tested from its last accepted sighting and from one about this many frames ago, where slow motion shows.
 EARLY_FRAMES = 5
 _MOST_FRAMES_BACK = EARLY_FRAMES + REFUSALS + 1
-# Where more tracks than this disagree with the motion found about the prediction, others are looked for.
+# Where a larger share of tracks than this disagrees with the motion found from the prediction, others are searched.
 _SEARCHED_BEYOND = 0.1
 _SAMPLES, _SAMPLE, _REFINED = 24, 3, 3
 # Residuals, in multiples of the bound, beyond which a track has less than a quarter of its weight, one after another.
 _SOFTENED = (4.0, 1.0)
-# What a linear model may neglect, in standard deviations of a pixel coordinate.
+# Error that the linear model may neglect, in standard deviations of a pixel coordinate.
 _NEGLIGIBLE_SIGMAS = 0.2
 
 
@@ -102,9 +102,9 @@ class MovingTracks:
         return sound
 
     def _take(self, step: "_Step", prediction: Prediction, seen: "_Tracks") -> BoolArray | None:
-        """Take the motion that the tracks agree on into the filter; return which agree, None where too few do.
+        """Update the filter with the motion that the tracks agree on; return which agree, None where too few do.
 
-        Those that are not put to the test agree.
+        Tracks that are not tested count as agreeing.
         """
         tested = (seen.refusals < REFUSALS) & seen.recent.can_predict(seen.now) & _deep(seen.uvs_px)
         found = _found(self._pairs(seen, seen.recent, tested), step, self._rig, self._rng)
@@ -126,7 +126,7 @@ class MovingTracks:
         return agree
 
     def _pairs(self, seen: "_Tracks", begun: "_Begun", which: BoolArray) -> "_Pairs":
-        """Return some tracks as points (N, 3) m of the body at the frame before, by where they were begun."""
+        """Return some tracks as points (N, 3) m in the body at the frame before, by their earlier sightings."""
         before, rig = seen.now - 1, self._rig
         frames, row = np.unique(begun.frames[which], return_inverse=True)
         T_before_begun = np.array([se3_inverse(self._path[before]) @ self._path[i] for i in frames.tolist()])
@@ -144,7 +144,7 @@ class _Begun(NamedTuple):
     frames: IntArray
 
     def can_predict(self, now: int) -> BoolArray:
-        """Say which (N,) are of an earlier frame and tell their depth."""
+        """Say which (N,) are of an earlier frame and have a known depth."""
         return np.asarray((self.frames < now) & _deep(self.uvs_px))
 
     def with_those(self, others: "_Begun", rows: IntArray, places: IntArray) -> "_Begun":
@@ -154,7 +154,7 @@ class _Begun(NamedTuple):
         return _Begun(uvs_px, frames)
 
     def moved_on(self, seen: "_Tracks", sound: BoolArray, most_frames: int) -> "_Begun":
-        """Return these with what is so many frames old moved on to now, if that is sound, and later in any case."""
+        """Replace sightings of a certain age by the present ones: by accepted ones first, later by any."""
         age = seen.now - self.frames
         late = (sound & (age >= most_frames)) | (age >= most_frames + REFUSALS) | ~_deep(self.uvs_px)
         return _Begun(np.where(late[:, None], seen.uvs_px, self.uvs_px), np.where(late, seen.now, self.frames))
@@ -189,7 +189,7 @@ class _Tracks:
         return replace(self, recent=recent, early=early, refusals=refusals)
 
     def checked(self, agree: BoolArray | None) -> "_Tracks":
-        """Return the tracks after it was said which (N,) agree; None where nothing can be said."""
+        """Return the tracks updated by which of them (N,) agree; None where that is not decided."""
         refusals = self.refusals
         if agree is not None:
             refusals = np.where((refusals < REFUSALS) & agree, 0, np.minimum(refusals + 1, REFUSALS))
@@ -199,7 +199,7 @@ class _Tracks:
 
 
 def _deep(uvs_px: Array) -> BoolArray:
-    """Say which sightings (N, 3) tell their depth."""
+    """Say which sightings (N, 3) have a known depth."""
     return np.asarray(~is_left_only(uvs_px) & (disparity_px(uvs_px) > LEAST_DISPARITY_PX))
 
 
@@ -248,7 +248,7 @@ class _Pairs(NamedTuple):
     path_cov: Array
 
     def linear(self, T_start_end: Array, rig: StereoRig) -> "_Linear":
-        """Return what is left of the sightings where a motion puts the points."""
+        """Return the residuals of the sightings under a motion, linearised."""
         T_end_start = se3_inverse(T_start_end)
         points = transform(T_end_start, self.points)
         points_cam = transform(rig.T_cam_imu, points)
@@ -330,7 +330,7 @@ class _Problem(NamedTuple):
 
 
 def _softened(problem: _Problem, bound: float) -> Array:
-    """Return the error (6,) that is found from none on, large residuals losing their weight by and by."""
+    """Return the error (6,) found from zero on, with the weights of large residuals lowered step by step."""
     error = np.zeros(6)
     for factor in _SOFTENED:
         error, _ = problem.solution((1.0 + problem.chi2(error[None])[0] / (factor * bound)) ** -2)
@@ -338,7 +338,7 @@ def _softened(problem: _Problem, bound: float) -> Array:
 
 
 def _searched(problem: _Problem, best: Array, bound: float, most: float, rng: np.random.Generator) -> Array:
-    """Return the least costly of an error (6,), none, and those that three tracks each show, if it is possible."""
+    """Return the error (6,) of least cost: the given one, zero, or a possible one that three tracks determine."""
     size = min(_SAMPLE, len(problem.residuals))
     rows = rng.random((_SAMPLES, len(problem.residuals))).argpartition(size - 1, axis=1)[:, :size]
     of_samples = problem.jacobians[rows].reshape(_SAMPLES, -1, 6)

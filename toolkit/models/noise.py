@@ -8,7 +8,7 @@ from toolkit.resampling import NS_PER_S
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
 TRACKED_PIXEL_SIGMA_PX = 0.5
-# What a noise-free-looking odometer still gets wrong between frames: pairing, wheel slip, lever arm.
+# Least noise of an odometer, even where its samples look free of noise: pairing, wheel slip, lever arm.
 LEAST_VELOCITY_SIGMA_MPS = 0.05
 LEAST_GYRO_SIGMA_RADPS = 0.005
 # Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: moves it by 2e-4 rad/s in 100 s.
@@ -16,20 +16,20 @@ GYRO_RANDOM_WALK = 2e-5
 # White noise (m/s^2/sqrt(Hz), rad/s/sqrt(Hz)) and accelerometer walk (m/s^3/sqrt(Hz)) of such a unit in motion, where
 # vibration and scale count for more than its data sheet: as on EuRoC's recordings (io/euroc_calibration), rounded up.
 MEMS_ACCEL, MEMS_GYRO, MEMS_ACCEL_WALK = 2e-2, 1e-3, 3e-3
-# How much a motion that nobody measured changes (m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)): a second of braking at 3 m/s^2, or
-# of a hand that turns at 1 rad/s. The tracks say the rest; a wrong guess by three costs them little.
+# Change of an unmeasured motion (m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)): a second of braking at 3 m/s^2, or of a hand that
+# turns at 1 rad/s. The tracks determine the motion; a factor of three in these numbers changes the result little.
 VELOCITY_CHANGE, TURN_CHANGE = 3.0, 1.0
 
 _MAD_TO_SIGMA = 1.4826
 
 
 def mems_imu() -> ImuNoise:
-    """Return the noise of an IMU that states none: that of a MEMS unit on something that vibrates."""
+    """Return the noise of an IMU that states none: that of a MEMS unit on a vibrating vehicle."""
     return ImuNoise(MEMS_ACCEL, MEMS_GYRO, MEMS_ACCEL_WALK, GYRO_RANDOM_WALK)
 
 
 def unmeasured_motion() -> TwistChangeNoise:
-    """Return the noise of a motion that nobody measured, the same for cars and hands."""
+    """Return the noise of an unmeasured motion, the same for cars and hand-held cameras."""
     return TwistChangeNoise(np.full(3, VELOCITY_CHANGE), np.full(3, TURN_CHANGE))
 
 

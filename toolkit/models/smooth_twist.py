@@ -1,11 +1,12 @@
-"""Motion that nobody measured: the body's twist stays as it was but for white noise on its change.
+"""Unmeasured motion: the body's twist is constant but for white noise on its change.
 
-The state is pose, velocity and turn rate. They stand where a state with an IMU has velocity and gyro bias: a gyro that
-always reads zero has the turn rate, with the sign changed, as its bias. So estimators need not know of this kind.
+The state is pose, velocity and turn rate. Velocity and turn rate stand where a state with an IMU has velocity and gyro
+bias: a gyro that always reads zero has the turn rate, with the sign changed, as its bias. So estimators need no code
+for this kind of motion.
 
-Over dt the pose moves by T <- T exp(dt [w, v]), v being the velocity in the body frame, which stays. White noise of
-densities q on the twist's change adds q dt^3/3 to the pose, q dt to the twist, and q dt^2/2 to what both share
-(Barfoot, "State estimation for robotics" (2017), eq. 3.202: white noise on acceleration).
+Over dt the pose moves by T <- T exp(dt [w, v]), where v is the velocity in the body frame, which is constant. White
+noise of densities q on the twist's change adds q dt^3/3 to the covariance of the pose, q dt to that of the twist, and q
+dt^2/2 to that between them (Barfoot, "State estimation for robotics" (2017), eq. 3.202: white noise on acceleration).
 """
 
 from collections.abc import Mapping
@@ -49,14 +50,14 @@ class SmoothIncrement:
     noise: TwistChangeNoise
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state over the interval: the twist of its own mean moves it."""
+        """Carry a state over the interval, moved by the twist of its mean."""
         xi = self.dt_s * _twist(start.T_world_imu, start.v_world, start.bias[3:])
         T_start_end = se3_exp(xi)
         v_body = start.T_world_imu[:3, :3].T @ start.v_world
         T_world_imu = start.T_world_imu @ T_start_end
         v_world = T_world_imu[:3, :3] @ v_body
         transition = _transition(T_start_end, se3_right_jacobian(xi), v_body, self.dt_s)
-        # A turn of the end's axes changes what of the body's velocity is an error of the world's.
+        # A rotation error at the end also changes the velocity error, because the body's velocity is fixed in its axes.
         spread = np.zeros((12, 12))
         spread[POSE, POSE] = np.eye(6)
         spread[_VELOCITY, ROTATION] = -skew(v_body)
@@ -137,7 +138,7 @@ def _fill(
 
 
 class SmoothTwist:
-    """Pose, velocity and turn rate, moved by a twist that stays as it was but for noise."""
+    """Pose, velocity and turn rate, moved by a twist that is constant but for noise."""
 
     layout = SMOOTH_LAYOUT
     variable_sizes: Mapping[str, int] = {"x": 6, "v": 3, "b": 3}

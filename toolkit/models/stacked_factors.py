@@ -1,7 +1,7 @@
 """Python factors of one form, evaluated and linearised all at once, for a solver that has many of them.
 
-GTSAM calls a factor of Python's by itself: a thousand steps along twists then take as long as the thirty thousand
-stereo factors beside them. Residuals, noise and derivatives here are those of the factors one by one
+GTSAM calls each Python factor separately: a thousand twist factors then take as long as the thirty thousand stereo
+factors of the same graph. Residuals, noise and derivatives here are those of the factors one by one
 (:func:`~toolkit.models.twist.twist_factor`, :func:`~toolkit.models.gap_bridge.kept_twist`), on arrays.
 """
 
@@ -50,7 +50,7 @@ def linear_factors(stack: StackedFactors, values: gtsam.Values) -> Iterator[gtsa
 
 
 def stacked(increments: Mapping[int, Increment], over: Mapping[int, KeptTwist]) -> list[StackedFactors]:
-    """Return stacks of the motion to states by their numbers and of bridges, as far as their factors are Python's."""
+    """Return stacks of those steps and bridges whose factors are in Python, given by the number of their last state."""
     steps = {k: increment for k, increment in increments.items() if isinstance(increment, TwistIncrement)}
     stacks = list[StackedFactors]()
     if steps:
@@ -104,7 +104,7 @@ class StackedSteps:
         return Linearised(_whitened(self.whitening, error), (by_start, by_end, by_step @ self.d_step_d_bias))
 
     def _errors(self, values: gtsam.Values) -> tuple[Array, Array]:
-        """Return the steps (N, 4, 4) with the biases that the values have, and what they are off at their ends."""
+        """Return the steps (N, 4, 4) with the biases of the values, and their errors at the ends."""
         bias = np.array([values.atVector(B(k - 1)) for k in self.k.tolist()])
         correction = (self.d_step_d_bias @ (bias - self.gyro_bias)[..., None])[..., 0]
         step_now = self.T_start_end @ se3_exp(correction)
@@ -114,7 +114,7 @@ class StackedSteps:
 
 @dataclass(frozen=True, eq=False)
 class StackedBridges:
-    """That the twists of two intervals are the same, which last some seconds each (N, 2) and end in states ``k`` (N,).
+    """N bridges: two intervals with durations (N, 2) s, which end in states ``k`` (N,), have the same twist.
 
     ``sigmas`` (N, 6) are the standard deviations of the change.
     """
@@ -125,7 +125,7 @@ class StackedBridges:
 
     @classmethod
     def of(cls, bridges: Mapping[int, KeptTwist]) -> "StackedBridges":
-        """Return what is kept up to states by their numbers."""
+        """Return the bridges by the number of their last state."""
         kept = list(bridges.values())
         return cls(
             np.array(list(bridges), dtype=np.int64),

@@ -1,4 +1,4 @@
-"""The state of the IMU as every model, filter and graph has it: where its blocks stand, its mean, its covariance.
+"""The state of the IMU in every model, filter and graph: the layout of its blocks, its mean, its covariance.
 
 Errors follow GTSAM: the pose [rotation, position] and the velocity are perturbed in the body frame.
 """

@@ -9,21 +9,22 @@ Variables that depend on the same later ones, as pose, velocity and biases of on
 one by one, in the second order below, all digits are lost within seconds of an IMU.
 
 Two orders are tried. In the order of time every state is recovered from the next, from the last to the first: with an
-IMU all are right to 1e-7 of a standard deviation, but where steps between states are known far better than the states,
-as where the errors of sightings are correlated, rounding grows on the way. On a drive of 125 frames a standard
+IMU all are right to 1e-7 of a standard deviation. But where steps between states are known far better than the states,
+as with correlated errors of sightings, rounding grows from state to state. On a drive of 125 frames a standard
 deviation of the first came out wrong by 5 % of itself, along the 1010 frames of Dataset 03, by twists, by fifty times.
-Nested dissection cuts the graph in halves again and again, and what cuts it comes last (George 1973, "Nested
+Nested dissection cuts the graph in halves recursively; the variables of a cut are eliminated last (George 1973, "Nested
 dissection of a regular finite element mesh"): from the root to any state it is some tens of variables, and on those
-drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Dissection comes
-first where states have no velocity, whose steps twists measure, but not where landmarks are seen for long, as while a
-vehicle stands: those it does not know how to cut. An order counts where it gives states the covariance that each has by
-itself: in time the first, where rounding ends up, else some.
+drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Nested dissection
+is tried first where states have no velocity (their steps are measured twists), but not where landmarks are seen for
+long, as while a vehicle stands: such landmarks connect so many states that dissection finds no small cut. The result of
+an order is accepted if some of its covariances equal those computed for these states separately: for the order of time
+the first state, where rounding accumulates, else a few states.
 
-Where neither does, landmarks are looked at. Of one that went thousands of baselines away the measurements tell the
-depth in metres so badly that GTSAM refuses it, or that its rounding is the states', though its disparity is told as
-well as any. A linear change of a landmark's coordinates changes no state's covariance, so every landmark is then given
-by what the measurements know of it, each direction in its own standard deviation, and a direction that they say nothing
-of is left out: nothing hangs on it. Where that does not help either, all are refused.
+Where neither order is accepted, the coordinates of landmarks are changed. For a landmark thousands of baselines away
+the depth in metres is so uncertain that GTSAM rejects it as undetermined, or that rounding spoils the states'
+covariances, although its disparity is well determined. A linear change of a landmark's coordinates changes no state's
+covariance. So every landmark is expressed in the directions that the measurements determine, each scaled by its
+standard deviation, and undetermined directions are left out. Where this does not help either, RoundingError is raised.
 """
 
 from collections import Counter, defaultdict
@@ -38,21 +39,21 @@ from toolkit.geometry import Array
 from toolkit.models.factors import linear_factor
 from toolkit.models.motion import MotionModel, state_keys
 
-# A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
+# Accepted relative error of a standard deviation, which is read to a tenth.
 _MOST_ROUNDED = 0.01
-# A landmark that ties more states than this is eliminated among them and not before.
+# A landmark seen by more states than this is eliminated among them and not before.
 _MOST_TIED = 50
-# Where one ties states further apart, as while a vehicle stands, the order of time is tried first.
+# Where a landmark is seen by states farther apart, as while a vehicle stands, the order of time is tried first.
 _STANDING = 150
-# A direction of a variable with less than this share of the information on its best one is lost in the sixteen digits
-# of the Jacobians: a landmark's depth beyond ten thousand million baselines.
+# A direction of a variable with less than this share of the information on its best direction is lost in double
+# precision: the depth of a landmark beyond 1e10 baselines.
 _LEAST_DETERMINED = 1e-10
-# So many rows may be added to a joint covariance before it is copied, without those that are not needed any more.
+# Rows that may be added to a joint covariance before it is copied without the rows that are no longer needed.
 _ROOM = 100
 
 
 class RoundingError(RuntimeError):
-    """The covariances of the states came out wrong, and are not known."""
+    """Rounding spoilt the covariances of the states; they are not available."""
 
 
 def state_covs(linear: gtsam.GaussianFactorGraph, motion: MotionModel, poses: Array) -> Array:
@@ -69,14 +70,14 @@ def covs_beside(
 ) -> tuple[Array, Array]:
     """Return the covariances of the states as :func:`state_covs`, and (m, m) of the variables beside them.
 
-    Those are of no frame, as the scale of disparities is: they are eliminated after all states.
+    These variables belong to no frame, like the scale of disparities; they are eliminated after all states.
     """
     states, has_velocity = [state_keys(motion, k) for k in range(len(poses))], "v" in motion.variable_sizes
     try:
         covs = _of_groups(linear, states, beside, has_velocity)
     except RuntimeError:
         kept = {key for group in (*states, beside) for key in group}
-        covs = _of_groups(_others_as_measured(linear, kept), states, beside, has_velocity)
+        covs = _of_groups(_with_orthonormal_landmarks(linear, kept), states, beside, has_velocity)
     of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
     return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
 
@@ -86,7 +87,7 @@ def _of_groups(
 ) -> list[Array]:
     """Return the joint covariance of the variables of each state, and of those beside them if there are any."""
     together: Sequence[Sequence[int]] = [*states, beside] if beside else states
-    tied = _tied(linear, together)
+    tied = _with_groups_connected(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
     spans = _spans(tied, together)
@@ -104,11 +105,10 @@ def _of_groups(
     raise failure
 
 
-def _others_as_measured(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
+def _with_orthonormal_landmarks(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
     """Return the graph with all variables but those kept in coordinates whose Jacobians are orthonormal.
 
-    A variable has as many of them as there are directions that the graph says anything of, and leaves it if there are
-    none.
+    A variable keeps the directions that the graph determines, and is left out if there are none.
     """
     factors, sizes = [linear.at(i) for i in range(linear.size())], linear.gradientAtZero()
     blocks = defaultdict[int, list[Array]](list)
@@ -116,7 +116,7 @@ def _others_as_measured(linear: gtsam.GaussianFactorGraph, kept: Collection[int]
         for key, block in _terms(factor, sizes):
             if key not in kept:
                 blocks[key].append(block)
-    directions = {key: _measured(np.vstack(rows)) for key, rows in blocks.items()}
+    directions = {key: _determined_directions(np.vstack(rows)) for key, rows in blocks.items()}
     graph = gtsam.GaussianFactorGraph()
     for factor in factors:
         terms = [(key, block @ directions[key] if key in directions else block) for key, block in _terms(factor, sizes)]
@@ -132,8 +132,8 @@ def _terms(factor: gtsam.GaussianFactor, sizes: gtsam.VectorValues) -> list[tupl
     return list(zip(keys, np.split(factor.jacobian()[0], ends[:-1], axis=1), strict=True))
 
 
-def _measured(jacobian: Array) -> Array:
-    """Return the directions (d, r) that a Jacobian (m, d) says anything of, each as long as its standard deviation."""
+def _determined_directions(jacobian: Array) -> Array:
+    """Return the directions (d, r) that a Jacobian (m, d) determines, each scaled to its standard deviation."""
     _, per_unit, directions = np.linalg.svd(jacobian, full_matrices=False)
     determined = per_unit > _LEAST_DETERMINED * per_unit[0]
     return np.asarray(directions[determined].T / per_unit[determined])
@@ -142,8 +142,8 @@ def _measured(jacobian: Array) -> Array:
 def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -> list[Array]:
     """Return the variances of the variables of some states, all else eliminated variable by variable.
 
-    By cliques GTSAM refuses here what has a covariance: the world behind hundreds of frames is so much looser than the
-    step between two that both in one clique are beyond the condition it allows.
+    Elimination by cliques would fail here: after hundreds of frames a pose is so much more uncertain than a step that
+    both in one clique exceed the condition number that GTSAM allows.
     """
     keys = [key for state in states for key in state]
     last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
@@ -154,8 +154,10 @@ def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -
     return np.split(np.diag(np.linalg.inv(information)), ends[:-1])
 
 
-def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) -> gtsam.GaussianFactorGraph:
-    """Return a graph with factors beside it that say nothing, by which variables of a group depend on one another."""
+def _with_groups_connected(
+    linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]
+) -> gtsam.GaussianFactorGraph:
+    """Return the graph with added factors of zero information that connect the variables of each group."""
     graph, sizes = gtsam.GaussianFactorGraph(), linear.gradientAtZero()
     graph.push_back(linear)
     unit = gtsam.noiseModel.Unit.Create(1)
@@ -169,10 +171,11 @@ def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) 
 def _in_time(
     graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]], spans: Mapping[int, tuple[int, int]]
 ) -> gtsam.Ordering:
-    """Return the order of the groups as they are given, after all that is in none: landmarks.
+    """Return the order of the groups as given, after all variables in no group: the landmarks.
 
-    Eliminated, a landmark leaves a dense factor of all states that saw it. One seen for long, as all are while a
-    vehicle stands, waits for the last of them, and until then is beside each: some hundred rows instead of thousands.
+    Eliminating a landmark leaves a dense factor on all states that saw it. A landmark seen for long, as while a vehicle
+    stands, is eliminated after the last of these states and until then is in the clique of each: some hundred rows
+    instead of thousands.
     """
     landmarks = _others(gtsam.Ordering.ColamdGaussianFactorGraph(graph), {key for group in groups for key in group})
     waiting = {key: last for key, (first, last) in spans.items() if last - first > _MOST_TIED}
@@ -264,9 +267,9 @@ def _clique(conditionals: Sequence[gtsam.GaussianConditional], sizes: Mapping[in
 
 
 class _Joint:
-    """The joint covariance of some variables, in a matrix with room for more: what is added leaves the rest in place.
+    """The joint covariance of some variables, in a matrix with room for more, so that adding variables moves no others.
 
-    What is not needed any more stays until the room is used up.
+    Variables that are no longer needed stay until the room is used up.
     """
 
     def __init__(self, rows: dict[int, range], cov: Array, room: int) -> None:
@@ -288,7 +291,7 @@ class _Joint:
         return self._size + len(clique.cov) <= len(self._matrix)
 
     def add(self, clique: _Clique) -> None:
-        """Add the variables of a clique, of which all that it depends on are here."""
+        """Add the variables of a clique; all variables that it depends on must be present."""
         before, size = self._size, self._size + len(clique.cov)
         gain = np.zeros((size - before, before))
         gain[:, _together(self._rows, clique.later)] = clique.gain
@@ -324,7 +327,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
         groups[clique_of[min(group, key=place.__getitem__)]].append(group)
     joints, waiting, covs = dict[int, _Joint](), Counter(next_of), dict[int, Array]()
     for i in reversed(range(len(cliques))):
-        joint = _given(cliques[i], next_of[i], joints, waiting)
+        joint = _room_for(cliques[i], next_of[i], joints, waiting)
         joint.add(cliques[i])
         covs |= {group[0]: joint.of(group) for group in groups[i]}
         if waiting[i]:
@@ -332,7 +335,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
     return [covs[group[0]] for group in together]
 
 
-def _given(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
+def _room_for(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
     """Return a joint covariance that a clique can be added to; the last clique that waits for one takes it over."""
     if after is None:
         return _Joint({}, np.empty((0, 0)), _ROOM + len(clique.cov))

@@ -112,9 +112,9 @@ def scaled_rig(rig: StereoRig, scale: float) -> StereoRig:
     """Return the rig whose sightings have disparities larger by a share, which is more than -1.
 
     d becomes d (1 + scale), the mean column c = (uL + uR) / 2 and the row stay. That is, exactly, a pair whose baseline
-    is b (1 + scale) about the same middle: the left camera is half of what is added further to the left. A baseline or
-    a focal length that is calibrated wrong does so, and matching that prefers one side; one about the left camera would
-    move c by half a scaled disparity as well.
+    is b (1 + scale) about the same middle: the left camera is half of what is added further to the left. A wrongly
+    calibrated baseline or focal length has this effect, and so has matching that is biased to one side. A scale about
+    the left camera would also move c by half the change of the disparity.
     """
     T_imu_cam = rig.T_imu_cam.copy()
     T_imu_cam[:3, 3] -= 0.5 * scale * rig.baseline_m * T_imu_cam[:3, 0]

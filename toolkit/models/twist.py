@@ -57,7 +57,7 @@ def integrate_each(motions: Sequence[TwistMotion], gyro_biases: Array, noise: Tw
 
 
 class _Pieces(NamedTuple):
-    """What each twist makes of a step: motions (n, 4, 4), derivatives (n, 6, 3) and covariances (n, 6, 6)."""
+    """The part of a step by each twist: motions (n, 4, 4), derivatives (n, 6, 3) and covariances (n, 6, 6)."""
 
     motions: Array
     biases: Array

@@ -1,7 +1,8 @@
-"""What a comparison leaves behind: tables, words, JSON documents, trajectories, figures, one HTML page; nothing runs.
+"""Everything a comparison leaves behind: tables, text, JSON, trajectories, figures, a page; nothing is run here.
 
-Reading order: table, prose -> comparison_table, messages -> comparison_text -> scores_json, curves, report_json,
-manifest, all by records -> camera_frames -> run_directory; figures/ draws; run_files reads a run directory, html/ makes
-the page of some, differences compares two, export passes one on. gate, evaluation_text (with evaluation_files), card,
-verify_text and citations show what commands of their own find; schemas writes docs/schemas.
+Reading order: table, prose -> comparison_table, messages -> comparison_text -> score_records and records (the JSON
+documents) -> scores_json, curves, report_json and manifest, which fill them -> camera_frames -> run_directory, which
+writes and reads a run directory. figures/ draws, html/ makes the page of run directories, differences compares two,
+export passes one on. gate, evaluation_text (with evaluation_files), card, verify_text and citations show the results of
+other commands; schemas writes docs/schemas.
 """

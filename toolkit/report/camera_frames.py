@@ -1,7 +1,7 @@
-"""A few images of a recording with the tracks that were made of them, and how well each estimator explains each track.
+"""A few images of a recording with their tracks, and the error of each track under each estimator's poses.
 
-What is told of a sighting is its leave-one-view-out error: how far it lies from where the track's other sightings, from
-the estimated poses, say. It asks nothing of an estimator but poses, and is small where pose and track are good.
+The error of a sighting is its leave-one-view-out error: its distance from the prediction by the track's other sightings
+and the estimated poses. It needs only the poses of an estimator, and is small where poses and track are accurate.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.report.curves import seconds
-from toolkit.report.records.report import CameraFrame, TrackErrors
+from toolkit.report.records import CameraFrame, TrackErrors
 from toolkit.sequence import Sequence
 
 FOLDER = "frames"
@@ -69,7 +69,7 @@ def camera_frames(comparison: Comparison) -> tuple[SeenFrame, ...]:
 def _images(comparison: Comparison) -> ImageRecording | None:
     try:
         return tracked_images(comparison.source, comparison.settings.frontend)
-    except DataError:  # a sequence out of memory has a name and no path
+    except DataError:  # a sequence given as a value has a name and no path
         return None
 
 
@@ -91,7 +91,7 @@ def _errors_px(row: Row, sequence: Sequence, requested: BoolArray) -> Array | No
 
 
 def _left_images(recording: ImageRecording, frames_t_ns: IntArray, shown: IntArray) -> Iterator[tuple[int, Image]]:
-    """Yield the left images of frames; one that is gone since the tracks were made is left out."""
+    """Yield the left images of frames; an image that was removed since the tracks were made is left out."""
     pair_at = {pair.t_ns: pair for pair in recording.pairs}
     there = [(k, pair_at[t]) for k, t in zip(shown.tolist(), frames_t_ns[shown].tolist(), strict=True) if t in pair_at]
     for (k, _), images in zip(there, read_pairs(recording, [pair for _, pair in there]), strict=True):

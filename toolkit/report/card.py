@@ -1,4 +1,4 @@
-"""The card of a recording in words and as a record: why a smoother does or does not win on it."""
+"""The card of a recording as text and as a record: why a smoother is or is not better than a filter on it."""
 
 from collections.abc import Iterator
 
@@ -9,21 +9,21 @@ from toolkit.files.documents import number, rounded
 from toolkit.geometry import Array
 from toolkit.report.comparison_table import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.records.report import CardRecord
+from toolkit.report.records import CardRecord
 from toolkit.report.table import MISSING, Table, as_text
 from toolkit.sequence import Sequence
 from toolkit.track_errors import Card
 
-# Shares and lengths from which they are remarked on.
+# Shares and lengths beyond which there is a remark.
 _MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
-# A scale is off where it is so many standard errors and so much away from one: disparities that err by chance alone
-# make vision 0.15 to 0.25 % long on average (eight seeds of drive and of drive-realistic).
+# A scale is wrong where it differs from one by this many standard errors and by this much: unbiased errors of
+# disparities make vision 0.15 to 0.25 % too long on average (eight seeds of drive and of drive-realistic).
 _SIGMAS, _SCALE_OFF = 3.0, 0.005
 _STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
 
 
 def card_lines(card: Card) -> Iterator[str]:
-    """Yield what the card says, a sentence or two each."""
+    """Yield the statements of the card, one or two sentences each."""
     few, middle, many = card.seen_frames
     yield (
         f"{card.a_frame:.0f} visible tracks a frame, seen in {middle:.0f} frames in the median ({few:.0f} to "

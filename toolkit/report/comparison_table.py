@@ -1,6 +1,6 @@
-"""The table of a comparison: which metrics have a column, and above it the recording and the rules all had in common.
+"""The table of a comparison: its columns, and the lines above it with the recording and the common rules.
 
-Which have one by default is said by the metrics' own records in :mod:`toolkit.metrics`.
+Which metrics have a column by default is in the metrics' records (:mod:`toolkit.metrics`).
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -14,10 +14,11 @@ from toolkit.report.table import MISSING, Table, cell, heading, number
 from toolkit.sequence import Sequence
 from toolkit.settings import Noise, Window, outlier_summary
 
-# The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
+# The metric whose mean over seeds is compared with its band, in a column after that of the mean.
 _BANDED = "nees_pose_mean"
-# What comes first in the table of a real drive: its drift, and the error that keeps the vertical. After an SE(3) fit
-# good estimators differ by luck there (one model solved twice differed by a metre). The drift says what the RPE would.
+# First columns of a real drive: the drift, and the error after a fit that keeps the vertical. After an SE(3) fit of a
+# drive, differences of good estimators are chance (one model solved twice differed by a metre). The drift replaces the
+# RPE.
 _LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 # The columns of a table: None for the usual ones, "all", or metrics by key or name.
 Columns = None | Literal["all"] | tuple[str, ...]
@@ -140,7 +141,7 @@ def shared_values(comparison: Comparison, columns: Columns = None) -> Iterator[s
 
 
 def change_lines(changes: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield a line for each estimator that changes something against the rung before, aligned; none off a ladder."""
+    """Yield an aligned line for each estimator with its change against the rung before; none outside a ladder."""
     given = [(name, change) for name, change in changes if change]
     width = max((len(name) for name, _ in given), default=0)
     for name, change in given:
@@ -193,7 +194,7 @@ def rules_line(comparison: Comparison) -> str:
 
 
 def _track_noise(noise: Noise) -> str:
-    """Say what the errors of a track are taken for, where they are not taken for white."""
+    """Say which model of track errors is used, where it is not white noise."""
     if noise.tracks == "white":
         return ""
     if noise.tracks == "correlated":
@@ -203,14 +204,14 @@ def _track_noise(noise: Noise) -> str:
 
 
 def _optional_parts(noise: Noise) -> str:
-    """Say what is taken into account besides, where it is not as by default."""
+    """Say which optional parts of the noise model are used, where this differs from the default."""
     sigma = noise.disparity_scale
     scale = "" if sigma is None else f"; disparities scaled by 0 +- {100.0 * sigma:g} %, a state"
     return f"{scale}{'' if noise.bridge_gaps else '; gaps between tracks not bridged'}"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:
-    """Return how many frames have no state in a window, for it would hold too many."""
+    """Return how many frames have no state in the window, because it would hold too many."""
     last, left_out = -1, 0
     for since_ns in (sequence.frames_t_ns - sequence.frames_t_ns[:1]).tolist():
         interval = window.interval(since_ns, sequence.motion_kind)

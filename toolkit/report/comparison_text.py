@@ -1,6 +1,6 @@
-"""A comparison in words and tables: as it is printed, and as ``report.md``; and what the audit alone found.
+"""A comparison as text: as it is printed, and as ``report.md``; and the findings of an audit alone.
 
-The table, and around it everything a reader must know before believing it: what numbers mean, how far to trust them.
+Around the table is everything needed to read it: the meaning of the numbers, and how far they can be trusted.
 """
 
 from collections.abc import Mapping

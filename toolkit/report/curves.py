@@ -1,8 +1,8 @@
-"""What figures and report.json draw over time, as numbers: errors after a fit to the truth, and by component.
+"""The series that figures and report.json draw over time: errors after a fit to the truth, and by component.
 
-The pairs and the fits are the metrics' own.
-With an IMU the vertical is measured and only heading and position are fitted (the fit of ate_yaw_m); from twists
-alone an estimator does not know the vertical, and a whole rigid motion is fitted (that of ate_se3_m).
+Pairs and fits are those of the metrics. With an IMU the vertical is measured and only heading and position are fitted
+(the fit of ate_yaw_m); from twists alone an estimator does not know the vertical, and a whole rigid motion is fitted
+(that of ate_se3_m).
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ class Errors(NamedTuple):
 
 
 class ReferenceEstimate(NamedTuple):
-    """A trajectory that others are measured against where there is no truth, and how to call it."""
+    """The trajectory that others are compared with where there is no truth, and its name."""
 
     name: str
     trajectory: Trajectory
@@ -120,9 +120,9 @@ def shown_output(run: Run) -> Output:
 
 
 class _Reference(NamedTuple):
-    """What the curves are measured against, how a row is aligned to it first, and how to call the difference.
+    """The reference of the curves, the alignment of a row to it, and the name of the difference.
 
-    ``trajectory`` is the estimate that stands for the truth where there is none.
+    ``trajectory`` is the estimate that replaces the truth where there is none.
     """
 
     truth: Truth
@@ -133,7 +133,7 @@ class _Reference(NamedTuple):
 
 
 class ErrorCurves(NamedTuple):
-    """The rows with their errors, how to call them ("error", or the difference from whom) and the caption."""
+    """The rows with their errors, the name of these ("error", or "difference from" a run) and the caption."""
 
     of_rows: list[tuple[Row, Errors]]
     what: str

@@ -18,14 +18,14 @@ from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, 
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.run_files import RunFiles, SeedsFiles
+from toolkit.report.run_directory import RunFiles, SeedsFiles
 from toolkit.report.table import MISSING, Table, as_text, cell
 
 Files = RunFiles | SeedsFiles
 _SAME = 1e-6
 _FEWEST_PAIRS = 2
 _COSTS = frozenset(metric.key for metric in cost.METRICS)
-# Of a manifest: what is asked for, what it runs with, what is read; the rest is where and when.
+# Parts of a manifest that are compared: request, settings, versions and data; the rest is place and time.
 _RUNS_WITH = ("versions", "git_revision", "cpu", "os", "threads")
 _READS = ("sequence", "start", "seeds", "references")
 _LONGEST = 40
@@ -33,7 +33,7 @@ _LONGEST = 40
 
 @dataclass(frozen=True)
 class Change:
-    """A thing of one name that the two sides have otherwise, as text; "" where one has none."""
+    """A named value that differs between the two sides, as text; "" where a side has none."""
 
     name: str
     before: str
@@ -70,12 +70,12 @@ class MetricChange:
 
     @property
     def beyond_chance(self) -> bool | None:
-        """Say whether chance is a poor explanation, None where it cannot be told."""
+        """Say whether the change is significant, None where it cannot be tested."""
         return None if self.p is None else self.p <= FALSE_ALARM_RATE
 
     @property
     def is_cost(self) -> bool:
-        """Say whether it is time or memory, which no two runs have the same."""
+        """Say whether it is time or memory, which differ between any two runs."""
         return self.metric in _COSTS
 
 
@@ -176,7 +176,7 @@ def _repeats_causal(lines: Mapping[tuple[str, str], _Line], key: tuple[str, str]
 
 
 def _reads_the_same(before: Files, after: Files) -> bool:
-    """Say whether both sides read the same recording under each seed they share; two drawn otherwise are no pairs."""
+    """Say whether both sides read the same recording under each common seed; otherwise runs are not paired."""
     one, two = (
         dict(zip(files.scores.seeds, files.scores.hashes, strict=True))
         if isinstance(files, SeedsFiles)
@@ -190,7 +190,7 @@ def _reads_the_same(before: Files, after: Files) -> bool:
 def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> float | None:
     """Return the p-value that a metric is the same on average, two-sided; None where too few runs tell.
 
-    What is the same under every seed needs no test, and time and memory depend on what else the machines did.
+    Values that are the same under every seed need no test; time and memory depend on other load of the machines.
     """
     was, is_ = before.good(metric), after.good(metric)
     if metric.key in _COSTS or was == is_:
@@ -212,7 +212,7 @@ def _array(values: Mapping[int, float]) -> Array:
 
 
 def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[Change]:
-    """Yield each line whose runs ended otherwise, or that one side alone has."""
+    """Yield each line whose runs ended differently, or that only one side has."""
     for key in dict.fromkeys((*before, *after)):
         counts = [_counts(side[key]) if key in side else "" for side in (before, after)]
         if counts[0] != counts[1]:
@@ -326,7 +326,7 @@ def _section(title: str, changes: tuple[Change, ...]) -> list[str]:
 
 
 def _short(text: str) -> str:
-    """Return a text, a long one without its middle: what differs is at the end, as of a file or of a changed commit."""
+    """Return a text, a long one without its middle: differences are usually at the end."""
     half = (_LONGEST - 3) // 2
     return (text if len(text) <= _LONGEST else f"{text[:half]}...{text[-half:]}") or MISSING
 

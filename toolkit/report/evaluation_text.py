@@ -169,11 +169,11 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
     scored = {metric.key for metric in evaluation.scored_metrics}
-    remarks: dict[str, _About] = {}
+    remarks: dict[str, _RemarkScope] = {}
     for run in evaluation.runs:
         for key in run.notes.keys() & scored:
             text = run.notes[key] if run.values.get(key) is not None else f"no value: {run.notes[key]}"
-            about = remarks.setdefault(text, _About({}, {}))
+            about = remarks.setdefault(text, _RemarkScope({}, {}))
             about.keys[key] = about.whose[f"{run.item.system} on {run.item.sequence}"] = None
     for text, about in list(remarks.items())[:_MOST_REMARKS]:
         first, *others = about.whose
@@ -182,7 +182,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         yield f"{', '.join(metric.key for metric in METRICS if metric.key in about.keys)}{whose}: {text}"
 
 
-class _About(NamedTuple):
+class _RemarkScope(NamedTuple):
     """The metrics, and the systems on sequences, that a remark is about, in order."""
 
     keys: dict[str, None]

@@ -1,4 +1,4 @@
-"""A run directory handed on: a trajectory in another program's format, or the run as one file to check and repeat.
+"""Exports of a run directory: a trajectory in another program's format, or the run as one file to check and repeat.
 
 A bundle is a zip archive with bundle.json (``vislam.bundle/1``), requirements.txt (the release of every package that is
 installed) and the run's files but for its figures. The same directory gives the same bytes.
@@ -22,13 +22,12 @@ from toolkit.files import documents
 from toolkit.files.reading import open_input
 from toolkit.files.writing import replaced_file, write_text
 from toolkit.report.records import Report
-from toolkit.report.run_directory import MANIFEST
-from toolkit.report.run_files import RunFiles, SeedsFiles, read_run
+from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
 TRUTH = "truth"
 BUNDLE, LOCK = "bundle.json", "requirements.txt"
 _NEVER_IN = ("figures/",)
-# The oldest stamp that a zip archive can hold, for every entry: when a file was written says nothing.
+# The oldest stamp that a zip archive can hold, for every entry, so that the same files give the same bytes.
 _STAMP = (1980, 1, 1, 0, 0, 0)
 _MOST_BYTES = 4 * 2**30
 _REMEDY = "make it again with vislam export --bundle"

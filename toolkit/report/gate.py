@@ -1,6 +1,6 @@
-"""A check of the gate for people: the verdict in one line, a table of everything, what failed and why, what to know.
+"""A check of the gate as text: the verdict in one line, a table of everything, failures with reasons, notes.
 
-And the files it leaves behind, each only where it is asked for: JUnit XML, Markdown and JSON.
+And its files, each on request: JUnit XML, Markdown and JSON.
 """
 
 from collections import Counter
@@ -96,7 +96,7 @@ def _value(value: float | None) -> str:
 def _percent(value: float | None, sign: str = "") -> str:
     if value is None:
         return MISSING
-    # A change that is shown must not be printed as none.
+    # A change that is shown must not be printed as zero.
     small = 100.0 * SHOWN <= abs(value) < 0.05
     return f"{value:{sign}.0e}" if small else f"{value + 0.0:{sign}.1f}"
 

@@ -1,6 +1,7 @@
-"""How a run can be repeated: the command, every version, the data's hash, seeds, threads and the machine.
+"""``manifest.json``, the contract ``vislam.manifest/1``: how a run can be repeated.
 
-And, in short, how a baseline was made.
+It holds the command, every version, the data's hash, seeds, threads and the machine; ``made_here`` is the short form
+that a baseline has.
 """
 
 import os
@@ -9,22 +10,76 @@ import subprocess
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.estimate import ArithmeticOfRuns
 from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
-from toolkit.report.records.manifest import Manifest, RecordingRecord, SeedsUsed
 from toolkit.sequence import Sequence
+from toolkit.settings import Settings
 from toolkit.threads import THREAD_VARIABLES
 
+Versions = Annotated[dict[str, str | None], Meta(description="by package; null where it is not installed")]
 _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
 _THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")
+
+
+class RecordingRecord(Struct, frozen=True, kw_only=True):
+    """The recording that was read; over seeds, that of the first."""
+
+    name: Annotated[str, Meta(description="the sequence's name")]
+    hash: Annotated[str, Meta(description="SHA-256 over measurements, calibration, noise, prior and truth")]
+    format: str
+    source: str
+
+
+class SeedsUsed(Struct, frozen=True, kw_only=True):
+    """The seed a simulation was drawn from, or the first of several."""
+
+    sequence: int
+    count: Annotated[int, Meta(description="how many, from the first on; only over seeds", ge=1)] | UnsetType = UNSET
+
+
+class Manifest(Struct, frozen=True, kw_only=True):
+    """The command, every version, the data's hash, seeds, threads and the machine."""
+
+    schema: Literal["vislam.manifest/1"]
+    command: Annotated[str, Meta(description="that repeats the run; empty where it was made in another way")]
+    compare: Annotated[Request, Meta(description="what was compared; a run is repeated from it")] | UnsetType = UNSET
+    settings: Annotated[Settings, Meta(description="with which settings, whole")] | UnsetType = UNSET
+    date: Annotated[str, Meta(description="ISO 8601, UTC")]
+    versions: Versions
+    git_revision: Annotated[str | None, Meta(description="-dirty where edited; null outside a checkout")]
+    sequence: RecordingRecord
+    start: Annotated[str, Meta(description="where every run started")]
+    estimators: Annotated[tuple[str, ...], Meta(description="that ran here")]
+    references: (
+        Annotated[tuple[str, ...], Meta(description="that were read from files; not over seeds")] | UnsetType
+    ) = UNSET
+    seeds: SeedsUsed
+    threads: Annotated[
+        dict[str, int | str | None],
+        Meta(description="processors, and the limits of threads: variables, or over seeds workers and threads of each"),
+    ]
+    arithmetic: (
+        Annotated[
+            dict[str, ArithmeticOfRuns],
+            Meta(description="that ran, by estimator, of those that have compiled code; both only over seeds"),
+        ]
+        | UnsetType
+    ) = UNSET
+    cpu: str
+    os: str
+    files: (
+        Annotated[tuple[str, ...], Meta(description="that the run wrote, relative to its directory, this one too")]
+        | UnsetType
+    ) = UNSET
 
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:

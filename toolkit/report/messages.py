@@ -1,4 +1,4 @@
-"""What the numbers mean, in plain words: statuses, findings, metrics that are missing and why."""
+"""Messages that explain the numbers: statuses, findings, and the reasons for missing metrics."""
 
 import math
 from collections import Counter
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.disagreement import FARTHEST, Dispute, Parted
+from toolkit.experiment.disagreement import FARTHEST, Dispute, FarthestPose
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
@@ -27,7 +27,8 @@ _TAILS = (
     "; and yet its gate refused much: most innovations are smaller than stated and some far larger, which no one "
     "noise of pixels describes"
 )
-# An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
+# Log lines shown of an estimator: one that recovers in every frame must not hide the rest; metrics.json has its whole
+# log.
 _LOG_ENTRIES = 4
 
 # Estimators whose difference takes more seeds than these to find count as equal.
@@ -46,7 +47,7 @@ _STATUS = {
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield a line a finding of the audit, or the good news that there is none, then what it could not judge."""
+    """Yield a line for each finding of the audit, or that there is none, then the faults it could not decide."""
     if not comparison.findings:
         yield "no fault found in the recording"
     for finding in comparison.findings:
@@ -64,7 +65,7 @@ def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
 
 
 def outcome(finding: Finding) -> str:
-    """Say in one or two words what became of a finding."""
+    """Return the outcome of a finding in one or two words."""
     if finding.repaired:
         return "too much lost" if finding.blocking else "repaired"
     if finding.blocking:
@@ -97,7 +98,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
 
 
 def _ends(comparison: Comparison) -> Iterator[str]:
-    """Yield a calm explanation of every run that did not end well, and what each run had to say on the way."""
+    """Yield an explanation of every run that did not end well, and the log of each run."""
     for run in comparison.runs:
         if run.status in _STATUS:
             yield f"{run.estimator} {_STATUS[run.status]}"
@@ -162,7 +163,7 @@ def _trend_text(trend: float, limit: float) -> str:
 
 
 def _refusals(comparison: Comparison) -> Iterator[str]:
-    """Yield a line where outlier gates refused far more than of a consistent estimator's innovations they do."""
+    """Yield a line where outlier gates refused far more innovations than those of a consistent estimator."""
     accepted = {row.estimator: row.value(ACCEPTED) for row in comparison.rows if row.output == "causal"}
     refused = {name: 100.0 - share for name, share in accepted.items() if share is not None and refuses_much(share)}
     if refused:
@@ -185,9 +186,9 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
 
 
 def dispute_lines(dispute: Dispute) -> Iterator[str]:
-    """Yield a line for those who part from the measured motion, and one for who rests on a motion that is disputed."""
-    if dispute.parted:
-        listed = "; ".join(f"{_name_of(one.row)} by {_parted_text(one)}" for one in dispute.parted)
+    """Yield a line for estimators too far from the measured motion, and one for those that rest on a disputed one."""
+    if dispute.too_far:
+        listed = "; ".join(f"{_name_of(one.row)} by {_distance_text(one)}" for one in dispute.too_far)
         yield (
             "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
             f"which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
@@ -195,12 +196,12 @@ def dispute_lines(dispute: Dispute) -> Iterator[str]:
     if dispute.doubts_motion:
         names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.witnesses)}"
         yield (
-            f"{', '.join(dispute.alone)}: nothing but the measured motion and the start, which {count} that correct "
-            f"it by vision dispute ({names})"
+            f"{', '.join(dispute.uncorrected)}: nothing but the measured motion and the start, which {count} that "
+            f"correct it by vision dispute ({names})"
         )
 
 
-def _parted_text(one: Parted) -> str:
+def _distance_text(one: FarthestPose) -> str:
     apart = f"{_figure(one.distance_m)} m and {_figure(one.angle_deg)} deg"
     return f"{apart} at {one.t_s:.0f} s, {_figure(one.squared)} times"
 
@@ -272,7 +273,7 @@ def paired_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def _difference(found: Paired, metric: Metric, best: str) -> str:
-    """Say by how much two estimators differ, and whether that is more than chance."""
+    """Say by how much two estimators differ, and whether that is significant."""
     if found.mean == found.error == 0.0:
         return f"equal to that of {best} under all {found.n} seeds"
     decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else metric.decimals

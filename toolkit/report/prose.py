@@ -1,4 +1,4 @@
-"""Lines of prose for a terminal: wrapped to a width, or whole where they go into a file or a pipe."""
+"""Lines of text: wrapped to the width of a terminal, or whole where they go into a file or a pipe."""
 
 import re
 import sys
@@ -8,7 +8,7 @@ from shutil import get_terminal_size
 
 from toolkit.errors import printable
 
-# Of tables and of prose beside them; on a terminal prose is as wide as that is, from 40 columns on.
+# Widest table and text; on a terminal, text has its width, but at least 40 columns.
 WIDTH, _NARROWEST = 100, 40
 Width = int | None
 _LABEL = 7
@@ -17,7 +17,7 @@ _MARKUP = re.compile(r"[\\`*<>\[\]|&]|(?<!\w)_|_(?!\w)|^[#~+-]|^\d+(?=[.)] )")
 
 
 def width_of_output() -> Width:
-    """Return the width of prose on standard output: None where nobody but a program may read the lines."""
+    """Return the width of text on standard output: None where it is not a terminal."""
     if not sys.stdout.isatty():
         return None
     return min(max(get_terminal_size((WIDTH, 24)).columns, _NARROWEST), WIDTH)

@@ -32,7 +32,7 @@ from toolkit.report.messages import (
     outcome,
     remark_lines,
 )
-from toolkit.report.records.report import (
+from toolkit.report.records import (
     AuditMessage,
     CameraFrame,
     ComponentSeries,

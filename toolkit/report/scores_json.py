@@ -11,7 +11,7 @@ from toolkit.experiment.statistics import Spread
 from toolkit.files.documents import Value, of_attributes
 from toolkit.metrics import Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
-from toolkit.report.records.scores import (
+from toolkit.report.score_records import (
     AuditEntry,
     ConsistencyMark,
     LogEntry,

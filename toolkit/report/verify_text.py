@@ -1,4 +1,4 @@
-"""A verification of an estimator for people: what it keeps, what it breaks, and what to do about it; and as JSON."""
+"""A verification of an estimator as text and as JSON: promises kept and broken, and what to do."""
 
 from typing import Annotated, Literal
 

@@ -1,8 +1,8 @@
 """Every option of a comparison in one typed record: what it is, its unit, its default and its range.
 
 An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
-runs carry the same one. A threshold that nobody should have to choose is no setting: it stands in the code, once, with
-its source. Read ``records``, then ``reading``, which makes one of what somebody wrote and tells of each.
+runs carry the same one. A threshold that no user has to choose is no setting: it is in the code, once, with its source.
+Read ``records``, then ``reading``, which converts input to a record and describes each setting.
 """
 
 from toolkit.settings.reading import Described, describe, read_toml, settings_of, with_assignments

@@ -1,6 +1,6 @@
-"""Settings as values: made the record of what somebody wrote, checked key by key; each one told for documentation.
+"""Converts settings in files and on the command line to the record, checked key by key; describes each for the docs.
 
-They come in TOML, in a manifest or as ``KEY=VALUE``. What is told of a setting is read from the records themselves.
+They are given in TOML, in a manifest or as ``KEY=VALUE``. Descriptions are read from the records themselves.
 """
 
 import tomllib
@@ -31,7 +31,7 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     try:
         return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
-        # In TOML and on the command line no value is called none.
+        # TOML and the command line have no null: the word "none" is used instead.
         what = readable(error, values, Settings).replace(" or null", " or none").replace("object", "a section of keys")
         given_text = _given(what.partition(":")[0], values) if what.endswith("got string") else ""
         raise SettingsError(f"{place}: {what}{given_text}") from error
@@ -59,7 +59,7 @@ def _with_none(given: Mapping[str, Any], record: type[Struct]) -> dict[str, Any]
 
 
 def _with_policy(given: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Return nested values with what a named outlier policy consists of, where they do not say otherwise."""
+    """Return nested values with the values of a named outlier policy, where they give no others."""
     values, outliers = dict(given), given.get("outliers")
     if isinstance(outliers, Mapping) and "policy" in outliers:
         policy = outliers["policy"]
@@ -94,7 +94,7 @@ def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> di
                 raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
         at[name] = _value(value.strip())
         if key.strip() == _POLICY:
-            # A policy is named whole: what was set of another is no part of it.
+            # Naming a policy replaces all values of the former one.
             result["outliers"] = {"policy": at[name]}
     return result
 
@@ -166,7 +166,7 @@ def _shown(default: Any) -> str:
 
 
 def _parts(hint: Any) -> Iterator[Any]:
-    """Yield a type annotation and all it is made of."""
+    """Yield a type annotation and its parts."""
     yield hint
     for part in get_args(hint):
         if not isinstance(part, Meta):

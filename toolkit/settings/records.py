@@ -1,4 +1,4 @@
-"""The records of settings, section by section: what each is, its unit, its default and its range."""
+"""The records of settings, section by section: meaning, unit, default and range of each."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -75,7 +75,7 @@ def _alike(policy: PolicyName, gate_probability: float | None, huber: float | No
         batch_huber=1.5 if gate_probability else huber,
         batch_cauchy=2.0 if gate_probability else None,
         batch_cut_probability=1.0 - gate_probability if gate_probability else None,
-        # Beyond the cut there is nothing to hold, and a loss would weigh sound sightings down.
+        # Beyond the cut no sightings are left to weigh down, and a loss would weigh down sound ones.
         batch_last_huber=None,
     )
 
@@ -88,9 +88,9 @@ POLICIES: Mapping[PolicyName, Outliers] = {
 }
 
 
-# A track that outlives the window starts anew, so that a longer one is better where sightings err by themselves; what
-# it brings beside an IMU was measured (docs/settings.md). Real tracks do not, and the filters that take them for white
-# lose by it on drives with measured twists.
+# A track that is longer than the window starts anew, so that a longer window is better where errors of sightings are
+# independent; the gain beside an IMU was measured (docs/settings.md). Errors of real tracks are not independent, and
+# filters that treat them as white lose accuracy by a longer window on drives with measured twists.
 _LAG_WITH_IMU_S, _LAG_S = 2.0, 0.6
 
 
@@ -124,9 +124,9 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
         return _LAG_WITH_IMU_S if motion_kind == "imu" else _LAG_S
 
     def interval(self, since_ns: int, motion_kind: str) -> int:
-        """Return which interval of time an instant after the first frame is in; of each one frame has a state.
+        """Return the number of the interval that a time after the first frame is in; one frame of each has a state.
 
-        They are as long as the window never holds more than its most.
+        Intervals are so long that the window never holds more than its largest number of states.
         """
         return int(since_ns * (self.most_states - 1) // round(self.seconds(motion_kind) * _NS_PER_S))
 

@@ -1,9 +1,9 @@
 """Simulated recordings with exact truth: a smooth trajectory, landmarks to look at, and sensors with known noise.
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
-``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` and ``track_faults``
-plant what goes wrong. ``filming`` takes images instead of tracks, with ``surfaces`` (what there is to see) and
-``renderer``, and tells how far tracks made of them are off.
+``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` plants faults in a
+recording, ``track_faults`` lasting errors of tracks. ``filming`` renders images instead of tracks, with ``surfaces``
+(the visible world) and ``renderer``, and measures the errors of tracks made of them.
 """
 
 from toolkit.simulation import faults, track_faults

@@ -1,11 +1,11 @@
-"""A simulated recording as the stereo images a pair of cameras takes of it, in the layout of EuRoC's recordings.
+"""A simulated recording as stereo images of a pair of cameras, in the layout of EuRoC's recordings.
 
-Motion, IMU and truth are those of the scenario under the same seed: what differs from its simulated tracks is that
-somebody has to find them. The seed draws the noise of each image, too.
+Motion, IMU and truth are those of the scenario under the same seed: only the tracks are not simulated but have to be
+made by a front end. The seed also draws the noise of each image.
 
-How far tracks made of the images are off says what a front end costs, in pixels. The ray of a track's first sighting,
-from the true pose, meets a point of the hall; from then on every sighting of the track should be where that point is.
-What flies about counts as wrong, as it does to an estimator.
+Errors of tracks made of the images measure the accuracy of a front end, in pixels. The ray of a track's first sighting,
+from the true pose, meets a point of the hall; every later sighting of the track should be where that point is. Tracks
+on flying crates count as wrong, as they do for an estimator.
 """
 
 import json
@@ -40,10 +40,10 @@ _CAMERAS = ("cam0", "cam1")
 _PAIR_GB = 4e-4
 _TRUTH = "state_groundtruth_estimate0"
 _IMAGES_STREAM = 5  # of the seed; simulate() has the first five
-# The exposure follows the light: the gain of both images swings by a share over some seconds; the right is brighter.
+# Automatic exposure: the gain of both images oscillates by a share over some seconds; the right image is brighter.
 _SWING, _SWING_S, _RIGHT_GAIN = 0.12, 7.0, 1.04
 _SHOTS = 5  # in an exposure that blurs
-# No pair is mounted perfectly: what lenses come with, the right camera turned against the left one (rad).
+# Imperfect mounting of a pair with lenses: the rotation of the right camera against the left one (rad).
 _TURNED_RAD = np.array([0.008, -0.005, 0.006])
 _COEFFICIENTS: dict[LensModel, tuple[float, ...]] = {
     "none": (0.0, 0.0, 0.0, 0.0),

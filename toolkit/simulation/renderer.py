@@ -1,7 +1,7 @@
-"""Pictures of textured planes through a camera with or without distortion, and what a sensor makes of the light.
+"""Images of textured planes by a camera with or without distortion, and the noise of its sensor.
 
-Each pixel's ray is cut with every plane and the nearest one is seen, so that places, disparities and occlusions are
-exact: a plane's inverse depth is linear in the ray (x, y, 1), and what is smaller is behind.
+Each pixel's ray is intersected with every plane and the nearest one is visible, so that positions, disparities and
+occlusions are exact: a plane's inverse depth is linear in the ray (x, y, 1), and the largest is the nearest.
 """
 
 from collections.abc import Callable, Sequence
@@ -99,7 +99,7 @@ def _before_the_camera(corners_cam: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Hits:
-    """What each pixel's ray meets first: the row of its panel, the inverse depth (1/m), and places times that."""
+    """The first panel that each pixel's ray meets: its row, the inverse depth (1/m), and positions times that."""
 
     panel: IntArray
     nearness: Floats
@@ -108,7 +108,7 @@ class _Hits:
 
 
 def light(panels: Sequence[Panel], eye: Eye, T_world_cam: Array) -> Floats:
-    """Return what light falls on each pixel (height, width), in grey values, of panels seen from a pose (4, 4).
+    """Return the light on each pixel (height, width), in grey values, from panels seen from a pose (4, 4).
 
     The camera must be among panels on all sides: a ray that meets none is dark.
     """
@@ -195,9 +195,9 @@ def _wrapped(x: Floats, period: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What makes grey values of light: noise in the dark (grey values), and its variance for each of them.
+    """Sensor noise: standard deviation in the dark (grey values), and variance for each grey value of light.
 
-    Variance grows with the light, as that of photons does.
+    The variance grows with the light, as photon noise does.
     """
 
     dark_sigma: float = 1.2

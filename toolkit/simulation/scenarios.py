@@ -33,7 +33,7 @@ START_NS = 1_600_000_000 * NS_PER_S
 LONGEST_S = 3600.0
 # Standard deviations of the prior: rotation (rad), position (m), velocity (m/s), all in the body frame.
 _PRIOR_SIGMA = np.repeat([0.002, 0.01, 0.05], 3)
-# No twist estimator has an accelerometer bias; its block of the prior must be positive definite all the same.
+# Estimators of twists have no accelerometer bias, but its block of the prior must be positive definite.
 _UNUSED_ACCEL_BIAS_SIGMA = 0.01
 
 
@@ -43,11 +43,11 @@ class Scenario:
 
     ``scene`` builds the trajectory and the world for a duration; ``varied`` lets every seed draw its own.
     ``noise_scale`` multiplies every drawn error (pixels, motion, biases, prior) and leaves the stated noise as it is,
-    so that 0 gives exact measurements an estimator can still weigh. ``has_surfaces`` says that its world has not only
-    landmarks and can be filmed (:mod:`~toolkit.simulation.filming`).
-    Where there is a ``track_noise``, the errors of tracks are drawn from it and not from the rig's covariance, which is
-    what a data sheet would state; a ``slip_share`` of the tracks slips to another point and stays there.
-    The first ``audited_s`` seconds, where that is known, tell an audit as much of every fault as the whole does.
+    so that 0 gives exact measurements with a noise for estimators to assume. ``has_surfaces`` says that its world has
+    not only landmarks and can be filmed (:mod:`~toolkit.simulation.filming`). Where there is a ``track_noise``, the
+    errors of tracks are drawn from it and not from the rig's covariance, which is what a data sheet would state; a
+    ``slip_share`` of the tracks slips to another point and stays there. An audit of the first ``audited_s`` seconds,
+    where that is known, decides every fault as an audit of the whole does.
     """
 
     name: str
@@ -78,7 +78,7 @@ def noise_free(scenario: Scenario) -> Scenario:
 
 
 def _number(name: str) -> int:
-    """Return what of a name goes into the seeds: 0 for drive, so that its draws are those of the seed alone."""
+    """Return the number of a name that goes into the seeds: 0 for drive, whose draws depend on the seed alone."""
     return crc32(name.encode()) ^ crc32(b"drive")
 
 
@@ -115,7 +115,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
 
 
 class _View(NamedTuple):
-    """What has no noise: a scene, the frames' stamps (K,), the motion then, and what landmarks are in view (K, M)."""
+    """The parts without noise: scene, stamps of the frames (K,), motion at them, visible landmarks (K, M)."""
 
     scene: Scene
     frames_t_ns: IntArray
@@ -132,7 +132,7 @@ def _view(scenario: Scenario, world_rng: np.random.Generator) -> _View:
 
 @lru_cache(maxsize=2)
 def _viewed_once(scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
-    """Return what all seeds of a scenario share: it takes longer than what each of them draws."""
+    """Return the parts that all seeds of a scenario share, which take longer than the draws of a seed."""
     return _viewed(scene_of(duration_s), duration_s, rig, camera)
 
 

@@ -50,12 +50,12 @@ class SceneOf(Protocol):
         """Return the scene."""
 
     def __hash__(self) -> int:
-        """Tell it from others, for what all seeds see of it is kept."""
+        """Hash by identity, because the parts that all seeds share are cached by scene."""
 
 
 @dataclass(frozen=True)
 class _Streets:
-    """What tells one town's streets from another's: which way the corners turn, phases (rad) of bends and hills."""
+    """Parameters of the streets: the directions of the corners, phases (rad) of bends and hills."""
 
     corner_turns: tuple[float, ...] = (1.0, 1.0, -1.0, 1.0, -1.0, -1.0)  # left is positive; repeated from the first
     bend_phase: float = 0.0

@@ -1,4 +1,4 @@
-"""Textured planes: what cameras see of the hall of `flight`, its walls and the things that stand and hang in it.
+"""The textured planes of the hall of `flight`: its walls, and the furniture that stands and hangs in it.
 
 Like the landmarks they belong to the scenario and are the same under every seed. Textures are periodic and kept at
 every halving of their resolution, so that a distant plane does not flicker (Williams, "Pyramidal parametrics", 1983).
@@ -59,7 +59,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What there is to see: panels that stand, and panels at any time (s) of bodies that move."""
+    """The visible world: fixed panels, and the panels of moving bodies at any time (s)."""
 
     standing: tuple[Panel, ...]
     moving: Callable[[float], tuple[Panel, ...]] | None = None

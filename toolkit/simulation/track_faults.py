@@ -1,7 +1,7 @@
-"""What real trackers do to whole tracks, to plant in a recording: errors that last, unlike noise of single sightings.
+"""Errors of real trackers that last over a track, to plant in a recording, unlike the noise of single sightings.
 
-Injectors as in :mod:`toolkit.simulation.faults`, ``fault(sequence, dose, seed) -> Sequence``; what goes wrong with
-single sightings, clocks (``camera_clock``) and the scale of samples (``linear_unit``, ``angular_unit``) is there.
+Injectors as in :mod:`toolkit.simulation.faults`, ``fault(sequence, dose, seed) -> Sequence``; faults of single
+sightings, clocks (``camera_clock``) and the scale of samples (``linear_unit``, ``angular_unit``) are there.
 """
 
 from dataclasses import replace
@@ -39,7 +39,7 @@ def disparity_scale(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> S
 def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequence:
     """End every track before a share of the frames, and go on with new ones: images that repeat, a tracker that fails.
 
-    Stale frames that are repaired look so: across each the motion samples alone tell how the body moved.
+    Repaired stale frames have this effect: across each, only the motion samples measure the motion.
     """
     seen = sequence.observations
     cut = np.random.default_rng(seed).uniform(size=sequence.frame_count) < dose

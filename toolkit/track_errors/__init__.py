@@ -1,8 +1,8 @@
 """What the errors of real tracks are like, found from a recording's own visible tracks, without truth.
 
-Read ``tracklets`` (the tracks, by length), ``likelihood`` (their residuals, and how probable a noise makes them),
-``adjustment`` (poses that suit all tracks), ``fit`` (which noise it is), ``card`` (what is told of it), and
-``statement`` (whether a noise that is stated can be theirs).
+Read ``tracklets`` (the tracks by length, their residuals, the likelihood of a noise), ``adjustment`` (poses that fit
+all tracks), ``fit`` (the noise of greatest likelihood), ``card`` (its summary), and ``statement`` (whether a stated
+noise can be that of the tracks).
 """
 
 from toolkit.track_errors.card import Card, card_of

@@ -1,8 +1,8 @@
-"""Poses of the camera that suit all tracks under a track noise: a bundle adjustment over the recording, without gtsam.
+"""Poses of the camera that fit all tracks under a track noise: a bundle adjustment over the recording, without gtsam.
 
 Landmarks are eliminated track by track, which couples only the poses that a track spans, so that the normal equations
 of the poses are banded (Triggs et al., "Bundle adjustment", 2000, section 8.2); a track's weight is that of a Student-t
-(Lange, Little & Taylor 1989). Where tracks leave a motion open, a weak tie to where it started holds it.
+(Lange, Little & Taylor 1989). Where tracks do not determine a motion, a weak prior at its initial value holds it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,15 +15,22 @@ from toolkit.measured_motion import ImuSamples, TwistSamples
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
-from toolkit.track_errors.likelihood import Tailed, linearised, whitened, whitening
-from toolkit.track_errors.tracklets import MOST_SIGHTINGS, Tracklets, middle_of_pair
+from toolkit.track_errors.tracklets import (
+    MOST_SIGHTINGS,
+    Tailed,
+    Tracklets,
+    linearised,
+    middle_of_pair,
+    whitened,
+    whitening,
+)
 
-# Standard deviations of the tie of an interval's motion to its start, rad/s and m/s: far above what tracks leave open.
+# Standard deviations of the prior of an interval's motion, rad/s and m/s: far above its uncertainty by tracks.
 _TIE = np.repeat([0.1, 2.0], 3)
 # Tracks whose (3 n, 6 n) Jacobians are in memory at a time.
 _AT_ONCE = 400
 _PROBES = 8
-# Information on the first pose, which stays where it is.
+# Information on the first pose, which is held fixed.
 _FIXED = 1e12
 
 
@@ -78,7 +85,7 @@ def _measured(sequence: Sequence, camera: CameraMotion) -> Array:
 
 def adjusted(start: Adjusted, model: Tailed, sequence: Sequence, iterations: int) -> Adjusted:
     """Return the poses and landmarks after Gauss-Newton steps from where they are."""
-    from scipy.linalg import cho_solve_banded, cholesky_banded  # every process would import it, and most do without
+    from scipy.linalg import cho_solve_banded, cholesky_banded  # imported here because most processes do not need it
 
     poses, tracks, freedom = start.T_world_middle, start.tracks, start.freedom
     tie = _Tie(se3_inverse(poses[:-1]) @ poses[1:], _TIE * np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S)
@@ -162,7 +169,8 @@ def _normal_equations(tracks: tuple[Tracklets, ...], poses: Array, rig: StereoRi
             rows *= np.sqrt(model.weights((rows[..., -1] ** 2).sum(axis=1), group.equations))[:, None, None]
             _add(system, some.first_frame, rows[..., :-1], rows[..., -1])
             step = np.linalg.solve(upper, taken)
-            # A landmark is given in its first frame and moves with that pose, which the equations do not let it.
+            # A landmark is given in its first frame and moves with that pose, but is fixed in the world in the
+            # equations.
             step[..., :6] -= here.d_pose[:, 0]
             steps.append(step)
         all_steps = np.concatenate(steps)

@@ -1,7 +1,7 @@
-"""The card of a recording: what its tracks are like, and what vision says of the measured motion, without truth.
+"""The card of a recording: statistics of its tracks, and the scale of vision over the measured motion, without truth.
 
-All figures are about the poses that the noise was fitted about. Residuals are those a landmark leaves that white noise
-puts in its place, as an estimator told white noise sees them; differences along a track hardly depend on the landmark.
+All figures are computed at the poses of the fit of the noise. Residuals are about the landmark that is estimated under
+white noise, as in an estimator that assumes white noise; differences along a track hardly depend on the landmark.
 """
 
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from toolkit.models.stereo import disparity_px
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
 from toolkit.track_errors.fit import Fit
-from toolkit.track_errors.likelihood import linearised
-from toolkit.track_errors.tracklets import Tracklets, middle_of_pair
+from toolkit.track_errors.tracklets import Tracklets, linearised, middle_of_pair
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Sightings between which residuals are compared, at most.
 LAGS = 8
-# Beyond so many robust standard deviations a residual is in the tails, and so many times the usual is a track at odds.
+# A residual beyond this many robust standard deviations is in the tails; a track with this many times the usual
+# residual is at odds with the motion.
 _TAIL, _ODDS = 4.0, 4.0
 # A lag with fewer pairs has no statistic.
 _FEWEST_PAIRS = 30
@@ -35,7 +35,7 @@ QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """What the visible tracks of a recording are like.
+    """Statistics of the visible tracks of a recording.
 
     ``tracks`` is the number of those the noise was fitted to; ``a_frame`` their sightings in a frame; ``seen_frames``
     and ``depth_m`` (3,) are the 10, 50 and 90 % quantiles of sightings a track and of depth; ``blind_intervals`` is the
@@ -177,7 +177,7 @@ def _scale(sequence: Sequence, T_world_middle: Array, known: BoolArray) -> Scala
     if middle.size < _FEWEST_INTERVALS:
         return None
     around_mps = 0.5 * (seen_mps[middle - 1] + seen_mps[middle + 1])
-    # Along the axis of most motion alone: across it there is noise, and that of neighbouring intervals is correlated.
+    # Along the axis of most motion alone: across it there is only noise, which is correlated in neighbouring intervals.
     along = np.linalg.eigh(around_mps.T @ around_mps)[1][:, -1:]
     scale = slope(around_mps @ along, measured_mps[middle] @ along, seen_mps[middle] @ along)
     return scale if scale.error < _SCALE_ERROR else None

@@ -1,9 +1,9 @@
-"""Which track noise a recording has: fitted to its visible tracks, and chosen among white, walk, offset and both.
+"""The track noise of a recording: fitted to its visible tracks, and chosen among white, walk, offset and both.
 
-Poses and noise are found in turn: an adjustment of all tracks under the noise as it is known, then the noise that makes
-what is left most probable. A walk, or an offset, is believed only where it explains far more than chance would: by the
+Poses and noise are estimated in turn: an adjustment of all tracks under the present noise, then the noise of greatest
+likelihood for the residuals. A walk, or an offset, is accepted only if it explains far more than chance: by the
 criterion of Schwarz ("Estimating the dimension of a model", 1978), and beyond three standard errors over stretches of
-the recording, since tracks that are seen together err together.
+the recording, because errors of tracks that are seen together are correlated.
 """
 
 from dataclasses import dataclass
@@ -14,29 +14,37 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
-from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood, linearised
-from toolkit.track_errors.tracklets import Tracklets, tracklets
+from toolkit.track_errors.tracklets import (
+    Likelihood,
+    Residuals,
+    Tailed,
+    Tracklets,
+    joined,
+    likelihood,
+    linearised,
+    tracklets,
+)
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# Fewer tracks of three sightings cannot tell a noise of seven parameters, or which kind it is.
+# Fewer tracks of three sightings do not determine a noise of seven parameters, or its kind.
 FEWEST_TRACKS = 100
-# Where poses take up more than a quarter of the residuals' degrees of freedom there are too few tracks.
+# There are too few tracks where the poses use more than a quarter of the residuals' degrees of freedom.
 LEAST_FREEDOM = 0.75
 # Rounds of poses and noise; they end earlier where a round gains less than this log-likelihood a track.
 _ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
-# Smallest white noise, walk and offset (px), white noise never being nothing: a coordinate is not finer than this.
+# Smallest white noise, walk and offset (px): coordinates are not more accurate than this.
 _LEAST_PX = np.repeat([[0.02], [0.002], [0.01]], 3, axis=1)
 _MOST_PX = 100.0
 _DEGREES = (2.0, 200.0)
 # Walks and offsets below so many times their smallest count as zero.
 _NONE = 2.5
-# Where the search begins, of no effect on where it ends.
+# Initial values of the search; they do not affect the result.
 _START_PX = np.array([[0.3, 0.5, 0.3], [0.1, 0.1, 0.1], [0.5, 0.5, 0.5]])
 _START_DEGREES = 5.0
 _STRETCHES, _SIGMAS = 12, 3.0
 
-# Parts (white, walk, offset) x (c, d, v) that a kind of noise has, the simplest first. The landmark takes up an offset
-# in c and v.
+# Parts (white, walk, offset) x (c, d, v) that a kind of noise has, the simplest first. An offset in c and v cannot be
+# distinguished from another landmark.
 _KINDS: dict[str, BoolArray] = {
     "white": np.array([[1, 1, 1], [0, 0, 0], [0, 0, 0]], dtype=bool),
     "offset": np.array([[1, 1, 1], [0, 0, 0], [0, 1, 0]], dtype=bool),
@@ -48,7 +56,7 @@ _RICHEST = _KINDS["walk and offset"]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was fitted, and what speaks for it.
+    """The fitted noise, and its gain in likelihood.
 
     ``noise`` is that of most tracks, ``degrees`` of freedom those of the tracks' Student-t (fewer: heavier tails).
     ``gain`` is the log-likelihood a track over white noise, with its standard error. ``adjusted`` has the poses and
@@ -139,7 +147,9 @@ def _most_likely(groups: list[Residuals], free: BoolArray, start: Tailed | None)
     lowest, highest = np.append(_LEAST_PX[free], _DEGREES[0]), np.append(np.full(free.sum(), _MOST_PX), _DEGREES[1])
     x = np.log(np.clip(np.append(begin[free], degrees), lowest, highest))
     bounds = list(zip(np.log(lowest), np.log(highest), strict=True))
-    from scipy.optimize import minimize  # its import takes a third of a process's start, and most do without
+    from scipy.optimize import (
+        minimize,
+    )  # slow to import, and most processes do not need it
 
     best = model(minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds).x)
     return best, joined(likelihood(group, best) for group in groups)

@@ -1,9 +1,9 @@
-"""Whether a noise of tracks that somebody states can be that of a recording's tracks, without truth.
+"""Tests whether a stated noise of tracks can be that of a recording's tracks, without truth.
 
-About the camera's own best motion a point triangulated from one sighting and projected into the next frame misses the
-sighting there by J e - e', which is little where both share their error and see the point alike (J near the identity).
-Where it is far more than a stated noise allows, an estimator that is told the noise takes sound tracks for mismatches,
-and what passes its gate for far more than it tells.
+A point is triangulated from one sighting and projected into the next frame by the camera's own best motion. It differs
+from the sighting there by J e - e', with the errors e and e' of both sightings. This is small where the errors are the
+same and J is near the identity. Where it is far larger than a stated noise allows, an estimator that uses this noise
+rejects sound tracks as mismatches, and gives too much weight to tracks that pass its gate.
 """
 
 import numpy as np
@@ -17,20 +17,20 @@ from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import Sequence
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# Chosen by looking at recordings: they scatter 0.6 to 1.1 times as much as the noise that was drawn or fitted says, and
-# 4.3 and 4.5 times as much as one that is not theirs.
+# Chosen by looking at recordings: tracks scatter 0.6 to 1.1 times as much as the drawn or fitted noise predicts, and
+# 4.3 and 4.5 times as much as the noise of another recording predicts.
 MOST_SCATTER = 2.0
-# A median of fewer neighbouring sightings says little.
+# With fewer neighbouring sightings their median is too uncertain.
 FEWEST_PAIRS = 30
-# What half of all chi-square variables of three degrees of freedom exceed.
+# Median of a chi-square variable with three degrees of freedom.
 _MEDIAN_CHI2 = 2.366
 
 
 def scatter_over(noise: TrackNoise, sequence: Sequence) -> float | None:
-    """Return how many times as much as a noise says the tracks scatter from frame to frame: 1 where it is theirs.
+    """Return the scatter of the tracks from frame to frame over that of a noise: 1 where it is the tracks' own.
 
-    By the median, which mismatches do not move. None where too few tracks determine the camera's motion, or where the
-    recording cannot be run.
+    The ratio is that of the medians, which mismatches do not change. None where too few tracks determine the camera's
+    motion, or where the recording cannot be run.
     """
     if not is_comparable(sequence):
         return None
@@ -42,7 +42,7 @@ def scatter_over(noise: TrackNoise, sequence: Sequence) -> float | None:
 
 
 def contradicted(noise: TrackNoise, sequence: Sequence) -> str | None:
-    """Return how the tracks contradict a noise that is stated too small, in a line, or None."""
+    """Return a line that says how the tracks contradict a stated noise that is too small, or None."""
     scatter = scatter_over(noise, sequence)
     if scatter is None or scatter < MOST_SCATTER:
         return None

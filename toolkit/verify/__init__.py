@@ -1,5 +1,5 @@
-"""What every estimator promises, whoever wrote it, as checks: for ``vislam verify`` and for the contract tests alike.
+"""The promises of every estimator as checks, for ``vislam verify`` and for the contract tests.
 
-Reading order: promises (a run with all that went in and came out, what must hold of it) -> threads -> subject (whose
-estimator it is) -> verification (all of it, of one estimator).
+Reading order: promises (a recorded run, and each property that it must have) -> threads -> subject (finds the
+estimator) -> verification (all checks of one estimator).
 """

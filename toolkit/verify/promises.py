@@ -1,6 +1,6 @@
-"""What must hold of a watched run. Each function returns what is wrong in a sentence, and nothing where all is well.
+"""Properties that a watched run must have. Each function returns a sentence about what is wrong, or an empty text.
 
-A run is watched where what went into an estimator and what came out is kept, each with a copy made at that moment.
+Of a watched run all inputs and outputs of the estimator are kept, each with a copy made at that moment.
 """
 
 from collections.abc import Iterator
@@ -9,8 +9,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from toolkit.answers import COV_SIZES, check_state
-from toolkit.estimate import Estimate, Finished, Run
+from toolkit.estimate import COV_SIZES, Estimate, Finished, Run, check_state
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
@@ -18,13 +17,13 @@ from toolkit.sequence import Packet, Sequence
 
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12
-# How often the test of mean NEES calls a consistent estimator inconsistent.
+# False alarm rate of the test of mean NEES.
 _FALSE_ALARM = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """One run over a recording: the setup and packets, every answer, what was said in the end; copies of all before."""
+    """One run over a recording: setup, packets, every answer and the result of ``finish``, with copies of each."""
 
     sequence: Sequence
     setup: Setup
@@ -36,7 +35,7 @@ class Watched:
 
 
 def setup_of(sequence: Sequence) -> Setup:
-    """Return what an estimator is told of a recording that states its own prior, as a simulated one does."""
+    """Return the setup of an estimator for a recording with its own prior, as a simulated one has."""
     assert sequence.prior is not None
     return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
 
@@ -90,7 +89,7 @@ def copies_of(value: object) -> tuple[Array, ...]:
 
 
 def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> str:
-    """Say at which frame an answer is another one where later packets are withheld."""
+    """Say at which frame an answer changes when later packets are withheld."""
     frames = len(watched.online)
     for count in counts or (2, frames // 2):
         early = answers(build, watched.sequence.truncated(count))
@@ -104,15 +103,15 @@ def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> 
 
 
 def other_answers(build: Build, watched: Watched) -> str:
-    """Say where a second run over the same packets gives other answers."""
+    """Say at which frame a second run over the same packets gives another answer."""
     return _other_in_second_run(build(watched.setup), watched.packets, watched)
 
 
 def other_when_repeated(build: Build, watched: Watched) -> str:
-    """Say where a second run over packets of recordings that end early answers otherwise: both of the above in one run.
+    """Check both properties above in one run: repeat it with packets of recordings that end early.
 
     The first two packets come from a recording that ends with them, the others of the first half from one that ends
-    there: nothing of what comes later can be in them. Which of the two promises is broken it does not tell.
+    there: they cannot contain later data. The check does not say which of the two promises is broken.
     """
     counts = (2, len(watched.online) // 2, len(watched.online))
     cut = [list(watched.sequence.truncated(count).packets()) for count in counts]
@@ -121,7 +120,7 @@ def other_when_repeated(build: Build, watched: Watched) -> str:
 
 
 def _other_in_second_run(estimator: Estimator, packets: tuple[Packet, ...], first: Watched) -> str:
-    """Say where an estimator that reads packets answers otherwise than one did; nothing where nowhere."""
+    """Say at which frame an estimator answers differently than before; empty where answers are the same."""
     for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
             return f"a second run answers otherwise to frame {k}: {found}"
@@ -130,7 +129,7 @@ def _other_in_second_run(estimator: Estimator, packets: tuple[Packet, ...], firs
 
 
 def difference(one: Estimate | Finished | None, other: Estimate | Finished | None) -> str:
-    """Say how two answers differ in any bit; nothing where they are the same."""
+    """Say how two answers differ; empty where all bits are the same."""
     if (one is None) != (other is None):
         return "one run answers and the other does not"
     pairs = list(zip_longest(_named_arrays(one, ""), _named_arrays(other, "")))
@@ -252,7 +251,7 @@ def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
 
 
 def no_rotation(watched: Watched) -> str:
-    """Say which pose has a rotation that is none."""
+    """Say which pose has a matrix that is not a rotation."""
     poses = [answer.T_world_imu for answer in watched.online if answer is not None]
     stacked = np.concatenate([np.array(poses).reshape(-1, 4, 4), watched.finished.trajectory.T_world_imu])
     rotations = stacked[:, :3, :3]
@@ -265,7 +264,7 @@ def no_rotation(watched: Watched) -> str:
 
 
 def wrong_stamps(watched: Watched) -> str:
-    """Say where answers miss a frame, or have the stamp of another one."""
+    """Say at which frame an answer is missing, or has the stamp of another frame."""
     frames_t_ns = watched.sequence.frames_t_ns
     silent = sum(answer is None for answer in watched.online)
     if silent not in (0, len(watched.online)):
@@ -282,7 +281,7 @@ def wrong_stamps(watched: Watched) -> str:
 
 
 def gave_up(run: Run, frames_t_ns: IntArray) -> str:
-    """Say why a run is not one that went on to the end: it may say that it diverged, and why, and nothing else."""
+    """Say why a run did not go on to the end. A run that reports divergence with a reason did."""
     if run.status not in ("ok", "diverged"):
         return run.log[0] if run.log else f"it {run.status}"
     if run.status != "ok" and not run.log:
@@ -298,7 +297,7 @@ def gave_up(run: Run, frames_t_ns: IntArray) -> str:
 
 
 def inconsistency(nees_means: list[float]) -> str:
-    """Say whether mean pose NEES over 6, one a run, show too much or too little certainty, by more than chance.
+    """Say whether mean pose NEES over 6, one a run, are above or below a consistent estimator's by more than chance.
 
     The band is for poses of a run that share one error, the worst case, and holds 99.9 % of consistent estimators.
     """

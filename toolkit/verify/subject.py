@@ -1,4 +1,4 @@
-"""Anybody's estimator: by its name where it is installed, or by the file or the module that defines it."""
+"""Finds the estimator to verify: by name where it is installed, or by the file or module that defines it."""
 
 import importlib
 import importlib.util
@@ -27,10 +27,10 @@ class Subject:
 
 
 def subject_of(word: str) -> Subject:
-    """Return the estimator that a word names: ``my_filter.py``, ``my_package.my_filter`` or ``ekf``.
+    """Return the estimator that an argument names: ``my_filter.py``, ``my_package.my_filter`` or ``ekf``.
 
     Loading it raises EstimatorError where the file cannot be imported or has no function ``build(setup)``. Raises
-    EstimatorError where the word names nothing.
+    EstimatorError where the argument names nothing.
     """
     if word.endswith(".py"):
         path = Path(word)
@@ -58,7 +58,7 @@ def _imported(path: Path) -> ModuleType:
     folder = str(path.resolve().parent)
     if folder not in sys.path:
         sys.path.insert(0, folder)
-    # As any import does, for dataclasses look their module up there.
+    # As an import does, because dataclasses look up their module there.
     sys.modules.setdefault(path.stem, module)
     spec.loader.exec_module(module)
     return module

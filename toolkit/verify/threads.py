@@ -1,7 +1,8 @@
-"""One thread and two say the same bits: what a report shows can be repeated anywhere.
+"""Checks that answers are the same bits on one thread and on two, so that results can be repeated anywhere.
 
-The number of threads is settled when the numeric libraries are loaded, so each number has a process of its own:
-``python -m toolkit.verify.threads 2 ekf my_filter.py`` prints a digest of all that each said on each scenario.
+The number of threads is fixed when the numeric libraries are loaded, so each number needs a process of its own:
+``python -m toolkit.verify.threads 2 ekf my_filter.py`` prints a digest of all answers of each estimator on each
+scenario.
 """
 
 import hashlib
@@ -25,7 +26,7 @@ _TIMEOUT_S = 600
 
 
 def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
-    """Run estimators in a process of so many threads; return a digest of all each said, by "NAME on SCENARIO".
+    """Run estimators in a process with a number of threads; return a digest of all answers, by "NAME on SCENARIO".
 
     Raises EstimatorError where the process does not end well.
     """
@@ -45,8 +46,8 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     return digests
 
 
-def other_bits(estimator: str) -> str:
-    """Say on which scenario an estimator says other bits with two threads than with one; nothing where nowhere."""
+def differing_answers(estimator: str) -> str:
+    """Say on which scenario an estimator's answers differ between one thread and two; empty where they do not."""
     one, two = (digests_at(threads, (estimator,)) for threads in (1, 2))
     differing = [key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest]
     return f"with two threads it says other bits than with one, on {', '.join(differing)}" if differing else ""
@@ -74,7 +75,7 @@ def _digests(estimators: list[str]) -> dict[str, str]:
 
 def main(arguments: list[str]) -> None:
     """Print the digests of the estimators named behind the number of threads."""
-    if hasattr(os, "sched_setaffinity"):  # what GTSAM's pool goes by
+    if hasattr(os, "sched_setaffinity"):  # read by GTSAM's thread pool
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(arguments[0])])
     print(json.dumps(_digests(arguments[1:])))
 

@@ -1,6 +1,6 @@
 """Every promise of one estimator, one after the other: passed, failed with what to do, or not applicable.
 
-Among them: it goes on through what a recording may hold, planted by :mod:`toolkit.simulation.faults`.
+One promise is to go on through faults of a recording, which are planted by :mod:`toolkit.simulation.faults`.
 """
 
 import warnings
@@ -23,12 +23,12 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, faults, simul
 from toolkit.verify import promises
 from toolkit.verify.promises import Watched, gave_up, watch
 from toolkit.verify.subject import Subject
-from toolkit.verify.threads import other_bits
+from toolkit.verify.threads import differing_answers
 
 SEED = 4
 DURATION_S, MAX_TRACKS = 6.0, 40
 
-# By what a user calls it; each as the audit leaves it, as before every comparison.
+# Planted faults by a description for the user. Recordings are audited first, as before every comparison.
 PLANTED_FAULTS: Mapping[str, Callable[[Sequence], Sequence]] = {
     "a fifth of the sightings lost": partial(faults.dropped_sightings, dose=0.2),
     "2 s without sight": partial(faults.blackout, dose=2.0),
@@ -52,7 +52,7 @@ _FEWEST_NEES = 2
 
 
 def short(scenario: Scenario, duration_s: float = DURATION_S) -> Scenario:
-    """Return a scenario of a few seconds and forty tracks a frame: they come and go, and every estimator is quick."""
+    """Return a scenario of a few seconds and forty tracks a frame, so that tracks begin and end and runs are short."""
     return replace(scenario, duration_s=duration_s, camera=replace(scenario.camera, max_tracks=MAX_TRACKS))
 
 
@@ -74,7 +74,7 @@ def ends_by_fault(name: str, build: Build) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class CheckedPromise:
-    """One promise: what it is, what came of it, what was found, and what to do where it is broken."""
+    """One promise: its name, the result of the check, what was found, and what to do where it is broken."""
 
     name: str
     result: Result
@@ -95,7 +95,7 @@ class Verification:
         return all(check.result != "failed" for check in self.checks)
 
 
-# What holds of one watched run: the promise, what says that it is broken, and what to do.
+# Promises checked on one watched run: name, the function that finds a violation, and what to do.
 _Of = Callable[[Build, Watched], str]
 _OF_A_RUN: tuple[tuple[str, _Of, str], ...] = (
     (
@@ -157,12 +157,12 @@ _TROUBLE_REMEDY = (
 
 
 def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verification:
-    """Check every promise of an estimator, which ``word`` names in a process of its own.
+    """Check every promise of an estimator; ``word`` names it for checks in another process.
 
     Raises EstimatorError where it cannot be loaded.
     """
     build, steps = subject.load(), len(SCENARIOS) + 3
-    with warnings.catch_warnings(), np.errstate(all="ignore"):  # what they would say, the checks say
+    with warnings.catch_warnings(), np.errstate(all="ignore"):  # NumPy's warnings add nothing to the checks
         warnings.simplefilter("ignore")
         watched: list[Watched] = []
         raised = ""
@@ -252,7 +252,7 @@ def _consistent(name: str, build: Build) -> CheckedPromise:
 
 
 def _threads(word: str) -> CheckedPromise:
-    return _check(_THREADS, _THREADS_REMEDY, lambda: other_bits(word))
+    return _check(_THREADS, _THREADS_REMEDY, lambda: differing_answers(word))
 
 
 def _faults(name: str, build: Build) -> CheckedPromise:

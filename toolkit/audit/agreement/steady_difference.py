@@ -10,7 +10,7 @@ import numpy as np
 from toolkit.audit.agreement.vision_scale import LARGEST_ERROR, SYSTEMATIC
 from toolkit.audit.calibration.miscalibration import SYSTEMATIC_RAD
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.turn import angle_of, turn_by_velocities
+from toolkit.audit.parts.extrinsic import angle_of, turn_by_velocities
 from toolkit.audit.tracks.correlated_tracks import err_by_themselves
 
 # Tracks that creep from image to image make so much more of both (a share, rad) in simulations, where nothing slips.

@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import Intervals, median_one_step_px, one_step_px_by_interval
+from toolkit.audit.parts.intervals import Intervals
+from toolkit.audit.parts.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
 from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence

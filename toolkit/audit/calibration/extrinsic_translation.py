@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.placement import is_excluded, is_there, metres, way_gone
+from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
 from toolkit.geometry import se3
 
 

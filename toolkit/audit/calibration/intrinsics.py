@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, own_one_step_px
+from toolkit.audit.parts.intervals import LEAST_INTERVALS
+from toolkit.audit.parts.one_step import own_one_step_px
 from toolkit.geometry import Array
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence, StereoRig, is_measured

@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LEVER
 from toolkit.audit.parts.calibration_limits import LIMITS
-from toolkit.audit.parts.placement import MOST_SIGMAS, is_there, metres, share_of_way
+from toolkit.audit.parts.extrinsic import MOST_SIGMAS, is_there, metres, share_of_way
 from toolkit.audit.parts.self_calibration import OFF_BY
 from toolkit.geometry import Array, BoolArray
 

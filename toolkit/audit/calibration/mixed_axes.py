@@ -21,8 +21,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.alignment import alignment
-from toolkit.audit.parts.intervals import Intervals, median_one_step_px
-from toolkit.audit.parts.placement import is_excluded, is_there, metres, way_gone
+from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
+from toolkit.audit.parts.intervals import Intervals
+from toolkit.audit.parts.one_step import median_one_step_px
 from toolkit.audit.parts.robust import spread
 from toolkit.geometry import Array, se3, se3_inverse
 

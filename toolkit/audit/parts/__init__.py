@@ -1,9 +1,9 @@
-"""What several faults share; no file here is a fault.
+"""Computations that several faults share; no file here is a fault.
 
-Read ``intervals`` (the camera's motion, of ``models.camera_motion``, beside the motion samples), then what is found of
-both: ``agreement``, ``deviations``, ``alignment`` (scale and place of the camera), ``placement``, ``turn``, ``units``.
-``rotation_offset`` compares clocks by what turns, ``truth_clock`` also their pace, ``windows`` what a trajectory moves
-by. ``self_calibration`` adjusts a ``bundle`` beside ``strides`` of motion, within ``calibration_limits``. Of single
-tracks: ``one_step``, ``step_correlation``, ``exchanged_rows``. For all: ``robust`` (statistics), ``tracks`` and
-``subsets`` (edits of a sequence).
+Read ``intervals`` first: the motion over each interval, by the camera (`models.camera_motion`) and by the samples.
+Then what is computed of both: ``one_step`` (residuals of tracks), ``alignment`` (scale and position of the camera),
+``extrinsic`` (position and rotation, judged), ``deviations`` (over time), ``units``, ``clocks`` (offset and rate of
+clocks) and ``windows`` (motion beside a trajectory's). ``self_calibration`` adjusts a ``bundle`` of key frames beside
+``strides`` of integrated motion; ``calibration_limits`` says what of it is wrong. ``exchanged_rows`` finds tracks whose
+image coordinates are exchanged. For all: ``robust`` (statistics) and ``edits`` (of a sequence).
 """

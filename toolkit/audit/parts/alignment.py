@@ -1,10 +1,11 @@
-"""By how much the camera's translation is longer than the measured one, and where the camera is: one linear regression.
+"""The scale of vision and the position of the camera, by one linear regression on the measured motion.
 
-Twists measure a velocity to compare with. An IMU measures its change: in the axes of a window's first frame, into
-which the gyro turns everything, the displacement of the IMU is that of the integrated specific force, but for a
-velocity and a gravity of each window's own, so that a scale shows in the accelerations and a lever arm in the turns.
-Source: Martinelli, "Closed-form solution of visual-inertial structure from motion" (2014); Qin, Li & Shen, "VINS-Mono"
-(2018), section V-B, with the position of the camera as a further unknown.
+The scale is the ratio of the camera's translation to the measured one. Twists measure the velocity directly. An IMU
+measures its change: in the axes of a window's first frame (rotations by the gyro), the displacement of the IMU is the
+integrated specific force plus the contributions of an unknown velocity and an unknown gravity of each window. The scale
+is then determined by accelerations, the lever arm by rotations. Source: Martinelli, "Closed-form solution of
+visual-inertial structure from motion" (2014); Qin, Li & Shen, "VINS-Mono" (2018), section V-B, with the position of the
+camera as a further unknown.
 """
 
 from itertools import pairwise
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by, subdivided
 from toolkit.audit.parts.robust import (
     CAUCHY_SIGMAS,
@@ -24,28 +26,28 @@ from toolkit.audit.parts.robust import (
     slip_stretches,
     spread,
 )
-from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Beside an IMU the camera's displacement is taken over so long, for its noise hardly grows, within windows so long.
+# With an IMU: duration of a displacement of the camera, whose noise hardly grows with it, and length of a window.
 STRIDE_S, WINDOW_S = 0.25, 6.0
-# Equations for each unknown below which a regression follows the noise.
+# Least number of equations for each unknown; with fewer a regression fits the noise.
 LEAST_EQUATIONS = 3.0
-# Standard deviations of what an accelerometer (m/s^2) reads too much, and a gyro less its median (rad/s).
+# Standard deviations of the biases of an accelerometer (m/s^2), and of a gyro about its median (rad/s).
 ACCEL_BIAS, GYRO_BIAS = 0.2, 0.01
 # Unknowns: the scale, the camera's position (3), its turn (3), with an IMU both biases (6).
 _LEVER, TURN, _COMMON = slice(1, 4), slice(4, 7), 13
 
 
 class Regression(NamedTuple):
-    """What the difference of the velocities depends on (7,), in the order of ``velocity_equations``.
+    """The unknowns (7,) that explain the difference of the velocities, in the order of ``velocity_equations``.
 
-    ``formal`` (7, 7) is the covariance if every interval erred by itself, ``cov`` (7, 7) that of a jackknife over
-    ``stretches`` no shorter than slip lasts, in which the vehicle moved as in so many of ``in_motion``.
+    ``formal`` (7, 7) is the covariance if errors of intervals were independent, ``cov`` (7, 7) that of a jackknife over
+    ``stretches`` which are no shorter than slip lasts. ``in_motion`` is the effective number of stretches in which the
+    vehicle moved.
     """
 
     found: Array
@@ -56,9 +58,9 @@ class Regression(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m.
+    """Relative excess of the camera's translation, and the correction (3,) m of its position in the IMU frame.
 
-    ``lever_cov_m2`` (3, 3) is the covariance of the latter, ``scale_by_chance`` what the scale is beyond by chance less
+    ``lever_cov_m2`` (3, 3) is the covariance of the correction; the scale exceeds ``scale_by_chance`` by chance less
     often than ``robust.LEVEL``. ``by_velocities`` is the whole regression beside odometry.
     """
 
@@ -85,8 +87,8 @@ def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) ->
 def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_s: float) -> Alignment:
     """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
 
-    Noise of the regressor feigns a scale. What the regression of the one on the other and its inverse leave open
-    between them counts for nothing (Frisch, "Statistical confluence analysis", 1934).
+    Noise of the regressor biases the scale. The smaller result of the regression of one velocity on the other and of
+    the inverse regression is taken, or zero where their signs differ (Frisch, "Statistical confluence analysis", 1934).
     """
     whole = velocity_regression(intervals, v_mps, T_imu_cam, len(v_mps) * step_s)
     measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
@@ -102,13 +104,13 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_
 
 
 def _by_chance(whole: Regression) -> float:
-    """Return what the first unknown is beyond by chance, where its errors last as long as slip."""
+    """Return the bound that the first unknown exceeds only by chance, with errors that last as long as slip."""
     slipping, formal = np.sqrt(whole.cov[:1, 0]), np.sqrt(whole.formal[:1, 0])
     return float(chance_bound(slipping, formal, whole.in_motion, INFLATION["twist"])[0])
 
 
 def velocity_regression(intervals: Intervals, v_mps: Array, T_imu_cam: Array, duration_s: float = np.inf) -> Regression:
-    """Regress the difference of the camera's velocity and the measured one on what makes one, by Cauchy weights."""
+    """Regress the difference of the camera's velocity and the measured one on its causes, with Cauchy weights."""
     stretches = slip_stretches(duration_s)
     measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
     found, formal = robust_with_formal_cov(measured - seen, jacobian)
@@ -117,7 +119,7 @@ def velocity_regression(intervals: Intervals, v_mps: Array, T_imu_cam: Array, du
 
 
 def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> tuple[Array, Array, Array]:
-    """Return the camera's velocity (M, 3) as the twists have it and as it is, and d(difference)/d(unknowns) (M, 3, 7).
+    """Return the camera's velocity (M, 3) by the twists and by the tracks, and d(difference)/d(unknowns) (M, 3, 7).
 
     Unknowns are the scale, the camera's position and, those of ``TURN``, its turn.
     """
@@ -194,8 +196,8 @@ def _window(
 
 
 class _Path(NamedTuple):
-    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU, in its first axes and as if it had begun at rest in
-    free fall, and what the displacement changes by with the biases of the accelerometer and the gyro (n, 3, 3).
+    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU, in its first axes, as if it had begun at rest in free
+    fall, and the derivatives (n, 3, 3) of the displacement by the biases of the accelerometer and the gyro.
     """
 
     R_first_imu: Array
@@ -241,7 +243,7 @@ def chained(step: Array) -> Array:
 def robust_with_formal_cov(response: Array, jacobian: Array) -> tuple[Array, Array]:
     """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights.
 
-    The covariance (m, m) is that if every row erred by itself.
+    The covariance (m, m) assumes that errors of rows are independent.
     """
     found, information, _ = _weighted(response, jacobian, np.zeros(jacobian.shape[2]))
     return found, np.asarray(np.linalg.inv(information))
@@ -261,7 +263,7 @@ def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntA
     np.add.at(of_block, block, score)
     inverse = np.asarray(np.linalg.inv(information))
     cov = inverse @ (of_block.T @ of_block + np.diag(prior)) @ inverse
-    lacking = np.maximum(np.diag(inverse) - np.diag(cov), 0.0)  # few blocks can look too calm
+    lacking = np.maximum(np.diag(inverse) - np.diag(cov), 0.0)  # few blocks may scatter too little by chance
     return found, np.asarray(cov + np.diag(lacking))
 
 

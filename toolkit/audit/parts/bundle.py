@@ -1,10 +1,10 @@
-"""One window of an adjustment of key frames and points beside measured motion, linearised, its calibration unknown.
+"""One window of a bundle adjustment of key frames with measured motion, linearised, with unknown calibration.
 
 Unknowns are the poses of the key frames (6 each: turn on the right, position in the axes of the first), beside an IMU
 with their velocities (3) and the gravity of the window (3), and the calibration that all windows share (21). Points are
-eliminated track by track, the window's own unknowns after that, so that it says what it knows of the calibration alone.
-Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
-al. (2017), as in `strides`.
+eliminated track by track, then the window's own unknowns, which leaves its information on the calibration. Source:
+Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et al.
+(2017), as in `strides`.
 """
 
 from dataclasses import replace
@@ -36,10 +36,10 @@ _GAUGE, _RIDGE = 1e10, 1e-9
 
 
 class Calibration(NamedTuple):
-    """What all windows share: the rig, how much later than its stamps the camera saw (s), the biases (6,).
+    """The unknowns that all windows share: the rig, the delay of the camera against its stamps (s), the biases (6,).
 
-    ``change_s`` is by how much later in the second half of the recording than in the first; ``right_shift_px`` and
-    ``right_roll_rad`` are what the right image is off by, beside a rectified one.
+    ``change_s`` is the delay in the second half of the recording less that in the first; ``right_shift_px`` and
+    ``right_roll_rad`` are the errors of the right image against a rectified one.
     """
 
     rig: StereoRig
@@ -112,7 +112,7 @@ class Window(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """What a window says of the calibration: information (21, 21), and gradients (B, 21) of parts that err alone.
+    """A window's information (21, 21) on the calibration, and the gradients (B, 21) of parts with independent errors.
 
     The parts are the tracks, whose own errors may be correlated, and the strides of a second. ``back`` takes a step of
     the calibration to the window's own.
@@ -199,11 +199,11 @@ class Predicted(NamedTuple):
 
 
 def predicted(window: Window, calibration: Calibration) -> Predicted:
-    """Predict every sighting: the point in the IMU as it moves on for as long as the camera is late, and in the camera.
+    """Predict every sighting: the point in the IMU frame, moved on over the camera's delay, then in the camera.
 
-    A pose moved by [phi, rho] on its right moves a point q in its axes by [q]x phi - rho. That a camera which is late
-    sees another point for another pose or velocity is left out of the Jacobians, and that a rolled image moves
-    otherwise: milliseconds and hundredths of a radian do not count there.
+    A pose moved by [phi, rho] on its right moves a point q in its axes by [q]x phi - rho. The Jacobians neglect that
+    the shift by the delay depends on pose and velocity, and the roll of the right image: for milliseconds and
+    hundredths of a radian both are negligible.
     """
     rig, key, track = calibration.rig, window.key, window.track
     R_imu_first, R_cam_imu = window.R_first_imu[key].swapaxes(1, 2), rig.T_imu_cam[:3, :3].T
@@ -237,7 +237,7 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
 
 
 def _weighted(residual_px: Array, rig: StereoRig) -> Array:
-    """Return what residuals (N, 3) px are multiplied by (N, 3, 3): whitened, and with the root of Cauchy weights."""
+    """Return matrices (N, 3, 3) that whiten residuals (N, 3) px and apply the root of Cauchy weights."""
     chi2 = np.sum((residual_px @ rig.whitener.T) ** 2, axis=1)
     scale2 = max(float(np.median(chi2)) / CHI2_3_MEDIAN, LEAST_SCALE2)
     return np.asarray(rig.whitener / np.sqrt(scale2 + chi2 / CAUCHY_SIGMAS**2)[:, None, None])
@@ -297,7 +297,7 @@ def _strides(window: Window, calibration: Calibration) -> _Normal:
 
 
 def stride_equations(window: Window, calibration: Calibration) -> tuple[Array, Array]:
-    """Return what the strides lack (m, k) and its change (m, k, j) by the states at both ends, gravity and biases."""
+    """Return the residuals (m, k) of the strides and their derivatives (m, k, j) by states, gravity and biases."""
     attitudes, position, velocity = window.R_first_imu, window.position, window.velocity
     return window.strides.equations(attitudes, position, velocity, window.gravity, calibration.bias)
 

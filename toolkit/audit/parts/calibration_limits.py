@@ -1,7 +1,7 @@
-"""What of a calibration found from tracks and measured motion is wrong beyond chance and sound recordings, in words.
+"""Decides which parts of a self-calibration are wrong by more than chance and than in sound recordings, in words.
 
-Where the camera is belongs to `lever_arm`, and beside odometry, of which the scale is no better known, the baseline to
-`vision_scale` and the clock to `time_offset`.
+The position of the camera is checked by `lever_arm`. With odometry, whose scale is no better known, the baseline is
+checked by `vision_scale` and the clock by `time_offset`.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from toolkit.sequence import StereoRig
 
 
 class Limits(NamedTuple):
-    """From how many standard errors on what counts, beyond what sound recordings have, and what is said to hide.
+    """Limits in standard errors, limits beyond sound recordings, and sizes of undetected errors to be reported.
 
     A share of a focal length, px of cx and cy, a turn in rad, a share of the baseline, s of the clock, px and rad of
-    the right image; those that are infinite are not judged. A fault that must be larger than the last ones to show is
-    said to hide.
+    the right image; infinite ones are not judged. Where a fault larger than the last limits would go undetected, that
+    is reported.
     """
 
     sigmas: float
@@ -62,14 +62,14 @@ BESIDE = {"imu": "IMU", "twist": "odometry"}
 
 
 class Wrong(NamedTuple):
-    """One thing that is wrong: what is said of it, and what to check."""
+    """One wrong part: the message, and what to check."""
 
     summary: str
     check: str
 
 
 def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wrong]:
-    """Name what is wrong of the rig by which the calibration was begun."""
+    """Return the wrong parts of the rig from which the self-calibration started."""
     limits = LIMITS[kind]
     return [
         *_intrinsics(found, rig, limits, BESIDE[kind]),
@@ -81,7 +81,7 @@ def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wron
 
 
 def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | None:
-    """Say what is wrong beyond chance and no more than sound recordings have."""
+    """Say which parts are wrong by more than chance but no more than in sound recordings."""
     nothing = {"right_shift_px": 0.0, "right_roll_rad": 0.0}
     by_chance = LIMITS[kind]._replace(focal=0.0, centre_px=(0.0, 0.0), turn_rad=0.0, **nothing)
     of_rig, of_right = _intrinsics(found, rig, by_chance, BESIDE[kind]), _right_image(found, by_chance)
@@ -93,7 +93,7 @@ def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | 
 
 
 def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
-    """Say how large faults of the intrinsics and of where the camera looks would not show, where that is much."""
+    """Say how large errors of the intrinsics and of the camera's rotation would go undetected, where that is large."""
     limits = LIMITS[kind]
     focal = limits.focal + limits.sigmas * found.error[FOCAL]
     centre_px = np.array(limits.centre_px) + limits.sigmas * found.error[CENTRE]
@@ -116,7 +116,7 @@ def _hidden_right(found: SelfCalibration, limits: Limits) -> list[str]:
 
 
 def hidden_baseline(found: SelfCalibration, kind: MotionKind) -> float:
-    """Return by what share a baseline must be off to be told, whichever way it is."""
+    """Return the least relative error of the baseline that is detected in either direction."""
     limits = LIMITS[kind]
     return float(limits.baseline + limits.sigmas * found.error[BASELINE] + abs(found.value[BASELINE]))
 
@@ -141,7 +141,8 @@ def _baseline(found: SelfCalibration, limits: Limits) -> list[Wrong]:
         return []
     factor = float(np.exp(share))
     summary = f"a baseline {factor:.3f} +- {factor * error:.3f} times the given one fits"
-    return [Wrong(summary, "the baseline, the rectification of the pair")]  # of far points a shifted image looks so
+    # A shifted image has this effect on far points.
+    return [Wrong(summary, "the baseline, the rectification of the pair")]
 
 
 def _turn(found: SelfCalibration, limits: Limits) -> list[Wrong]:

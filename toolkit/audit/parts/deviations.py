@@ -1,7 +1,7 @@
-"""By how much the motion samples deviate from the camera's own motion, interval by interval, and for how long.
+"""Deviations of the motion samples from the camera's own motion, interval by interval, and how long they last.
 
-Neither tells alone which of the two is wrong. What the mean of a stretch of time deviates by is held against what such
-means scatter by in the rest of the recording, which holds noise, slip and what else is usual there.
+A deviation does not show which of the two is wrong. The mean over a stretch of time is compared with the scatter of
+such means in the rest of the recording, which includes noise, slip and other usual errors.
 """
 
 from functools import partial
@@ -20,9 +20,9 @@ from toolkit.sequence import Sequence
 
 # Length of the stretches that are averaged: longer than a correction of the steering, shorter than a red light.
 STRETCH_S = 2.0
-# Of fewer intervals no mean is taken.
+# Least number of intervals for a mean.
 LEAST_IN_STRETCH = 8
-# From so many stretches on a recording shows itself how much their means scatter.
+# With this many stretches the scatter of their means is estimated from the recording itself.
 LEAST_STRETCHES = 10
 # The specific force is compared with gravity as it was within so many seconds: the gyro's drift turns it after that.
 GRAVITY_S = 10.0
@@ -58,7 +58,7 @@ class Span(NamedTuple):
 def deviations(
     sequence: Sequence, camera: CameraMotion, intervals: Intervals, fallen: "Fallen | None" = None
 ) -> tuple[Deviation, ...]:
-    """Return what can be compared: rotation, and the velocity of twists or the specific force of an IMU.
+    """Return the deviations of the rotation, and of the velocity of twists or the specific force of an IMU.
 
     The gyro's constant bias is taken off first. ``fallen`` is that of `fallen_mps`, where it is known.
     """
@@ -146,7 +146,7 @@ def _of_medians(what: str, unit: str, t_s: Array, value: Array) -> Deviation:
 
 
 def _scatter(value: Array) -> Array:
-    """Return the standard deviation (3,) from one interval to the next, which what lasts does not raise."""
+    """Return the standard deviation (3,) from changes between intervals, which lasting deviations do not raise."""
     change = np.abs(np.diff(value, axis=0))
     return np.asarray(MAD_TO_SIGMA * np.median(change, axis=0) / np.sqrt(2.0))
 
@@ -171,7 +171,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: "Fallen") -
     t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
     value = (np.diff(smooth, axis=0) / h_s)[rows]
     bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(fallen) - 2]]
-    # Where no stretch is long enough, nothing tells how much the velocities scatter.
+    # Where no stretch is long enough, the scatter of the velocities is unknown.
     bent_mps = np.median(bend, axis=0) if len(bend) else np.full(3, np.inf)
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * bent_mps / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
@@ -190,7 +190,7 @@ class Fallen(NamedTuple):
 
 
 def fallen_mps(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Fallen:
-    """Take what the IMU gained from the camera's velocity."""
+    """Subtract the velocity that the IMU gained from the camera's."""
     bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion

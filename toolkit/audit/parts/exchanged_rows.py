@@ -1,8 +1,9 @@
-"""Tracks among others whose image coordinates are exchanged: row where column belongs.
+"""Finds tracks, among others, whose image coordinates are exchanged: the row in the place of the column.
 
-Both images' rows then stand for uL and uR, which differ by their noise alone, and the column for v. The camera's own
-motion, of the other tracks, says where a point of unknown depth may be seen next: on a piece of its epipolar line
-(Hartley and Zisserman, "Multiple View Geometry", section 9.2). An exchanged track follows it once exchanged again.
+uL and uR are then the rows of both images, which differ by noise alone, and v is the column. The camera's own motion,
+from the other tracks, predicts where a point of unknown depth is seen next: on a part of its epipolar line (Hartley and
+Zisserman, "Multiple View Geometry", section 9.2). An exchanged track follows this line after its coordinates are
+exchanged again.
 """
 
 import numpy as np
@@ -21,7 +22,7 @@ _INVERSE_DEPTHS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 23)])
 
 
 def exchanged_rows(sequence: Sequence, camera: CameraMotion) -> BoolArray:
-    """Say of each sighting (N,) whether its track, one like rows, follows the camera's own motion only if exchanged.
+    """Say of each sighting (N,) whether its track, without disparity, follows the camera's motion only if exchanged.
 
     Its median distance from the epipolar lines is then less than half of what it is as given.
     """

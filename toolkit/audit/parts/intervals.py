@@ -1,22 +1,21 @@
-"""The motion between two frames as the motion samples and as the camera measure it, side by side."""
+"""The motion over each interval between frames, by the motion samples and by the camera."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
 from toolkit.measured_motion import NoSamples, TwistSamples
-from toolkit.models.camera_motion import CameraMotion, usable_pairs
-from toolkit.models.stereo import project, triangulate
+from toolkit.models.camera_motion import CameraMotion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30
-# Steps in which an IMU's samples are integrated, with the orientation as it is in the middle of each.
+# Longest step (s) in the integration of an IMU's samples, with the orientation in its middle.
 STEP_S = 0.02
-# What a gyro beside odometry reads too much at most, 11 degrees a second; more is another fault, such as wrong axes.
+# Largest bias of a gyro with odometry, 11 degrees a second; more is another fault, such as wrong axes.
 MOST_BIAS_RADPS = 0.2
 
 
@@ -41,7 +40,7 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Put both side by side; None where too few intervals are known, or no motion was measured."""
+    """Return both motions; None where too few intervals are known, or no motion was measured."""
     rows = np.flatnonzero(camera.known)
     if isinstance(sequence.motion, NoSamples) or rows.size < LEAST_INTERVALS:
         return None
@@ -62,7 +61,7 @@ def is_comparable(sequence: Sequence) -> bool:
 class Integral(NamedTuple):
     """Samples (S, d) at stamps (S,), joined by straight lines and level beyond the ends, and their integral up to each.
 
-    Made once, it has the means over any intervals at the cost of these alone.
+    After it is made once, means over intervals cost time only in their number.
     """
 
     t_ns: IntArray
@@ -97,36 +96,13 @@ def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Arra
 def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
     """Return stamps (n,) that divide each interval between stamps (K,) into equal parts, and the index (K,) of those.
 
-    Over a part, STEP_S at most, an IMU's force and rate of rotation are taken for constant; over the interval between
-    two frames they are not: what shakes a vehicle several times a second feigns a scale of 8 %.
+    Over a part, STEP_S at most, an IMU's force and rate of rotation are taken as constant. Over the interval between
+    two frames they are not: vibration of several hertz would bias a scale by 8 %.
     """
     parts = max(1, int(np.ceil(np.median(np.diff(t_ns)) / NS_PER_S / STEP_S)))
     index = np.arange(len(t_ns)) * parts
     since_ns = np.interp(np.arange(index[-1] + 1), index, t_ns - t_ns[0])
     return t_ns[0] + since_ns.round().astype(np.int64), index
-
-
-def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
-    """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
-
-    Points triangulated in one frame are moved by the motion samples through the extrinsic ``T_imu_cam`` and projected
-    into the next. A gyro has a bias: rates of rotation are taken about their median difference from the camera's, but
-    beside odometry for more than ``MOST_BIAS_RADPS``. An IMU measures no velocity: there the camera's own is taken.
-    Only intervals whose camera motion is known.
-    """
-    return _median(_one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))[1])
-
-
-def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
-    """Return the median of the same residuals in each known interval that has any (M,), in pixels."""
-    interval, each_px = _one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))
-    first = np.flatnonzero(np.diff(interval, prepend=-1))
-    return np.array([_median(part) for part in np.split(each_px, first[1:])]) if interval.size else np.empty(0)
-
-
-def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
-    """Return the same median where the points are moved by a motion of the camera, for example its own."""
-    return _median(_one_step_px(sequence, camera, moved_by(camera, sequence))[1])
 
 
 def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
@@ -148,17 +124,3 @@ def moved_by(camera: CameraMotion, sequence: Sequence) -> Array:
     """Return the motion (K - 1, 4, 4) of a camera over every interval."""
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     return se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1))
-
-
-def _one_step_px(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> tuple[IntArray, Array]:
-    """Return interval (P,) and residual (P,) px under the camera's motion (K - 1, 4, 4) in the known intervals."""
-    pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
-    pairs = pairs.select(camera.known[pairs.interval])
-    points = transform(se3_inverse(T_before_after)[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
-    points[:, 2] = np.maximum(points[:, 2], 0.1)
-    residual_px = uv_px[pairs.after] - project(points, sequence.rig)
-    return pairs.interval, np.sqrt(np.mean(residual_px**2, axis=1))
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if values.size else float("nan")

@@ -14,13 +14,13 @@ ITERATIONS = 10
 # Standard error of a median over that of a mean, for normal errors.
 MEDIAN_TO_MEAN_ERROR = 1.2533
 LEAST_STRETCHES = 2
-# What is chance less often than this counts.
+# Level of significance.
 LEVEL = 1e-3
 # How long slip lasts (s); chosen with the parts of the recordings at hand in view.
 SLIP_S = 1.5
-# What lasts for seconds, as slip does, makes estimates scatter more than if every interval erred by itself: by these
-# factors, as so many stretches tell. 248 parts of ten drives have 2.0 on the median and 4.6 in nine of ten at most, 03
-# alone 3.3 and 5.0; 258 parts beside an IMU 1.0 and 1.3. Chosen with them in view.
+# Errors that last for seconds, such as slip, make estimates scatter more than independent errors of intervals: by these
+# factors, with the weight of this many stretches. 248 parts of ten drives have 2.0 on the median and 4.6 in nine of ten
+# at most, 03 alone 3.3 and 5.0; 258 parts beside an IMU 1.0 and 1.3. Chosen with them in view.
 INFLATION, INFLATION_STRETCHES = {"twist": 3.0, "imu": 1.5}, 8.0
 
 
@@ -45,7 +45,7 @@ def median(values: Array) -> Array:
     """
     if len(values) == 0:
         return np.full(values.shape[1:], np.nan)
-    # The middle value stands for both where there is one. What is not a number comes last in the order.
+    # With an odd number the middle value is used twice. NaN comes last in the order.
     lower, upper, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
     ordered = np.partition(values, (lower, upper, last), axis=0)
     middle: Array = np.where(np.isnan(ordered[last]), np.nan, 0.5 * (ordered[lower] + ordered[upper]))
@@ -74,20 +74,21 @@ def in_motion(moved: Array, stretches: int) -> float:
 
 
 def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
-    """Return from how many standard errors on an estimate is chance less often than ``level``, by Student's t.
+    """Return the number of standard errors exceeded by chance less often than ``level``, by Student's t.
 
-    The error is that of a jackknife over so many stretches; two or fewer tell nothing of it.
+    The error is that of a jackknife over this many stretches; with two or fewer the result is infinite.
     """
     return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * level)) if stretches > LEAST_STRETCHES else np.inf
 
 
 def chance_bound(error: Array, formal: Array, stretches: float, usual: float) -> Array:
-    """Return beyond what (m,) estimates are chance less often than ``LEVEL``.
+    """Return the bounds (m,) that estimates exceed by chance less often than ``LEVEL``.
 
     ``error`` (m,) is a jackknife's over so many stretches and ``formal`` (m,) the standard error if every interval
-    erred by itself. A few stretches tell their own scatter badly: beside their bound there is that of their inflation
-    of the formal error pooled with the ``usual`` one, and the smaller holds. Source: Smyth, "Linear models and
-    empirical Bayes methods for assessing differential expression in microarray experiments" (2004), section 3.
+    erred by itself. A few stretches determine their own scatter badly. So a second bound is computed from their
+    inflation of the formal error pooled with the ``usual`` inflation, and the smaller bound is returned. Source: Smyth,
+    "Linear models and empirical Bayes methods for assessing differential expression in microarray experiments" (2004),
+    section 3.
     """
     own_dof = max(stretches - 1.0, 0.0)
     inflation = np.maximum(error / np.maximum(formal, 1e-12), 1.0)

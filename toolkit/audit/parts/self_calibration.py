@@ -1,7 +1,7 @@
-"""The calibration by which tracks and measured motion fit best: windows of key frames adjusted with it unknown.
+"""Self-calibration: windows of key frames are adjusted to tracks and measured motion with unknown calibration.
 
-From frame to frame the noise of the tracks hides a focal length, a clock or a turn that is off by little; a point that
-is followed over a second, beside the integrated IMU or odometry, shows it. See `bundle` for the equations.
+From frame to frame the noise of the tracks hides small errors of a focal length, a clock or a rotation; points that are
+followed over a second, with the integrated IMU or odometry, show them. See `bundle` for the equations.
 """
 
 from typing import NamedTuple
@@ -49,9 +49,9 @@ class Effort(NamedTuple):
 # Of longer recordings the windows are spread evenly beside an IMU, whose clock may change, and are those of the most
 # rotation beside odometry: cars go straight ahead for long. There tracks that creep leave no use for more of them.
 MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 100, 14)}
-# Settled is what changes by less than this share of its standard errors.
+# Converged where the change is less than this share of the standard errors.
 SETTLED = 0.4
-# A step of more than so many standard deviations of what a calibration is off by leads nowhere.
+# A step of more than this many prior standard deviations diverges.
 STRAYED = 10.0
 # Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. What is
 # beyond them is no solution.
@@ -78,7 +78,7 @@ NEAR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(MOST_P
 
 
 class SelfCalibration(NamedTuple):
-    """What has to be added to the calibration's unknowns, or what its biases are (21,), and the covariance.
+    """The corrections of the calibration's unknowns (21,), or the values of its biases, and the covariance.
 
     `bundle` has their order. They rest on so many ``windows``; one says nothing of a change of the clock. Of a pair
     that looks rectified the right image's are zero, with the covariance that they have beside the others.
@@ -99,7 +99,7 @@ def self_calibration(
 ) -> SelfCalibration | None:
     """Find the calibration by tracks and the measured motion.
 
-    None where no window has the tracks for it, or where none near the one that is given fits.
+    None where no window has enough tracks, or no calibration near the given one fits.
     """
     w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
     windows = _windows(sequence, camera, w_bias, fewest_windows)
@@ -109,7 +109,7 @@ def self_calibration(
     try:
         given = Calibration(sequence.rig, 0.0, np.zeros(6))
         found, cov = _fitted(_At(windows, given, np.zeros(COMMON)), kind)
-    except (np.linalg.LinAlgError, DataError):  # steps that lead nowhere: singular, or a rig that is none
+    except (np.linalg.LinAlgError, DataError):  # diverging steps: singular, or an impossible rig
         return None
     value = found.value
     if not found.settled or (np.abs(value) > NEAR[kind]).any():
@@ -147,7 +147,7 @@ def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
     """
     rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
     right = _step(rectified.all_reduced, rectified.at.moved_by, prior)[RIGHT]
-    # Windows of a pair that is not rectified want different calibrations: their scatter is no chance here.
+    # Windows of a pair that is not rectified fit different calibrations: their scatter is not by chance.
     by_parts, _ = _cov_of_parts(rectified.all_reduced, prior, COMMON)
     if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(by_parts)[RIGHT])).any():
         found = _adjusted(rectified.at, kind, COMMON)

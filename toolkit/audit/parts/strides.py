@@ -1,4 +1,4 @@
-"""The measured motion over strides of some frames, integrated, what states at their ends lack of it, and its noise.
+"""The measured motion integrated over strides of several frames, its residuals at states at their ends, and its noise.
 
 Of an IMU the samples are preintegrated; odometry's twists are chained, with an unknown turn of their velocities. The
 derivatives by the biases are differences of the integrals: all are linear to what biases are off by.

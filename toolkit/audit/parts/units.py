@@ -1,4 +1,4 @@
-"""Ratios of what two sources tell of one motion, the units they show, and samples converted to SI."""
+"""Ratios of one motion by two sources, the units that they show, and samples converted to SI."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ FROM_SCATTER = 0.5
 
 
 def in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
-    """Return the one unit whose factor a ratio is, or None where it is none's, may be one or may be two units'."""
+    """Return the only unit whose factor a ratio matches; None where none does, several do, or the ratio may be 1."""
     if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
         return None
     apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}

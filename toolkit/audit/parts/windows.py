@@ -1,7 +1,7 @@
-"""What the camera moves and turns by, from the stereo tracks alone, beside what a trajectory does in the same time.
+"""Displacements and rotations over windows of time, by the stereo tracks alone and by a trajectory.
 
-Over windows of time both are chained from frame to frame, in the axes that the camera has where each window begins.
-What they differ by is told by the median over the windows, with its standard error and what chance makes of as many.
+Both are chained from frame to frame, in the axes of the camera at the start of each window. Their difference is the
+median over the windows, with its standard error and a bound by chance.
 """
 
 from itertools import pairwise
@@ -17,23 +17,23 @@ from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, Truth
 
-# Long enough that the noise of single frames hardly counts, short enough that five seconds hold ten of them.
+# Long enough that the noise of single frames is small, short enough that five seconds have ten windows.
 WINDOW_S = 0.5
 LEAST_WINDOWS = 4
 # What is chance less often than this, by Student's t of as many windows, counts ...
 LEVEL = 1e-3
 # ... beyond what sound recordings at hand have; chosen with them in view.
 SYSTEMATIC = 0.06
-# A scale is the difference where little is left of it after scaling; while a vehicle stands there is only noise.
+# The difference is a scale where scaling removes most of it; while a vehicle stands there is only noise.
 MOST_SCALED_OFF = 0.25
-# A truth's noise feigns motion of what hardly moves (m, rad over a window).
+# Least motion of a window (m, rad): the noise of a truth moves even a standing vehicle.
 LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
 
 
 def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
-    """Return how many times as long as the camera's own a trajectory's steps are, where that factor alone parts them.
+    """Return the ratio of a trajectory's steps to the camera's, where they differ by this factor alone.
 
-    None where it is chance or no more than sound recordings have, or where the tracks do not tell.
+    None where the ratio may be 1 by chance or as in sound recordings, or the tracks do not determine it.
     """
     camera = camera_motion(sequence)
     if not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
@@ -85,13 +85,13 @@ def _has_truth(truth: Truth, t_ns: IntArray, apart_ns: int) -> BoolArray:
 def moving(both: Array, least: float) -> BoolArray:
     """Say in which windows (M,) the truth does enough, of what camera and truth do (2, M, 3).
 
-    Where it stands and the camera seems to move, a vehicle fills the view as often as the truth is wrong.
+    Windows in which the truth stands are left out: if the camera seems to move there, a vehicle may fill the view.
     """
     return np.asarray(np.linalg.norm(both[1], axis=1) > least)
 
 
 class Compared(NamedTuple):
-    """A median over some windows with its standard error, and beyond which distance it is no chance."""
+    """A median over windows with its standard error, and the distance that is exceeded only by chance."""
 
     value: float
     error: float

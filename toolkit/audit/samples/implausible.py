@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.edits import keep_samples
 from toolkit.audit.parts.robust import MAD_TO_SIGMA
-from toolkit.audit.parts.subsets import keep_samples
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

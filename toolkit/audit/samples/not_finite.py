@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.subsets import keep_samples
+from toolkit.audit.parts.edits import keep_samples
 from toolkit.geometry import Array, BoolArray
 from toolkit.sequence import is_measured
 

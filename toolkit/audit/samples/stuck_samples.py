@@ -9,7 +9,7 @@ equal samples in a row are no chance is told by how often two are equal in the r
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.subsets import keep_samples
+from toolkit.audit.parts.edits import keep_samples
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 

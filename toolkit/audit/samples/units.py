@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import Intervals, median_one_step_px
+from toolkit.audit.parts.intervals import Intervals
+from toolkit.audit.parts.one_step import median_one_step_px
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.units import (
     force_ratio,

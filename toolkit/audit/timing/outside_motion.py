@@ -3,7 +3,7 @@
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.resampling import NS_PER_S
 
 # Between fewer frames nothing moves.

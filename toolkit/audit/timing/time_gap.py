@@ -8,7 +8,7 @@ hole is kept; stitching the rest on would need a pose nobody measured.
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

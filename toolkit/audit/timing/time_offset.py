@@ -1,7 +1,7 @@
 """Frames stamped by another clock than the motion samples, or with a constant delay of the camera.
 
 The camera's rotation, from its tracks alone, is the mean of the gyro over each interval, shifted by the offset
-(`parts.rotation_offset`).
+(`parts.clocks`).
 
 A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains. Where it
 is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit. An
@@ -14,10 +14,10 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LATE
+from toolkit.audit.parts.clocks import camera_offset, is_stamped_at_frames
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
-from toolkit.audit.parts.rotation_offset import camera_offset, is_stamped_at_frames
-from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.timing.twist_lag import LAG
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S

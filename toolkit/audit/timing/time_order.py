@@ -3,7 +3,7 @@
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.subsets import keep_frames, keep_samples
+from toolkit.audit.parts.edits import keep_frames, keep_samples
 from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.tracks import by_track
+from toolkit.audit.parts.edits import by_track
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px

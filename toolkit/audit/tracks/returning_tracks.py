@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.tracks import by_track, split
+from toolkit.audit.parts.edits import by_track, split
 from toolkit.sequence import Observations
 
 

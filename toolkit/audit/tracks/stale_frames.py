@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.edits import by_track, split
 from toolkit.audit.parts.intervals import interval_means, is_comparable
-from toolkit.audit.parts.tracks import by_track, split
 from toolkit.geometry import Array, BoolArray
 from toolkit.models.camera_motion import Neighbours, neighbours
 from toolkit.resampling import NS_PER_S

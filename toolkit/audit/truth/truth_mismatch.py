@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.clocks import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable
-from toolkit.audit.parts.truth_clock import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.audit.parts.windows import (
     LEAST_MOVED_M,
     LEAST_TURNED_RAD,

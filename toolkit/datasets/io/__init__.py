@@ -1,8 +1,8 @@
 """Parts of the recording formats; no file here is a format.
 
 Read ``fields`` (named arrays with their checks) and ``tables`` (CSV) first; ``image_pairs`` lists images and checks
-them, ``truth`` reads ground truth, ``yaml_fields`` calibrations. ``npz_archive`` streams large arrays, with ``sparse``;
-``plain_pickle`` reads object arrays and runs nothing. ``euroc_calibration`` and ``euroc_truth`` belong to EuRoC,
-``bag_reader``, ``bag_topics``, ``bag_calibration`` and ``ros_values`` to bags. ``unrecognised``: what is no recording.
-``returned``: what is no sequence.
+them, ``truth`` reads ground truth, ``yaml_fields`` calibrations. ``npz_archive`` streams large arrays and keeps them
+sparse; ``plain_pickle`` reads object arrays and runs nothing. ``euroc_calibration`` and ``euroc_truth`` are EuRoC's,
+``bag_reader``, ``bag_topics``, ``bag_calibration`` and ``ros_values`` are for bags. ``unrecognised`` explains why a
+path is no recording.
 """

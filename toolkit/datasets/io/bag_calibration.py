@@ -67,7 +67,7 @@ def _frame(messages: list[Message], *, of_child: bool = False) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Where a calibration may be from; ``in_tf`` says that /tf joins the frames, and not /tf_static."""
+    """Possible sources of a calibration; ``in_tf`` says that /tf connects the frames, and not /tf_static."""
 
     path: Path
     chosen: Chosen
@@ -98,7 +98,7 @@ def _moving(bag: Bag, chosen: Chosen) -> Iterator[Any]:
 def mounted(source: Source, motion: MotionSamples) -> Mounted:
     """Return the calibration: from files beside the bag, or from its own messages.
 
-    Raises DataError where there is none, it is not whole, or nothing tells where the camera is on the body.
+    Raises DataError where there is none, it is incomplete, or the pose of the camera on the body is unknown.
     """
     folder = _calibration_folder(source.path)
     twist = twist_noise(motion.t_ns, motion.v_mps, motion.w_radps) if isinstance(motion, TwistSamples) else None
@@ -111,7 +111,7 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
         notes = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
         return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes)
     T_imu_left = source.tree.between(source.frames.body, source.frames.left)
-    # An IMU has no camera's axes: where both name one frame, programs have written the same name everywhere.
+    # An IMU does not have the axes of a camera: if both name the same frame, the name is wrong for one of them.
     if T_imu_left is None or (source.chosen.imu is not None and source.frames.body == source.frames.left):
         raise DataError(_not_joined(source))
     pair, as_they_are, how = _pair(source)

@@ -1,8 +1,8 @@
-"""The border to the rosbags library: which kind of bag a path is, its topics, and its messages, one by one.
+"""The interface to the rosbags library: the kind of a bag, its topics, and its messages, one by one.
 
-Messages are read with the library's own definitions of ROS's types and never with those a bag brings, for code is made
-of these. Whatever a damaged bag makes the library raise becomes a DataError.
-Formats: http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2.
+Messages are read with the library's own definitions of ROS's types and never with those in a bag, because code is
+generated from definitions. Any error that a damaged bag makes the library raise becomes a DataError. Formats:
+http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2.
 """
 
 import importlib.util
@@ -33,7 +33,7 @@ _TF, _OLD_TF, _TF_DEFINITION = (
 _ENDINGS = (".mcap", ".db3", ".bag")
 # How rosbag record --split ends the names of the parts.
 _PART = re.compile(r"_(\d+)$")
-# What the library says of a storage, a compression or a version of bags that it does not know.
+# The library's messages about a storage, a compression or a version of bags that it does not know.
 _NOT_SUPPORTED = "not supported"
 # What writes the missing index, by kind of bag.
 _MENDS = {

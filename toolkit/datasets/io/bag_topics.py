@@ -1,4 +1,4 @@
-"""Which topics of a bag are what: as asked for with ``--topics``, else guessed from their types and names."""
+"""Assigns the topics of a bag to their roles: as given with ``--topics``, else guessed from types and names."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -48,7 +48,7 @@ _COMPRESSED_SUFFIX = "/compressed"
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics of a recording by what they are; None where there is none, and what must be known of the choice.
+    """The topics of a recording by role, None where there is none, and remarks on the choice.
 
     ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
     transforms that may change, and ``other_imus`` those that were not chosen.
@@ -75,7 +75,7 @@ class Chosen:
 
 
 def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
-    """Return which topics are what; raises DataError where one asked for, or a pair of images, is not there."""
+    """Return the topics by role; raises DataError where a requested one, or a pair of images, is missing."""
     given = _requested(path, topics, requested)
     usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
     left, right = _pair(path, topics, usable, given)
@@ -139,7 +139,7 @@ def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: d
 
 
 def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
-    """Return what to tell of a bag in which no two topics of images are a pair by their names."""
+    """Return the message for a bag in which no two topics of images are a pair by their names."""
     there = ", ".join(map(str, topics)) or "no topics"
     if not images:
         why = "holds no images that can be read, and the tracks are made of them"
@@ -220,7 +220,7 @@ def _most(topics: Iterable[Topic]) -> Topic | None:
 
 
 def _facts(topics: Sequence[Topic], chosen: Chosen, given: dict[str, Topic]) -> tuple[str, ...]:
-    """Return which topics are what, said or guessed, and those that are not used."""
+    """Return remarks on the topics by role, given or guessed, and on those that are not used."""
     found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
     named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
     used = {topic.name for topic in (*found.values(), *chosen.transforms)}

@@ -22,12 +22,12 @@ from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
 
-# Long enough that the noise of single truth poses hardly counts, short enough that the gyro's mean is the rotation.
+# Long enough that the noise of single truth poses is small, short enough that the gyro's mean gives the rotation.
 _STEP_NS = NS_PER_S // 10
-# Poses about a step that are further apart do not tell its rotation.
+# The rotation of a step is unknown where poses around it are farther apart than this.
 _MOST_STEPS = 5
-# Rates of two unrelated motions are apart by at least what the gyro turns; of a noisy motion capture by half of that.
-# Less than the first figure is the noise of a good one at a standstill.
+# Rates of two unrelated motions differ by at least the gyro's rates; those of a noisy motion capture by half of that.
+# Differences below the first number are the noise of a good motion capture at a standstill.
 _MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
 _STRANGER = (
     ": it turns otherwise than the gyro, so it is of another recording, or its quaternions or the gyro are not in the "

@@ -1,4 +1,4 @@
-"""The named arrays of one recording as measurements: checks of type and shape, stamps, and stereo corners.
+"""The named arrays of a recording: checks of type and shape, conversion of stamps, and stereo corners.
 
 Every check turns a malformed array into one line that names file and key.
 """
@@ -20,24 +20,26 @@ from toolkit.sequence import Observations
 _RIGID_TOLERANCE = 1e-3
 # A pair whose rows are this far apart (median, px) is not rectified: at most 0.3 px in the recordings at hand.
 _MOST_ROWS_APART_PX, _FEWEST_ROWS = 1.5, 30
-# Matches of two rows so far apart (px) are none; 4 % of them at most in the recordings at hand, with 3 px of noise.
+# Corners whose rows are this far apart (px) are mismatches: 4 % of them at most in the recordings at hand, with 3 px of
+# noise.
 _NO_MATCH_PX, _MOST_NO_MATCH = 5.0, 0.1
 # Share of the focal length that a skew may be: less than a pixel at the edge of the image.
 _MOST_SKEW = 1e-3
-# No recording lies beyond the year 5000, nor has a sample only every half minute.
+# Latest plausible stamp, in the year 5000.
 _LATEST_S = 1e11
-# What int64 holds of nanoseconds: to the year 2262.
+# Largest time in seconds that int64 nanoseconds can hold: the year 2262.
 _LATEST_NS_S = 9.2e9
 # Stamps are finer than this; single precision is not, from 10 000 s on.
 _COARSE_S = 9e-4
+# No recording has a sample only every half minute.
 _LONGEST_STEP_S = 30.0
 _UNITS = (
     (1e-9, "nanoseconds: divide by 1e9"),
     (1e-6, "microseconds: divide by 1e6"),
     (1e-3, "milliseconds: divide by 1e3"),
 )
-# Nobody states more than two thousand samples a second, so closer stamps do not count nanoseconds. What they count is
-# told from the step: halfway, as factors go, between steps of 50 ms in one unit and the next.
+# Rates above two thousand samples a second are not plausible, so closer stamps are not in nanoseconds. Their unit is
+# found from the step: thresholds are the geometric means of steps of 50 ms in one unit and the next.
 _UNITS_OF_NS = (
     (1.6, "seconds: multiply by 1e9"),
     (1.6e3, "milliseconds: multiply by 1e6"),
@@ -190,7 +192,7 @@ def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:
 def check_rows(path: Path, corners_px: Array) -> None:
     """Raise DataError where the rows vL and vR of corners (N, 4) differ by a constant, or in many: not rectified.
 
-    Or u and v are exchanged. A sequence has only the rows' mean, in which nothing shows it any more.
+    Or u and v are exchanged. It is checked here because a sequence has only the mean of the rows.
     """
     whole = corners_px[np.isfinite(corners_px).all(axis=1)]
     if len(whole) < _FEWEST_ROWS:

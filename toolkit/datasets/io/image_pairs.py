@@ -1,6 +1,6 @@
-"""Which image files belong together: listed in the tables of an ASL folder, or paired by the numbers of their names.
+"""Pairs of image files: listed in the tables of an ASL folder, or paired by the numbers in their names.
 
-What images must have before any is read is checked here: both cameras, stamps that differ, the motion's time.
+Checks before any image is read: both cameras are there, stamps differ, and they lie in the motion's time.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 UNPACK_IMAGES = f"unpack them there ({', '.join(SUFFIXES)} are read)"
 # Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
 _SAME_INSTANT_NS = 1_000_000
-# So many of the pairs left out are told by name.
+# Pairs left out that are listed by name.
 _NAMED = 10
 
 
@@ -39,7 +39,7 @@ class Listed:
     remarks: tuple[str, ...] = ()
     apart_ms: float | None = None
 
-    def there(self, least: float) -> "Listed":
+    def existing(self, least: float) -> "Listed":
         """Return the pairs of which both files are there, with a remark, where their share is below the least.
 
         Of a recording that has nearly all its files those that are missing stay in, to be named one by one.

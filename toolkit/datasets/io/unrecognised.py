@@ -1,4 +1,4 @@
-"""What is told of a path that is of no format: an archive, a trajectory, a run directory, a folder of recordings."""
+"""Messages for a path of no format: an archive, a trajectory, a run directory, a folder of recordings."""
 
 import os
 from collections.abc import Callable
@@ -17,12 +17,12 @@ _ARCHIVES = {
     b"PK\x03\x04": "zip",
     b"7z\xbc\xaf": "7-zip",
 }
-# Arrays of NumPy are packed so, and nobody need unpack them.
+# Archives of NumPy arrays, which need not be unpacked.
 _ARRAYS = ".npz"
 _TAR, _TAR_AT = b"ustar", 257
-# So many entries of a folder are looked at, and so many recordings among them named.
+# Entries of a folder that are examined, and recordings among them that are named.
 _LOOKED_AT, _NAMED = 50, 3
-# Data sets come as dataset/sequences/00, and people name a camera's folder: so many levels below and above are tried.
+# Levels below and above a path that are searched: users name dataset/sequences, or the folder of one camera.
 _BELOW, _ABOVE = 3, 4
 
 
@@ -38,7 +38,7 @@ def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
 
 
 def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
-    """Return what a folder is, nothing where it cannot be told."""
+    """Return what a folder is; empty where that is unknown."""
     if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
         return (
             "is a run directory and no recording: vislam report shows it, and --config "
@@ -49,7 +49,7 @@ def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
 
 
 def _of_file(path: Path) -> str:
-    """Return what a file is, nothing where it cannot be told."""
+    """Return what a file is; empty where that is unknown."""
     if path.stat().st_size == 0:
         return "the file is empty and so of no known format"
     archive = None if path.suffix == _ARRAYS else _archive(path)

@@ -1,4 +1,4 @@
-"""The checks that a trajectory belongs to a recording, or to a truth alone: one clock, one unit, the same turns."""
+"""Checks that a trajectory belongs to a recording, or to a truth: the same clock, units and rotations."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -34,10 +34,10 @@ _WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
 
 
 class Reference(NamedTuple):
-    """What a trajectory is held against: stamps (K,), rates of rotation (S, 3) rad/s, and positions where known.
+    """The reference of a trajectory: stamps (K,), rates of rotation (S, 3) rad/s, and positions where known.
 
-    ``clock`` and ``turns`` are what has these stamps and these rates, in words. ``positions`` (P, 3) m are the truth's;
-    without them ``speeds_mps`` (S,) of the motion samples tell the unit of length, and may be NaN.
+    ``clock`` and ``turns`` name the sources of these stamps and rates in messages. ``positions`` (P, 3) m are the
+    truth's; without them ``speeds_mps`` (S,) of the motion samples tell the unit of length, and may be NaN.
     """
 
     name: str
@@ -135,8 +135,8 @@ def check_turns(
 ) -> bool:
     """Return whether rotations (N, 3, 3) agree with the gyro; False also where the recording is too short or straight.
 
-    Raises DataError where they do so under one of the readings, and not as given: read wrongly, a trajectory turns
-    the other way and about other axes.
+    Raises DataError where they agree under one of the readings, and not as given: misread rotations turn the other way
+    and about other axes.
     """
     within = _within(t_ns, reference.rates_t_ns)
     steps = _Steps.of(t_ns[within])

@@ -1,4 +1,4 @@
-"""Poses whose axes are exchanged or have the wrong sign: columns mixed up by who wrote the file, a left-handed world.
+"""Finds poses whose axes are exchanged or have the wrong sign: exchanged columns in a file, a left-handed world.
 
 Positions that fit the truth's far better after a reflection are mirrored; those that fit, with orientations that are
 off by one constant turn, are in other axes than these. The signed permutations are tried: with one of them, and no
@@ -18,14 +18,16 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
 
 Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
-# What fits: positions to a share of their extent, orientations to an angle. Estimates that drift more are not judged.
+# Largest errors of a fit: positions in shares of their extent, orientations by an angle. Estimates with more drift are
+# not judged.
 _FITTING_SHARE, _FITTING_RAD = 0.1, np.deg2rad(10.0)
-# As they are given positions must be off so many times as far as otherwise, and by a share of their extent ...
+# As given, positions must have this many times the error under the exchange, and an error above this share of their
+# extent ...
 _TIMES, _LEAST_SHARE = 3.0, 0.01
-# ... or orientations by an angle. A path that keeps to a line tells neither.
+# ... or orientations an error above this angle. A path on a line determines neither.
 _WRONG_RAD, _LEAST_SIDEWAYS = np.deg2rad(30.0), 0.05
 _FEWEST = 10
-# More poses than these, evenly spread, say nothing more.
+# Number of poses, evenly spread, that are compared.
 _ENOUGH = 500
 _NAMES = "xyz"
 
@@ -87,7 +89,7 @@ def _struck(matrix: Array) -> Iterator[Struck]:
 def check_mirrored(what: str, truth: Array, estimate: Array) -> None:
     """Raise DataError where positions of poses (n, 4, 4) fit the truth's (n, 4, 4), of the same times, mirrored alone.
 
-    What a reflection does to orientations looks like other mistakes in them, so that it is looked for before these.
+    The effect of a reflection on orientations resembles other mistakes in them, so it is checked first.
     """
     fit = _fit(truth, estimate)
     if fit is not None and fit.is_mirrored:

@@ -1,4 +1,4 @@
-"""What is read from a trajectory file, and the checks that do not depend on its format."""
+"""The content of a trajectory file, and the checks that do not depend on its format."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

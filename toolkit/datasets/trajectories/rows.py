@@ -16,9 +16,9 @@ from toolkit.geometry import Array, IntArray
 from toolkit.resampling import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1
-# As many digits before the point fit with nanoseconds into 64 bits, if the first is no 9.
+# Digits before the point that fit with nanoseconds into 64 bits, unless the first is 9.
 _MOST_DIGITS, _DECIMALS = 10, 9
-# How seconds are usually printed; as digits they are read several times as fast as through decimals.
+# The usual form of seconds; reading digits is several times as fast as decimal numbers.
 _USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 
 
@@ -119,7 +119,7 @@ def _printed_alike(cells: list[str]) -> IntArray | None:
     if not (0 < point <= _MOST_DIGITS and 0 < after <= _DECIMALS) or set(map(len, cells)) != {width}:
         return None
     characters = np.frombuffer("".join(cells).encode(), dtype=np.uint8)
-    if characters.size != width * len(cells):  # some are no digits of ours
+    if characters.size != width * len(cells):  # some characters are not ASCII
         return None
     digits = characters.reshape(-1, width) - np.int64(ord("0"))
     is_digit = (digits >= 0) & (digits <= 9)

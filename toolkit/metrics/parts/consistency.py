@@ -21,7 +21,8 @@ from toolkit.sequence import Sequence
 POSE_DOF = 6
 SIGHTING_DOF = 3
 BAND_PROBABILITY = 0.95
-# The scatter of a run is told by what four in five of its steps change by, at least so many: 1.28 standard deviations.
+# The scatter of a run is estimated from the 80 % quantile of its changes from step to step (1.28 standard deviations),
+# with this many frames or more.
 _USUAL_SHARE, _USUAL_SIGMAS, _FEWEST_FRAMES = 0.8, 1.2816, 20
 INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
 # A first pose this improbable under its own covariance is expressed in another world frame than the truth.
@@ -78,8 +79,8 @@ class Nees:
 class Nis:
     """The innovations of the frames that report any: their ``rows`` (n,) among the causal estimates, and sums (n,).
 
-    ``expected`` is what a consistent estimator's ``nis`` is on average: ``dof``, or less behind a gate, which takes
-    the largest innovations away.
+    ``expected`` is the mean ``nis`` of a consistent estimator: ``dof``, or less behind a gate, which removes the
+    largest innovations.
     """
 
     rows: IntArray
@@ -107,8 +108,8 @@ class Nis:
 
         A gate makes the sum of a frame's innovations scatter less than chi-square, the error of the pose that they
         share makes it scatter more: on simulated drives 1.3 and 0.7 times the degrees of freedom. Frames are
-        independent in a consistent filter, so the run itself shows which, by its scatter from frame to frame; what it
-        is too large by all along is in the mean, and not in that. With few frames it is chi-square's.
+        independent in a consistent filter, so the scatter is estimated from the changes of the run from frame to frame,
+        which a constant excess does not affect. With few frames it is that of chi-square.
         """
         dof = np.asarray(self.dof, dtype=float)
         change = np.abs(np.diff((self.nis / self.expected - 1.0) * np.sqrt(dof)))

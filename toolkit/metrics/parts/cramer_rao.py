@@ -1,18 +1,19 @@
 """The Cramér-Rao bound of a recording, and the estimate that attains it, at every frame.
 
 No unbiased estimator has a smaller covariance than the inverse of Fisher's information (Van Trees, "Detection,
-estimation and modulation theory", part I, 1968, section 2.4). For Gaussian measurements that is the information of
-all factors linearised at the truth: the factors, the noise, the prior and the tracks are those the estimators have.
-Here it is computed without any of them: the causal bound by a forward information filter over the state and the
+estimation and modulation theory", part I, 1968, section 2.4). For Gaussian measurements that is the information of all
+factors linearised at the truth: the factors, the noise, the prior and the tracks are those the estimators have. No
+estimator is used to compute it: the causal bound comes from a forward information filter over the state and the
 landmarks that are still to be seen (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao bounds for discrete-time
 nonlinear filtering"), the final one by eliminating the whole graph.
 
-Beside the bound stands the efficient estimate, one linear step from the truth on the same measurements. The error of
-any unbiased estimator is that of the efficient one plus a part that is not correlated with it: what is left after the
-efficient error is taken off is the estimator's own loss, without the draw of noise that both share.
+The efficient estimate attains the bound: it is one linear step from the truth on the same measurements. The error of
+any unbiased estimator is that of the efficient one plus an uncorrelated part. The difference of both errors is
+therefore the estimator's own loss, without the noise that both share.
 
-That needs a truth with every state, exact: the motion measured between its states must be as far from them as the
-stated noise says. Where a recording has none, the bound that the model claims is taken at an estimate of the states.
+This needs an exact truth with every state: the motion measured between its states must differ from them by as much as
+the stated noise. Where a recording has no such truth, the bound that the model claims is computed at an estimate of the
+states.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +48,8 @@ _EXACT = (0.8, 1.25)
 class Efficient:
     """The bound at every frame (K, d, d), and the errors (K, d) of the efficient estimate.
 
-    In the order and on the side of an Estimate's covariance; an error is what takes the estimate to the truth."""
+    In the order and on the side of an Estimate's covariance; an error is the difference from the estimate to the
+    truth."""
 
     layout: Layout
     covs: Array
@@ -205,7 +207,7 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
     frames = [packet.frame for packet in packets]
     ids, uvs_px = np.concatenate([f.track_ids for f in frames]), np.concatenate([f.uvs_px for f in frames])
     pose = np.repeat(np.arange(len(frames)), [f.track_ids.size for f in frames])
-    # By track, the widest disparity, which tells the depth best, first.
+    # By track, the sighting with the largest disparity first: it has the most accurate depth.
     order = np.lexsort((-stereo.disparity_px(uvs_px), ids))
     uvs_px, seen_from = uvs_px[order], poses[pose[order]]
     track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
@@ -249,13 +251,13 @@ class _Information:
         self._landmarks = np.empty(0, dtype=np.int64)  # rows of the problem's landmarks
 
     def predict(self, packet: Packet) -> None:
-        """Bring in the next state by the measured motion, and let the one before it go."""
+        """Add the next state by the measured motion, and marginalise the one before it."""
         problem, d, k = self._problem, self._size, packet.index
         assert packet.motion is not None
         before, now = problem.states[k - 1], problem.states[k]
         increment = problem.model.integrate(packet.motion, before.bias)
         prediction = increment.predict(before)
-        # At the true end, not at the predicted one: what nothing measures stays unmeasured.
+        # Linearised at the true end, not at the predicted one, so that unobservable directions gain no information.
         at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
         transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
         # The measured motion says that the next state's offset is F x + r, but for its noise.
@@ -269,7 +271,7 @@ class _Information:
         self._vector = np.concatenate([precision @ r, self._vector[d:]]) - to_next.T @ gain[:, -1]
 
     def update(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Take the sightings of a frame in; landmarks seen for the first time join."""
+        """Add the sightings of a frame; landmarks seen for the first time are added to the state."""
         problem, rows = self._problem, self._problem.rows(frame)
         self._join(rows[~np.isin(rows, self._landmarks)])
         seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
@@ -291,7 +293,7 @@ class _Information:
         return 0.5 * (cov + cov.T), cov @ (self._vector[:d] - self._matrix[:d, d:] @ inner[:, d])
 
     def forget(self, gone: BoolArray) -> None:
-        """Let landmarks go that are not seen again: ``gone`` (M,) of the problem's."""
+        """Marginalise landmarks that are not seen again: ``gone`` (M,) of the problem's."""
         leaving = gone[self._landmarks]
         if not leaving.any():
             return

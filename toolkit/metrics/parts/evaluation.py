@@ -1,4 +1,4 @@
-"""An estimate beside the truth, each alignment computed once: any pairs of poses, or one output of one run."""
+"""An estimate and the truth, with each alignment computed once: any pairs of poses, or one output of one run."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,7 @@ from toolkit.sequence import Sequence
 
 
 class AgainstTruth:
-    """Pairs of true and estimated poses, and how they are brought together; what trajectory metrics are made of.
+    """Pairs of true and estimated poses with their alignments, from which trajectory metrics are computed.
 
     The properties raise Unavailable where there is no truth, or too few pairs.
     """
@@ -69,7 +69,7 @@ class PairsAgainstTruth(AgainstTruth):
 
     @property
     def level(self) -> bool:
-        """Whether the vertical is measured, as it was said."""
+        """Whether the vertical is measured."""
         return self.is_level
 
 

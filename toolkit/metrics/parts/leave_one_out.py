@@ -30,7 +30,7 @@ _HUBER_SIGMAS = 2.796
 _BEHIND_SIGMAS = 1e4
 _ITERATIONS, _ITERATIONS_AGAIN = 12, 3
 _MOST_VIEWS_SOLVED_AGAIN = 40
-# So many views are solved again at a time: what is computed of them fits a processor's cache, which halves the time.
+# Views that are solved again at a time: their arrays fit a processor's cache, which halves the time.
 _VIEWS_AT_A_TIME = 10_000
 _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
 # Rows of a robust problem's sums: the upper half of H row by row, g, and the cost. _WHOLE are the rows of all of H.
@@ -46,8 +46,8 @@ class PredictedSightings(NamedTuple):
     in_front: BoolArray
 
 
-class _Seen(NamedTuple):
-    """What views make of a point each: the image (3, N) in focal lengths from the centre, 1 / z and z > 0 (N,)."""
+class _Projections(NamedTuple):
+    """Projections of a point by each view: the image (3, N) in focal lengths from the centre, 1 / z and z > 0 (N,)."""
 
     ratio: Array
     inverse_depth: Array
@@ -56,12 +56,12 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The views of M tracks, N in all, sorted by track: what turns a track's point into measurements.
+    """The views of M tracks, N in all, sorted by track, which map a track's point to measurements.
 
     ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. ``linear`` (3, 3, N) and ``constant`` (3, N) make
     of a track's point r times the point in the view's camera, linear @ q + constant. ``uv_px`` (3, N) was measured.
-    ``sqrt_information`` (3, 3), or one each (3, 3, N), whitens. Views come last, for arithmetic on whole rows takes a
-    third of the time of products of small matrices.
+    ``sqrt_information`` (3, 3), or one each (3, 3, N), whitens. Views are the last axis, because arithmetic on whole
+    rows takes a third of the time of products of small matrices.
     """
 
     track: IntArray
@@ -72,22 +72,22 @@ class Views:
     rig: StereoRig
     sqrt_information: Array
 
-    def seen(self, points: Array) -> _Seen:
+    def project(self, points: Array) -> _Projections:
         """Project a point for each view (3, N)."""
         linear, constant = self.linear, self.constant
         x, y, depth = (linear[i, 0] * points[0] + linear[i, 1] * points[1] + linear[i, 2] * points[2] for i in range(3))
         x, y, depth = x + constant[0], y + constant[1], depth + constant[2]
         inverse_depth = 1.0 / depth
         ratio = np.stack([x, x - self.rig.baseline_m * points[2], y]) * inverse_depth
-        return _Seen(ratio, inverse_depth, depth > 0.0)
+        return _Projections(ratio, inverse_depth, depth > 0.0)
 
-    def pixels(self, seen: _Seen) -> Array:
+    def pixels(self, seen: _Projections) -> Array:
         """Return the pixels (3, N) of what is seen."""
         return np.asarray(self._focal_px * seen.ratio + self._centre_px)
 
     def predict(self, points: Array) -> PredictedSightings:
         """Predict each view's measurement from a point of its own (3, N)."""
-        seen = self.seen(points)
+        seen = self.project(points)
         return PredictedSightings(self.pixels(seen).T, seen.in_front)
 
     def shares(self, points: Array) -> Array:
@@ -95,7 +95,7 @@ class Views:
 
         The weights are Huber's.
         """
-        seen = self.seen(np.take(points, self.track, axis=1))
+        seen = self.project(np.take(points, self.track, axis=1))
         residual = self._whitened(left_only.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
         length = np.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
         visible = seen.in_front & np.isfinite(length)
@@ -113,7 +113,7 @@ class Views:
         shares[_COST] = np.where(length <= _HUBER_SIGMAS, 0.5 * length**2, robust)
         return shares
 
-    def _slope(self, seen: _Seen) -> Array:
+    def _slope(self, seen: _Projections) -> Array:
         """Return the derivatives (3, 3, N) of pixels by the point."""
         slope = np.stack([self.linear[0], self.linear[0], self.linear[1]])
         slope[1, 2] -= self.rig.baseline_m
@@ -185,8 +185,8 @@ def errors_left_out(observations: Observations, poses: Array, rig: StereoRig) ->
 def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> PredictedSightings:
     """Predict each sighting (N, 3) px of tracks (N,), sorted by track, from the others of its track.
 
-    ``T_world_cam`` (N, 4, 4) is the left camera's pose at each sighting. Every track needs at least two
-    views. What comes out is in the order that went in; it may not be finite where the poses are absurd.
+    ``T_world_cam`` (N, 4, 4) is the left camera's pose at each sighting. Every track needs at least two views. The
+    results are in the order of the input; they may not be finite where the poses are absurd.
     """
     T_last_view = _relative_to_last(track_ids, T_world_cam)
     views = _views(track_ids, uv_px, T_last_view, rig)

@@ -1,4 +1,4 @@
-"""From pairs of poses, or of image points, to one error each, and to the figures over all of them."""
+"""The error of each pair of poses or of image points, and statistics over all of them."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from toolkit.metrics.parts.association import Matched
 from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
 from toolkit.sequence import is_left_only
 
-# An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or
-# one that is not finite, counts as this much, so that no run wins by losing its points.
+# Cap of the error of an observation. A point behind the camera, or one that is not finite, has this error, so that no
+# run gains by losing its points.
 CAP_PX = 100.0
 
 

@@ -1,6 +1,7 @@
 """The error of the whole stated state: pose, velocity and biases in the order of an Estimate's covariance.
 
-Every error is what takes the estimate to the truth, in the body frame.
+Every error is the motion, or the difference, from the estimate to the truth, in the body frame. This is not in
+``consistency`` because its layouts need GTSAM, which the evaluation of trajectory files does without.
 """
 
 import numpy as np
@@ -65,7 +66,7 @@ def _turned(T_world_imu: Array, vectors_world: Array) -> Array:
 def _true(evaluation: Evaluation, name: str, stated: StatedErrors) -> Array:
     """Return the true velocity (n, 3) or biases (n, 6) at the estimates' stamps, interpolated linearly between its own.
 
-    Both change little within a frame: a stamp between two of the truth's is a matter of rounding.
+    Both change little within a frame, and stamps lie between two of the truth's only by rounding.
     """
     truth = evaluation.sequence.truth
     values = None if truth is None else getattr(truth, name)

@@ -30,11 +30,11 @@ from toolkit.report.figures.style import NamedFigure
 FigureFormat = Literal["png", "pdf", "svg"]
 # Text stays text in an SVG; in a PDF fonts are whole, as publishers ask (no Type 3).
 _IN_FILES: Any = {"svg.hashsalt": "vislam", "svg.fonttype": "none", "pdf.fonttype": 42}
-# What formats note of the time a figure was drawn, which differs where nothing else does.
+# Metadata with the time of drawing, by format; they are removed so that the same figure gives the same bytes.
 _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
 FigureChoice = Literal["few", "all", "none"]
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
-# What a comparison always leaves behind, and what it does when asked: drawing takes a while, and few are looked at.
+# Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
 _FEW: tuple[_Drawing, ...] = (
     top_view.draw_all,
     errors_over_time.draw,
@@ -54,7 +54,7 @@ _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
 
 def drawn(comparison: Comparison, choice: FigureChoice = "all") -> Iterator[NamedFigure]:
-    """Draw the few figures that say most, or every one the comparison has data for; each when it is asked for."""
+    """Draw the few most important figures, or all that the comparison has data for, each when it is reached."""
     drawings = _OVER_SEEDS if comparison.over_seeds else _FEW + (_MORE if choice == "all" else ())
     if choice == "none":
         drawings = ()
@@ -78,7 +78,7 @@ def save(figures: Iterable[NamedFigure], directory: Path, kind: FigureFormat = "
     """Save figures as files of a kind; return file name -> caption, in order. The same figures give the same bytes."""
     captions: dict[str, str] = {}
     with warnings.catch_warnings(), rc_context(_IN_FILES):
-        # A letter that the font lacks is drawn as a box; of that nothing is to be told.
+        # A letter that the font lacks is drawn as a box; the warning about it is suppressed.
         warnings.filterwarnings("ignore", "Glyph")
         for name, caption, figure in figures:
             undated = {_DATE_OF[kind]: None} if kind in _DATE_OF else {}

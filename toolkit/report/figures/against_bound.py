@@ -1,4 +1,4 @@
-"""What each estimator loses against the Cramér-Rao bound over time, beside the bound and what it states."""
+"""The loss of each estimator against the Cramér-Rao bound over time, with the bound and its stated deviation."""
 
 from collections.abc import Iterator
 

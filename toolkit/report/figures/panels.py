@@ -1,4 +1,4 @@
-"""Small panels, one an estimator, all on the same axes: what fourteen lines in one panel would hide."""
+"""Small panels, one an estimator, all on the same axes, because fourteen lines in one panel hide each other."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from toolkit.report.figures.style import (
 
 # Okabe & Ito (2008). In panels of one estimator the colour tells the output.
 COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}
-# What a NEES or NIS over its expectation is beyond these is drawn there, and the panel says how far it goes.
+# Values of a NEES or NIS over its expectation beyond these are drawn at the limit, and the panel gives the largest.
 RANGE = (1e-2, 1e4)
 # From so many panels on there are four in a row, before that three; two or four make a square.
 _MANY = 10
@@ -91,7 +91,7 @@ def scale_by_decades(axes: Axes, low: float, high: float) -> None:
 class Normalised(NamedTuple):
     """Squared errors over their expectation at times (n,) s, and the band (n,), (n,) of a consistent estimator.
 
-    What is NaN is not known.
+    NaN means unknown.
     """
 
     t_s: Array

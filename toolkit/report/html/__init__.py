@@ -1,9 +1,8 @@
 """The report as one HTML file that opens from disk: what run directories hold, laid side by side.
 
-Reading order: payload (what is shown of what :mod:`toolkit.report.run_files` reads) with highlights (who is
+Reading order: payload (what is shown of what :mod:`toolkit.report.run_directory` reads) with highlights (who is
 best) -> :func:`page_text` (one file made of page.html, style.css and the scripts in ``scripts``): nothing is fetched,
 and no text of a recording is code.
-Beside it: leaderboard, the page of an evaluation.
 """
 
 import html
@@ -39,7 +38,7 @@ SCRIPTS = (
     "case",
     "main",
 )
-# What could end the script element or open a comment inside it, and what older parsers take for the end of a line.
+# Characters that could end the script element or open a comment in it, or that older parsers take as the end of a line.
 _ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
@@ -51,7 +50,7 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     """
     # Here, because pages of other systems' trajectories are made without what reads a run directory.
     from toolkit.report.html.payload import payload_of
-    from toolkit.report.run_files import read_run
+    from toolkit.report.run_directory import read_run
 
     runs = [read_run(directory) for directory in directories]
     write_text(target, page_text(payload_of(runs)))

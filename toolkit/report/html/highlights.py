@@ -1,4 +1,4 @@
-"""The answers a reader looks for first: who was most accurate, who knew how sure to be, who was fastest."""
+"""The answers a reader looks for first: the most accurate estimator, the most consistent one, the fastest one."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ Row = dict[str, Any]
 
 
 class _Question(NamedTuple):
-    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and in what words.
+    """A question: its text, the outputs it is about, its metric (the first that any row has), unit, and answer.
 
     A ``contest`` has no answer where only one estimator has the metric.
     """

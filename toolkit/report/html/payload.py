@@ -1,7 +1,7 @@
-"""Everything the page shows, as one JSON value; its numbers are those of the run directories' own documents.
+"""The content of the page as one JSON value; its numbers are those of the run directories' documents.
 
-Over seeds: means with their spread, every seed's value, NEES and its band.
-Series have fewer points than a recording, none of them made up: what a screen can show, in a file that can be mailed.
+Over seeds: means with their spread, every seed's value, NEES and its band. Series are thinned to a subset of the
+recording's points, as many as a screen can show, to keep the file small.
 """
 
 import base64
@@ -18,9 +18,9 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves
 from toolkit.report.html.highlights import highlights
-from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
-from toolkit.report.records.scores import ConsistencyMark, RunOverSeeds
-from toolkit.report.run_files import DrawnPath, RunFiles, SeedsFiles
+from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
+from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
+from toolkit.report.score_records import ConsistencyMark, RunOverSeeds
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles

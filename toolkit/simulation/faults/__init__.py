@@ -1,9 +1,9 @@
-"""Faults to plant in a recording: what goes wrong with trackers, motion sensors, clocks, calibrations and units.
+"""Faults to plant in a recording: of trackers, motion sensors, clocks, calibrations and units.
 
-Every injector is ``fault(sequence, dose, seed) -> Sequence``: it leaves what it is given as it is, draws where and
-whom it strikes from the seed, and can be followed by another. The dose is in the unit its docstring names. The truth
-stays that of the motion, unless the fault is one of the truth. All are reached from here; read ``tracks``, ``motion``,
-``clocks``, ``standstill``, ``calibration`` and ``truth``, which share ``parts``.
+Every injector is ``fault(sequence, dose, seed) -> Sequence``: it returns a changed copy, draws the affected times and
+tracks from the seed, and can be followed by another. The dose is in the unit its docstring names. The truth stays that
+of the motion, unless the fault is one of the truth. All are reached from here; read ``tracks``, ``motion``, ``clocks``,
+``calibration`` and ``truth``, which share ``parts``.
 """
 
 from collections.abc import Callable
@@ -44,11 +44,11 @@ from toolkit.simulation.faults.motion import (
     nan_span,
     saturated_motion,
     spike,
+    standstill,
     stuck_motion,
     thinned_motion,
     wrong_noise,
 )
-from toolkit.simulation.faults.standstill import standstill
 from toolkit.simulation.faults.tracks import (
     blackout,
     dropped_sightings,

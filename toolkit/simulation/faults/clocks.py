@@ -1,4 +1,4 @@
-"""Faults of clocks: frames, or frames and motion samples, that are stamped at other times than things happened.
+"""Faults of clocks: wrong stamps of frames, or of frames and motion samples.
 
 They are injectors like those of ``faults``, through which they are reached.
 """

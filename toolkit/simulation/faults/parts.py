@@ -1,4 +1,4 @@
-"""What several faults share: where in a recording they strike, and edits of it."""
+"""Parts of several faults: the time span that they affect, and edits of a recording."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Faults of the tracks: what trackers lose, take for another, exchange, or put elsewhere in the image."""
+"""Faults of the tracks: lost, mismatched, exchanged or displaced sightings."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -161,6 +161,6 @@ def exchanged_tracks(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Se
 
 
 def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:
-    """Say of each sighting (N,) whether its track is of the share that is struck."""
+    """Say of each sighting (N,) whether its track is in the share that is affected."""
     track, row = np.unique(sequence.observations.track_id, return_inverse=True)
     return np.asarray((np.random.default_rng(seed).uniform(size=track.size) < share)[row])

@@ -1,4 +1,4 @@
-"""Faults of the truth: another unit, another clock, orientations nobody wrote."""
+"""Faults of the truth: another unit, another clock, missing orientations."""
 
 from dataclasses import replace
 

@@ -1,18 +1,25 @@
-"""``report.json``, the contract ``vislam.report/1``: what a report draws and says beyond the scores (docs/report.md).
+"""The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
-It has two forms: of a comparison, and of one over seeds. Times ``t_s`` count from the first frame; numbers have six
-digits; what is not finite is null. The card of a recording in it is a document of its own, the contract
-``vislam.card/1`` (docs/tracks.md).
+Here are the records of ``report.json``, the contract ``vislam.report/1``: what a report draws and says beyond the
+scores (docs/report.md). It has two forms: of a comparison, and of one over seeds. Times ``t_s`` count from the first
+frame; numbers have six digits; what is not finite is null. The card of a recording in it is a document of its own, the
+contract ``vislam.card/1`` (docs/tracks.md). The scores are in ``score_records``, the manifest in ``manifest``, a check
+in :mod:`toolkit.gate.verdict`; :mod:`toolkit.files.documents` reads and writes, :mod:`toolkit.report.schemas` writes
+docs/schemas.
 """
 
 from collections.abc import Sized
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.estimate import Output
-from toolkit.report.records.scores import Undecided
+from toolkit.files.documents import read
+from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
+from toolkit.report.manifest import Manifest
+from toolkit.report.score_records import Metrics, Seeds, Undecided
 
 Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
 Quantiles = Annotated[tuple[float, float, float], Meta(description="10, 50 and 90 %")]
@@ -23,6 +30,23 @@ Lags = Annotated[
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
 Numbers = tuple[float | None, ...]
 Vector = tuple[float, float, float]
+__all__ = [
+    "CardRecord",
+    "CheckDocument",
+    "Manifest",
+    "Metrics",
+    "Report",
+    "Seeds",
+    "SeedsReport",
+    "read_card",
+    "read_check",
+    "read_manifest",
+    "read_metrics",
+    "read_report",
+    "read_seeds",
+    "read_seeds_report",
+]
+_REPEAT = "repeat the comparison"
 
 
 class CardRecord(Struct, frozen=True, kw_only=True):
@@ -269,3 +293,38 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
             nees = {} if run.nees is None else {f"runs[{i}].nees.pose": run.nees.pose}
             errors = {} if run.position_rms_m is None else {f"runs[{i}].position_rms_m": run.position_rms_m}
             _check_lengths({"t_s": self.t_s, **nees, **errors})
+
+
+def read_metrics(path: Path) -> Metrics:
+    """Read a ``metrics.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Metrics, remedy=_REPEAT)
+
+
+def read_seeds(path: Path) -> Seeds:
+    """Read a ``seeds.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Seeds, remedy=_REPEAT)
+
+
+def read_report(path: Path) -> Report:
+    """Read the ``report.json`` of a comparison; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Report, remedy=_REPEAT)
+
+
+def read_seeds_report(path: Path) -> SeedsReport:
+    """Read a ``report.json`` over seeds; raises DataError, in one line with the place, where it is not one."""
+    return read(path, SeedsReport, remedy=_REPEAT)
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a ``manifest.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Manifest, remedy=_REPEAT)
+
+
+def read_check(path: Path) -> CheckDocument:
+    """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
+    return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER_CHECKS)
+
+
+def read_card(path: Path) -> CardRecord:
+    """Read what ``vislam card --json`` wrote; raises DataError, in one line with the place, where it is not that."""
+    return read(path, CardRecord, remedy="repeat vislam card")

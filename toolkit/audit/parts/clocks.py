@@ -1,0 +1,319 @@
+"""How far two clocks are apart, by the rotation that both see: the camera's clock and the gyro's, or the truth's.
+
+``camera_offset`` is by how much the camera's rotation is later than its stamps. A coarse search over whole steps finds
+the neighbourhood; Gauss-Newton on the shift, with Cauchy weights and about the median (a gyro has a bias), refines it
+to a fraction of a sample. The noise of twists would hide the change of rotation, so the change that the camera sees is
+the instrument there.
+
+``truth_clock`` does the same with the truth's rates of rotation in the place of a gyro's, and also finds the rate at
+which the clocks part: by Gauss-Newton on offset and rate, from the middle of the recording outwards, because far from
+the middle a wrong rate displaces a turn by more than its duration. Source: Furgale, Rehder & Siegwart, "Unified
+temporal and spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar, slope, spread
+from toolkit.geometry import Array, BoolArray, IntArray, so3_log
+from toolkit.jackknife import jackknife_error
+from toolkit.measured_motion import TwistSamples
+from toolkit.models.camera_motion import CameraMotion
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, Truth
+
+# Range of the search, and its step in intervals.
+MOST_S, COARSE_STEP = 0.6, 0.25
+# Means over an interval that are computed at a time: they take a megabyte, however long the recording.
+MEANS_AT_A_TIME = 10_000
+REFINEMENTS = 5
+# The standard error is that of a jackknife over stretches of the recording (a corner is one event and not ten
+# intervals), times this factor, which was measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+SCATTER = 1.45
+# The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
+MOST_UNEXPLAINED = 0.9
+# The difference of two rates of which one is noise has the sum of their variances; a gyro's noise in a standstill also
+# has a shift with the least difference. The variance must be below this share of the sum, without gross mismatches.
+MOST_APART, GROSS_SPREADS = 0.8, 6.0
+# An offset counts beyond so many standard errors and so much (s), a rate where it makes as much at both ends. Sound
+# recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
+# The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
+SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
+# As many intervals at least, of which the truth may not reach some.
+FEWEST = LEAST_INTERVALS + 10
+# The slope of the truth's rates is taken over this share of a step of the frames to either side.
+SLOPE_STEP = 0.1
+# Largest rate; beyond it, other stretches of a motion fit as well.
+MOST_RATE = 0.1
+
+
+def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
+    candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
+    some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
+    costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
+    costs, at_zero = costs[:-1], costs[-1]
+    if not np.isfinite(costs).any():
+        return None
+    best = int(np.nanargmin(costs))
+    offset_s = float(candidates[best]) if costs[best] < MOST_UNEXPLAINED * at_zero else 0.0
+    found = Scalar(offset_s, np.inf)
+    seen, known = _change_seen(sequence, intervals, w_imu)
+    for _ in range(REFINEMENTS):
+        mean, inside = _gyro_at(gyro, sequence, intervals, found.value)
+        after, after_inside = _gyro_at(gyro, sequence, intervals, found.value + 0.1 * step_s)
+        before, before_inside = _gyro_at(gyro, sequence, intervals, found.value - 0.1 * step_s)
+        rows = known & inside & after_inside & before_inside
+        if rows.sum() < LEAST_INTERVALS:
+            return None
+        change = (after - before)[rows] / (0.2 * step_s)
+        residual = w_imu[rows] - mean[rows]
+        instrument = seen[rows] if isinstance(sequence.motion, TwistSamples) else change
+        residual = residual - np.median(residual, axis=0)
+        step = slope(instrument, change, residual)
+        found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
+    if abs(found.value) >= 2.0 * MOST_S or _share_apart(w_imu[rows], mean[rows]) > MOST_APART:
+        return None
+    if isinstance(sequence.motion, TwistSamples) and is_stamped_at_frames(sequence):
+        return found
+    return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
+
+
+def _slope(instrument: Array, change: Array, residual: Array) -> float:
+    return slope(instrument, change, residual).value
+
+
+def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
+    """Return how the camera's rotation changes about each interval (M, 3) rad/s^2, and where that is known (M,).
+
+    From the neighbouring intervals: it follows the gyro's change and not its noise, nor the interval's own.
+    """
+    seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
+    seen[intervals.interval + 1], known[intervals.interval + 1] = w_imu, True
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    before, after = intervals.interval, intervals.interval + 2
+    return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
+
+
+def _gyro_at(
+    gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
+) -> tuple[Array, BoolArray]:
+    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them it reaches (..., M).
+
+    The intervals are shifted by the offsets (...) s.
+    """
+    begin = intervals.interval - intervals.interval[0]
+    shift_ns = np.rint(np.asarray(offset_s) * NS_PER_S).astype(np.int64)[..., None]
+    t_ns = sequence.frames_t_ns[intervals.interval[0] : intervals.interval[-1] + 2] + shift_ns
+    inside = (t_ns[..., begin] >= gyro.t_ns[0]) & (t_ns[..., begin + 1] <= gyro.t_ns[-1])
+    return gyro.means(t_ns)[..., begin, :], np.asarray(inside)
+
+
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
+    """Return the spread of the differences (C, M, 3) over the intervals that are reached (C, M), squared (C,).
+
+    NaN where those are few.
+    """
+    reached = inside.sum(axis=-1)
+    apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
+    deviation = MAD_TO_SIGMA * _medians(np.abs(apart - _medians(apart, reached)), reached)
+    return np.where(reached < LEAST_INTERVALS, np.nan, np.sum(deviation[..., 0] ** 2, axis=-1))
+
+
+def _medians(values: Array, reached: IntArray) -> Array:
+    """Return the medians (C, d, 1) of values (C, d, M), of which so many (C,) are no NaN: those come last in order."""
+    ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
+    middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
+    return np.asarray(0.5 * (middle[0] + middle[1]))
+
+
+def _share_apart(w_imu: Array, mean: Array) -> float:
+    """Return the variance of the difference (M, 3) over the sum of both variances: 1 where they are independent."""
+    seen, measured = (rates - np.median(rates, axis=0) for rates in (w_imu, mean))
+    apart = seen - measured
+    apart = apart - np.median(apart, axis=0)
+    sound = (np.abs(apart) <= GROSS_SPREADS * spread(apart)).all(axis=1)
+    return float(np.sum(apart[sound] ** 2) / max(np.sum(seen[sound] ** 2 + measured[sound] ** 2), 1e-300))
+
+
+def is_stamped_at_frames(sequence: Sequence) -> bool:
+    """Say whether most frames have a motion sample of the same stamp."""
+    return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
+
+
+class TruthClock(NamedTuple):
+    """How much later than by their stamps (s) the frames are by the truth's clock, and by what share faster that runs.
+
+    Each is None where it is undetermined. ``half_s`` is half of the recording's duration.
+    """
+
+    offset: Scalar | None
+    rate: Scalar | None
+    half_s: float
+
+    @property
+    def runs_otherwise(self) -> bool:
+        """Whether the rate is significant and drives the clocks apart."""
+        if self.rate is None:
+            return False
+        return abs(self.rate.value) * self.half_s > max(LEAST_OFFSET_S, OFFSET_SIGMAS * self.rate.error * self.half_s)
+
+    @property
+    def unseen_s(self) -> float:
+        """Undetected difference (s) of the clocks, at most."""
+        if self.offset is None or self.rate is None:
+            return np.inf
+        return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
+
+
+class BesideTruth(NamedTuple):
+    """The camera's rates of rotation in the IMU's axes (M, 3) rad/s over M intervals, and the recording in which the
+    truth's rates stand for a gyro's."""
+
+    sequence: Sequence
+    seen: Intervals
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, sequence: Sequence, camera: CameraMotion, truth: Truth) -> Self | None:
+        """Put both side by side; None where there is no sequence of finite poses in the order of time."""
+        step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
+        in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
+        if sequence.motion_kind == "none" or not in_order:
+            return None
+        R_world_imu = truth.T_world_imu[:, :3, :3]
+        w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+        middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
+        turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
+        rows = np.flatnonzero(camera.known)
+        seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
+        as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
+        return cls(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
+
+
+def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> TruthClock | None:
+    """Compare the clocks; None where the truth does not move, or no motion was measured."""
+    beside = BesideTruth.of(sequence, camera, truth)
+    if beside is None:
+        return None
+    offset = camera_offset(beside.sequence, beside.seen, beside.w_imu_radps)
+    rate = rate_of_clock(beside, 0.0 if offset is None else offset.value)
+    return TruthClock(offset, rate, 0.5 * sequence.duration_s)
+
+
+def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
+    """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
+
+    ``offset_s`` is, nearly, how much later than by its stamp the middle frame is by the truth's clock. The standard
+    error is that of a jackknife over stretches of the recording.
+    """
+    clocks = _Clocks.of(beside)
+    try:
+        fitted = clocks.fitted(offset_s)
+        if fitted is None:
+            return None
+        found, at = fitted
+        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
+    except np.linalg.LinAlgError:  # the truth turns in one stretch at most
+        return None
+
+
+class _Linearised(NamedTuple):
+    """The camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate (m, 3, 2)."""
+
+    unexplained: Array
+    jacobian: Array
+
+
+class _Clocks(NamedTuple):
+    """The integral of the truth's rates, stamps of the frames (K,), and what the camera sees of M intervals.
+
+    ``since_s`` (K,) is the time since the middle of the frames.
+    """
+
+    truth: Integral
+    frames_t_ns: IntArray
+    since_s: Array
+    interval: IntArray
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, beside: BesideTruth) -> Self:
+        motion, t_ns = beside.sequence.motion, beside.sequence.frames_t_ns
+        since_s = (t_ns - t_ns[0]) / NS_PER_S
+        truth = Integral.of(motion.t_ns, motion.values[:, 3:])
+        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], beside.seen.interval, beside.w_imu_radps)
+
+    @property
+    def step_s(self) -> float:
+        return float(np.median(np.diff(self.since_s)))
+
+    def rates(self, shift_s: Array) -> Array:
+        """Return the truth's mean rates (M, 3) over the intervals, whose frames are shifted (K,)."""
+        return self.truth.means(self.frames_t_ns + np.rint(shift_s * NS_PER_S).astype(np.int64))[self.interval]
+
+    def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
+        """Return the equations of those of the rows that the truth reaches, where these are enough.
+
+        A fast clock shows less rotation in a second, as a wrong focal length does, so this effect is not used for the
+        rate.
+        """
+        shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
+        at_ns = self.frames_t_ns + shift_s * NS_PER_S
+        inside = (at_ns[self.interval] >= self.truth.t_ns[0]) & (at_ns[self.interval + 1] <= self.truth.t_ns[-1])
+        used = rows[inside[rows]]
+        if used.size < LEAST_INTERVALS:
+            return None
+        slope = (self.rates(shift_s + apart_s) - self.rates(shift_s - apart_s))[used] / (2.0 * apart_s)
+        middle_s = 0.5 * (self.since_s[:-1] + self.since_s[1:])[self.interval[used]]
+        unexplained = self.w_imu_radps[used] - (1.0 + found[1]) * self.rates(shift_s)[used]
+        return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
+
+    def fitted(self, offset_s: float) -> tuple[Array, "_Linearised"] | None:
+        """Return offset and rate (2,) and the equations there; None where they do not fit what the camera sees."""
+        found, count, at = np.array([offset_s, 0.0]), self.interval.size, None
+        for share, steps in zip(SHARES, STEPS, strict=True):
+            aside = min(round(0.5 * (1.0 - share) * count), max(count - FEWEST, 0) // 2)
+            rows = np.arange(aside, count - aside)
+            for _ in range(steps):
+                at = self.linearised(found, rows)
+                if at is None:
+                    return None
+                found = found + _solved(*at)
+                found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
+        is_one = at is not None and abs(found[1]) < MOST_RATE and self.fits(found, offset_s)
+        return (found, at) if at is not None and is_one else None
+
+    def fits(self, found: Array, offset_s: float) -> bool:
+        """Say whether the rate explains residuals that the offset does not, if it displaces the ends by a step or more.
+
+        With a smaller displacement, other turns cannot fit by chance.
+        """
+        if abs(found[1]) * self.since_s[-1] < self.step_s:
+            return True
+        rows = np.arange(self.interval.size)
+        both = [self.linearised(one, rows) for one in (found, np.array([offset_s, 0.0]))]
+        with_rate, without = (np.inf if at is None else float(np.sum(spread(at.unexplained) ** 2)) for at in both)
+        return with_rate < MOST_UNEXPLAINED * without
+
+
+def _solved(unexplained: Array, jacobian: Array) -> Array:
+    """Return offset and rate (2,) by least squares with Cauchy weights; raises LinAlgError where nothing turns."""
+    scale = np.maximum(spread(unexplained), 1e-9)
+    x, y = (jacobian / scale[:, None]).reshape(-1, 2), (unexplained / scale).ravel()
+    weight = np.ones(y.size)
+    for _ in range(ITERATIONS):
+        weighted = x.T * weight
+        found = np.linalg.solve(weighted @ x, weighted @ y)
+        weight = 1.0 / (1.0 + (y - x @ found) ** 2 / CAUCHY_SIGMAS**2)
+    return np.asarray(found)
+
+
+def _rate(unexplained: Array, jacobian: Array) -> float:
+    return float(_solved(unexplained, jacobian)[1])
