@@ -19,7 +19,8 @@ from toolkit.report.records import read_manifest
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 Starts = Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]
-QUICK = ("--max-frames", "10", "--figures", "none")
+# To read what is compiled takes a process longer than these runs.
+QUICK = ("--max-frames", "10", "--figures", "none", "--no-fast")
 SWEEP = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--seeds", "3", *QUICK)
 PROJECT = str(Path(__file__).parents[2])
 

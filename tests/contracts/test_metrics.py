@@ -1,7 +1,5 @@
 """The contract of every metric file, and the keys that metrics.json promises."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -105,17 +103,14 @@ def test_every_metric_the_gate_judges_has_a_name_there():
     assert checked == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_a_description_is_one_line(key):
-    line = metrics.describe()[key]
-    assert line
-    assert "\n" not in line
+def test_a_description_is_one_line():
+    described = metrics.describe()
+    assert [key for key in KEYS if not described[key] or "\n" in described[key]] == []
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_every_key_is_documented(key, request):
+def test_every_key_is_documented(request):
     page = (request.config.rootpath / "docs" / "metrics.md").read_text(encoding="utf-8")
-    assert re.search(rf"`{key}`", page)
+    assert [key for key in KEYS if f"`{key}`" not in page] == []
 
 
 @pytest.mark.parametrize("output", ["causal", "final"])

@@ -263,7 +263,7 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
             print("starting", flush=True)
             yield from results(*given)
         Workers.results = told
-        words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--out", "run"]
+        words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--no-fast", "--out", "run"]
         sys.exit(main(["compare", "drive", *words]))
     """)
     vislam = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})

@@ -13,7 +13,7 @@ from toolkit.simulation import FLIGHT, simulate
 # A hand-held rig as they are: biases unknown before the start and drifting fast, few tracks that end soon.
 ROUGH = replace(
     FLIGHT,
-    duration_s=15.0,
+    duration_s=12.0,
     rig=replace(FLIGHT.rig, baseline_m=0.11),
     camera=replace(FLIGHT.camera, rate_hz=10.0, max_tracks=30, loss_per_frame=0.1),
     motion=replace(FLIGHT.motion, bias_sigma=np.repeat([0.05, 0.003], 3)),

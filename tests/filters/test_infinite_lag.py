@@ -12,7 +12,7 @@ from filters.smart import Smart
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
-SCENARIOS = [replace(DRIVE, duration_s=3.0), replace(DRIVE_IMU, duration_s=3.0), replace(FLIGHT, duration_s=1.5)]
+SCENARIOS = [replace(DRIVE, duration_s=2.0), replace(DRIVE_IMU, duration_s=2.0), replace(FLIGHT, duration_s=1.5)]
 
 
 def largest_difference(one, other) -> float:

@@ -32,7 +32,7 @@ def drive():
 @pytest.fixture(scope="module")
 def walking():
     """Return a drive whose tracks walk and are matched wrong for life, stated to be white noise of half a pixel."""
-    sequence = simulate(replace(DRIVE_REALISTIC, duration_s=6.0), 4)
+    sequence = simulate(replace(DRIVE_REALISTIC, duration_s=4.0), 4)
     return replace(sequence, rig=replace(sequence.rig, cov_uv_px2=0.25 * np.eye(3)))
 
 

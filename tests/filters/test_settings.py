@@ -18,9 +18,9 @@ WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
 
 @cache
 def recording() -> Sequence:
-    """Return two seconds in which one sighting in a hundred is of another point."""
+    """Return a second and a half in which one sighting in a hundred is of another point."""
     camera = replace(DRIVE.camera, outlier_rate=0.01, max_tracks=40)
-    return simulate(replace(DRIVE, duration_s=2.0, camera=camera), 6)
+    return simulate(replace(DRIVE, duration_s=1.4, camera=camera), 6)
 
 
 @cache
