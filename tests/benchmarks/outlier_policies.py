@@ -42,11 +42,11 @@ NO_ANSWER = float(np.log(10.0))
 
 # Candidates that are no policy of the settings: the gate and the loss of "robust", one of them changed.
 _CHANGED = partial(msgspec.structs.replace, POLICIES["robust"])
-_HUBER = ("joint_huber", "filter_huber", "smoother_huber", "batch_last_huber")
+_HUBER = ("joint_huber", "filter_huber", "smoother_huber")
 CANDIDATES: dict[str, Outliers] = {
     **POLICIES,
     "robust-gate-95": _CHANGED(gate_probability=0.95, batch_cut_probability=0.05),
-    "robust-huber-1.5": _CHANGED(**dict.fromkeys(_HUBER, 1.5)),
+    "robust-huber-2.8": _CHANGED(**dict.fromkeys(_HUBER, 2.8)),
     "robust-gate-99.99": _CHANGED(gate_probability=0.9999, batch_cut_probability=1e-4),
     "robust-smoothers-4-x": _CHANGED(smoother_gate_factor=4.0),
 }

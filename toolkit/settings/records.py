@@ -81,7 +81,7 @@ def _alike(policy: PolicyName, gate_probability: float | None, huber: float | No
 
 
 POLICIES: Mapping[PolicyName, Outliers] = {
-    "robust": _alike("robust", 0.999, 2.7954834829151074),
+    "robust": _alike("robust", 0.999, 1.5),
     "gate": _alike("gate", 0.999, None),
     "none": _alike("none", None, None),
     "classic": Outliers(),
