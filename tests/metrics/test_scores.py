@@ -182,6 +182,12 @@ def test_two_files_cannot_declare_the_same_key(tmp_path, monkeypatch, found_anew
         metrics.describe()
 
 
+def test_a_metric_is_chosen_by_what_stands_above_its_column():
+    assert [m.key for m in metrics.metrics_called(["held-out"])] == ["heldout_reproj_median_px"]
+    for metric in metrics.known_metrics():
+        assert metrics.metrics_called([metric.column]) == (metric,)
+
+
 def test_a_metric_is_chosen_by_its_key_or_its_name():
     assert [m.key for m in metrics.metrics_called(["NIS mean", "ate_se3_m"])] == ["nis_mean", "ate_se3_m"]
     with pytest.raises(VislamError, match=r"no metric is called ATE SE3; did you mean ATE SE\(3\)\?"):

@@ -127,13 +127,13 @@ def contract_keys() -> tuple[str, ...]:
 
 
 def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
-    """Return the metrics of the given keys, names or groups ("ate_se3_m", "ATE SE(3)", "bound"), in the given order.
+    """Return the metrics of the given keys, names, headings or groups ("ate_se3_m", "ATE SE(3)", "held-out", "bound").
 
-    Raises UnknownNameError for a name that no metric has, with the nearest one.
+    They come in the given order. Raises UnknownNameError for a name that no metric has, with the nearest one.
     """
     files = _found().files
     known = [metric for file in files for metric in file.METRICS]
-    by_name = {metric.name: (metric,) for metric in known} | {metric.key: (metric,) for metric in known}
+    by_name = {name: (metric,) for metric in known for name in (metric.column, metric.name, metric.key)}
     by_name |= {file.GROUP: file.METRICS for file in files if hasattr(file, "GROUP")}
     chosen = tuple(names)
     for name in chosen:

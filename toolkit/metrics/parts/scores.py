@@ -46,6 +46,12 @@ class Metric:
             )
         object.__setattr__(self, "name", self.name or " ".join(filter(None, self.heading)))
 
+    @property
+    def column(self) -> str:
+        """The heading in one line, as it reads above the column: "held-out" of "held-" and "out"."""
+        above, below = self.heading
+        return above + below if above.endswith("-") else " ".join(filter(None, self.heading))
+
 
 class Unavailable(Exception):  # noqa: N818 - not an error: the run or the sequence simply lacks what the metric needs
     """Raised where a metric cannot be computed; its message is the reason the reader gets."""
