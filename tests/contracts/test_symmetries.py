@@ -21,7 +21,7 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 from toolkit.simulation.symmetries import STATE_MIRROR, delayed, mirrored, mirrored_poses, renamed, turned
 from toolkit.verify.verification import short
 
-SCENARIOS = {"drive": short(DRIVE, 1.5), "drive-imu": short(DRIVE_IMU, 1.5), "flight": short(FLIGHT, 1.5)}
+SCENARIOS = {"drive": short(DRIVE, 1.5), "drive-imu": short(DRIVE_IMU, 1.5), "flight": short(FLIGHT, 1.0)}
 SEED = 4
 QUARTER, SHIFT_M, LATER_NS = 0.5 * np.pi, np.array([30.0, -20.0, 5.0]), 1_600_000_000_000_000_000
 # Rounding of positions of tens of metres, 1e-14, which the worst conditioned of the windows with an IMU's biases take
@@ -51,6 +51,10 @@ def with_other_names(sequence: Sequence) -> Sequence:
     return renamed(sequence, new[track])
 
 
+def as_it_is(sequence: Sequence) -> Sequence:
+    return sequence
+
+
 def retold(sequence: Sequence) -> Sequence:
     """Return a recording in another world, seen in a mirror, by other names and at another time."""
     return delayed(with_other_names(mirrored(turned(sequence, QUARTER, SHIFT_M))), LATER_NS)
@@ -76,7 +80,7 @@ def run_on(name: str, scenario: str, how: str) -> Run:
         build = find(name).load()
     except EstimatorError as unavailable:
         pytest.skip(str(unavailable))
-    told = {"as it is": lambda s: s, "retold": retold, "turned": lambda s: turned(s, 2.0, SHIFT_M)}
+    told = {"as it is": as_it_is, "retold": retold, "turned": lambda s: turned(s, 2.0, SHIFT_M)}
     sequence = told[how](recording(scenario))
     assert sequence.prior is not None
     return runner.run(name, build, sequence, sequence.prior)
@@ -141,15 +145,13 @@ def test_the_start_is_the_same_of_a_recording_that_is_told_otherwise(scenario: s
 @pytest.mark.parametrize(
     ("scenario", "plant"),
     [
-        ("drive", lambda sequence: sequence),
-        ("flight", lambda sequence: sequence),
+        ("drive", as_it_is),
+        ("flight", as_it_is),
         ("drive", faults.gyro_bias),
         ("drive", faults.camera_clock_step),
-        ("drive", faults.turned_camera),
         ("drive", faults.moving_objects),
         ("drive-imu", faults.camera_clock),
         ("flight", faults.displaced_camera),
-        ("flight", faults.wrong_aspect),
     ],
 )
 def test_the_audit_finds_the_same_in_a_recording_that_is_told_otherwise(scenario, plant) -> None:
