@@ -197,6 +197,21 @@ def test_twists_at_the_frames_or_at_another_rate_are_no_clock_that_is_off() -> N
     assert _constant_phase_s(clean) is None
 
 
+@pytest.mark.parametrize("samples", [2, 3])
+def test_frames_are_not_shifted_where_the_gyro_alone_is_late(samples: int) -> None:
+    """Velocities that fit as they are stamped speak against a shift of the frames; a late camera they bear out."""
+    clean = sound("drive")
+    values = clean.motion.values.copy()
+    values[samples:, 3:] = clean.motion.values[:-samples, 3:]
+    late = replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))
+    found = audit(late)
+    offset = next(finding for finding in found.findings if finding.fault == "time-offset")
+    assert offset.warning
+    assert "the gyro alone is off" in offset.detail
+    np.testing.assert_array_equal(found.sequence.frames_t_ns, late.frames_t_ns)
+    assert "the frames are shifted by it" in messages(audit(faults.camera_clock(clean, -0.1 * samples)))["time-offset"]
+
+
 def test_an_offset_beyond_chance_is_reported_though_it_is_known_badly() -> None:
     """50 ms, known to more than 6.4 ms: six seconds of a level drive hold little turning."""
     late = faults.camera_clock(sound("drive-imu").truncated(75), -0.05)

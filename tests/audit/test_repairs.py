@@ -9,11 +9,12 @@ import pytest
 from toolkit.audit import Finding, audit
 from toolkit.audit.fault import Evidence
 from toolkit.audit.parts.alignment import Alignment
-from toolkit.audit.parts.extrinsic import is_excluded, is_there, way_gone
+from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
 from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence
-from toolkit.simulation import SCENARIOS, simulate
+from toolkit.simulation import SCENARIOS, faults, simulate
+from toolkit.verify.verification import short
 
 Make = Callable[..., Sequence]
 PlantIn = Callable[[str, Sequence], Sequence]
@@ -196,6 +197,20 @@ def test_samples_in_other_axes_beside_a_place_measured_in_the_right_ones_leave_i
     outcome = audit(replace(clean_recording("drive"), rig=replace(rig, T_imu_cam=T_imu_cam)))
     np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
     assert outcome.findings[0].fault == "mixed-axes"
+
+
+def test_nothing_is_concluded_from_tracks_whose_axes_are_left_to_choose() -> None:
+    """Forty tracks of an inverted extrinsic: the camera was then put elsewhere and the prior's gyro bias widened."""
+    drive = simulate(short(SCENARIOS["drive"], 10.0), 4)
+    outcome = audit(faults.inverted_extrinsic(drive))
+    assert [(found.fault, found.blocking) for found in outcome.findings] == [("mixed-axes", True)]
+    assert "choose one" in outcome.findings[0].detail
+    assert outcome.undecided["extrinsic-translation"].startswith("mixed-axes must be mended")
+    assert outcome.sequence.prior is drive.prior
+
+
+def test_a_place_of_next_to_nothing_has_no_sign() -> None:
+    assert metres(np.array([1.5, -0.001, -0.005])) == "(1.50, 0.00, -0.01)"
 
 
 @pytest.mark.parametrize("seed", range(3))

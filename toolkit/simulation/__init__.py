@@ -2,11 +2,12 @@
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
 ``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` plants faults in a
-recording, ``track_faults`` lasting errors of tracks. ``filming`` renders images instead of tracks, with ``surfaces``
+recording, ``track_faults`` lasting errors of tracks; ``symmetries`` turn, mirror, delay or reverse one. ``filming``
+renders images instead of tracks, with ``surfaces``
 (the visible world) and ``renderer``, and measures the errors of tracks made of them.
 """
 
-from toolkit.simulation import faults, track_faults
+from toolkit.simulation import faults, symmetries, track_faults
 from toolkit.simulation.scenarios import (
     DRIVE,
     DRIVE_IMU,
@@ -30,5 +31,6 @@ __all__ = [
     "faults",
     "noise_free",
     "simulate",
+    "symmetries",
     "track_faults",
 ]

@@ -88,6 +88,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} then{doubt}",
         treatment=taken.done if certain else f"{readings[second].name} explains it as well: choose one",
         remedy=remedy if certain else None,
+        spoils_vision=not certain,
     )
 
 

@@ -68,7 +68,7 @@ def _log_odds(share: Scalar) -> float:
 
 def metres(position: Array) -> str:
     """Return a position (3,) m as text."""
-    return "(" + ", ".join(f"{x:.2f}" for x in position) + ")"
+    return "(" + ", ".join(f"{x:z.2f}" for x in position) + ")"
 
 
 def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:

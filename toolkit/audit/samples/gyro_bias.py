@@ -53,7 +53,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     biased = (np.abs(bias_radps) > SIGMAS * error_radps) | denied
     if not biased.any():
         return None
-    values = ", ".join(f"{b:.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
+    values = ", ".join(f"{b:z.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
     detail = f"the gyro reads ({values}) rad/s too much about x, y, z ({source})"
     if prior is None and _is_too_much(evidence.sequence, bias_radps, error_radps):
         return Symptom(
@@ -68,7 +68,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             detail=detail,
             treatment="left to the estimators, which carry a gyro bias",
         )
-    stated = ", ".join(f"{b:.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
+    stated = ", ".join(f"{b:z.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
     return Symptom(
         count=int(biased.sum()),
         detail=f"{detail}, and the prior has ({stated})",

@@ -1,0 +1,168 @@
+"""What no estimator, start, metric or audit may depend on: where the world begins, what tracks are called, the clock's
+zero, and which side is left. Answers to a recording that is told otherwise are the same answers, told so.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit import runner
+from toolkit.audit import audit
+from toolkit.errors import EstimatorError
+from toolkit.estimate import Run, Trajectory
+from toolkit.estimator import discover, find
+from toolkit.geometry import Array, se3, se3_inverse, se3_log
+from toolkit.initialization import start_from_measurements
+from toolkit.metrics import score_run
+from toolkit.sequence import Prior, Sequence, is_held_out
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
+from toolkit.simulation.symmetries import STATE_MIRROR, delayed, mirrored, mirrored_poses, renamed, turned
+from toolkit.verify.verification import short
+
+SCENARIOS = {"drive": short(DRIVE, 1.5), "drive-imu": short(DRIVE_IMU, 1.5), "flight": short(FLIGHT, 1.0)}
+SEED = 4
+QUARTER, SHIFT_M, LATER_NS = 0.5 * np.pi, np.array([30.0, -20.0, 5.0]), 1_600_000_000_000_000_000
+# Rounding of positions of tens of metres, 1e-14, which the worst conditioned of the windows with an IMU's biases take
+# 1e5 times as large; of covariances, over the deviations they belong to.
+ROUNDING, COV_ROUNDING = 1e-8, 1e-6
+# In incremental smoothers a point stays linearised where it is until it moves by a centimetre along one of the world's
+# axes, and the iterations of a triangulation are damped along these: this far that makes answers differ.
+AXES_COUNT_FOR = 2e-4
+# Of metrics, relative to their value or to one.
+METRIC_ROUNDING = 1e-5
+COSTS = {"frame_ms_mean", "frame_ms_p95", "frame_ms_max", "total_s", "cpu_s", "peak_rss_mb", "frame_cpu_ms_mean"}
+
+both_kinds = pytest.mark.parametrize("scenario", ["drive", "flight"])
+
+
+@cache
+def recording(scenario: str) -> Sequence:
+    return simulate(SCENARIOS[scenario], SEED)
+
+
+def with_other_names(sequence: Sequence) -> Sequence:
+    """Return a recording with large names of tracks in the opposite order; the same tracks are withheld."""
+    names, track = np.unique(sequence.observations.track_id, return_inverse=True)
+    others = 10**9 + np.arange(40 * names.size)[::-1]
+    withheld, new = is_held_out(names), np.empty_like(names)
+    new[withheld], new[~withheld] = (others[is_held_out(others) == kind][: (withheld == kind).sum()] for kind in (1, 0))
+    return renamed(sequence, new[track])
+
+
+def as_it_is(sequence: Sequence) -> Sequence:
+    return sequence
+
+
+def retold(sequence: Sequence) -> Sequence:
+    """Return a recording in another world, seen in a mirror, by other names and at another time."""
+    return delayed(with_other_names(mirrored(turned(sequence, QUARTER, SHIFT_M))), LATER_NS)
+
+
+def back(T_world_imu: Array, yaw_rad: float, in_mirror: bool) -> Array:
+    """Return poses (..., 4, 4) in the world of the recording as it was."""
+    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
+    T_new_old = se3(np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]), SHIFT_M)
+    poses = mirrored_poses(T_world_imu) if in_mirror else T_world_imu
+    return np.asarray(se3_inverse(T_new_old) @ poses)
+
+
+def signs(size: int) -> Array:
+    """Return what a mirror makes of a state (size,): pose and gyro bias, these with the velocity, or all."""
+    whole = {9: np.r_[0:6, 12:15], 12: np.r_[0:9, 12:15]}.get(size, np.arange(size))
+    return np.asarray(STATE_MIRROR[whole])
+
+
+@cache
+def run_on(name: str, scenario: str, how: str) -> Run:
+    try:
+        build = find(name).load()
+    except EstimatorError as unavailable:
+        pytest.skip(str(unavailable))
+    told = {"as it is": as_it_is, "retold": retold, "turned": lambda s: turned(s, 2.0, SHIFT_M)}
+    sequence = told[how](recording(scenario))
+    assert sequence.prior is not None
+    return runner.run(name, build, sequence, sequence.prior)
+
+
+def outputs(run: Run) -> list[Trajectory]:
+    return [trajectory for trajectory in (run.causal, run.final) if trajectory is not None]
+
+
+def apart(one: Trajectory, poses: Array) -> float:
+    """Return how far poses are from those of a trajectory at most, in metres or radians."""
+    return float(np.abs(se3_log(se3_inverse(one.T_world_imu) @ poses)).max())
+
+
+@both_kinds
+@pytest.mark.parametrize("name", sorted(discover()))
+def test_an_estimator_answers_the_same_to_a_recording_that_is_told_otherwise(name: str, scenario: str) -> None:
+    usual, other = run_on(name, scenario, "as it is"), run_on(name, scenario, "retold")
+    assert usual.status == other.status == "ok"
+    for one, two in zip(outputs(usual), outputs(other), strict=True):
+        assert apart(one, back(two.T_world_imu, QUARTER, in_mirror=True)) < ROUNDING
+        if one.cov is not None and two.cov is not None:
+            sign, deviation = signs(one.cov.shape[1]), np.sqrt(np.einsum("nii->ni", one.cov))
+            off = np.abs(one.cov - sign[:, None] * two.cov * sign)
+            assert (off / (deviation[:, :, None] * deviation[:, None, :])).max() < COV_ROUNDING
+
+
+@both_kinds
+@pytest.mark.parametrize("name", sorted(discover()))
+def test_no_axis_of_the_world_counts_for_more_than_others(name: str, scenario: str) -> None:
+    usual, other = run_on(name, scenario, "as it is"), run_on(name, scenario, "turned")
+    for one, two in zip(outputs(usual), outputs(other), strict=True):
+        assert apart(one, back(two.T_world_imu, 2.0, in_mirror=False)) < AXES_COUNT_FOR
+
+
+@both_kinds
+@pytest.mark.parametrize("name", ["ekf", "batch"])
+def test_metrics_are_the_same_of_a_recording_that_is_told_otherwise(name: str, scenario: str) -> None:
+    usual = score_run(run_on(name, scenario, "as it is"), "final", recording(scenario)).values
+    other = score_run(run_on(name, scenario, "retold"), "final", retold(recording(scenario))).values
+    measured = {key for key, value in usual.items() if value is not None} - COSTS
+    assert {"ate_none_m", "ate_yaw_m", "rpe_1s_m", "heldout_reproj_median_px", "nees_pose_mean"} <= measured
+    for key in measured:
+        assert other[key] == pytest.approx(usual[key], rel=METRIC_ROUNDING, abs=METRIC_ROUNDING), key
+
+
+def started(sequence: Sequence) -> Prior:
+    return start_from_measurements(replace(sequence, prior=None))
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_start_is_the_same_of_a_recording_that_is_told_otherwise(scenario: str) -> None:
+    usual, other = started(recording(scenario)), started(retold(recording(scenario)))
+    assert usual.source == other.source
+    mirror = np.diag([1.0, -1.0, 1.0])
+    np.testing.assert_allclose(mirrored_poses(other.T_world_imu), usual.T_world_imu, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(mirror @ other.v_world, usual.v_world, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(signs(15)[9:] * other.bias, usual.bias, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(signs(15)[:, None] * other.cov * signs(15), usual.cov, rtol=COV_ROUNDING, atol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "plant"),
+    [
+        ("drive", as_it_is),
+        ("flight", as_it_is),
+        ("drive", faults.gyro_bias),
+        ("drive", faults.camera_clock_step),
+        ("drive", faults.moving_objects),
+        ("drive-imu", faults.camera_clock),
+        ("flight", faults.displaced_camera),
+    ],
+)
+def test_the_audit_finds_the_same_in_a_recording_that_is_told_otherwise(scenario, plant) -> None:
+    """Counts and verdicts; what was measured beside them has its signs.
+
+    A wrong extrinsic told in a mirror is another fault, where it is that of other axes or of the inverse.
+    """
+    length_s = 6.0 if scenario == "flight" else 10.0
+    planted = plant(simulate(replace(SCENARIOS[scenario], duration_s=length_s), SEED))
+    usual, other = audit(planted), audit(retold(planted))
+    assert [replace(found, detail="", spans_ns=()) for found in other.findings] == [
+        replace(found, detail="", spans_ns=()) for found in usual.findings
+    ]
+    assert other.undecided.keys() == usual.undecided.keys()
