@@ -33,7 +33,7 @@ from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import WindowPoses
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray, transposed
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
@@ -242,7 +242,7 @@ class _Normals(NamedTuple):
         """Return the normal equations of some rows."""
         H_transposed = np.swapaxes(rows.H_point, 2, 3)
         right = (H_transposed @ rows.residuals[..., None])[..., 0]
-        return cls(rows, H_transposed @ rows.H_point, right, H_transposed @ rows.H_pose)
+        return cls(rows, transposed(rows.H_point) @ rows.H_point, right, H_transposed @ rows.H_pose)
 
     def newest_nis(self, root: Array) -> Array:
         """Return the NIS (F,) of the newest sightings, each given the window and the others of its track.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transposed
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.sequence import StereoRig, is_left_only
@@ -134,7 +134,7 @@ def _fit(points: Array, views: _Views, rig: StereoRig) -> _Fit:
     system[..., :3] = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
     system[..., 3] = left_only.residuals_px(views.uvs_px, stereo.project(points_cam, rig))
     system = left_only.whitener(views.uvs_px, rig) @ system
-    normal = np.add.reduceat(np.swapaxes(system, 1, 2) @ system, views.first)
+    normal = np.add.reduceat(transposed(system) @ system, views.first)
     nearest_m = np.minimum.reduceat(depth_m, views.first)
     cost = np.where(nearest_m > 0.0, 0.5 * normal[:, 3, 3], np.inf)
     return _Fit(points, cost, normal[:, :3, 3], normal[:, :3, :3], nearest_m)

@@ -63,7 +63,7 @@ def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPr
     A point within a millimetre of the camera's plane is predicted as if it were a millimetre in front of it.
     """
     points_cam, depth_m = _divisible(in_camera(points_imu, rig))
-    d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ rig.T_imu_cam[:3, :3].T
+    d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ transposed(rig.T_imu_cam[:3, :3])
     # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the IMU frame.
     d_uv_d_pose = np.empty((*points_imu.shape, 6))
     d_uv_d_pose[..., :3], d_uv_d_pose[..., 3:] = d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu
