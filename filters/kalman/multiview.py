@@ -48,6 +48,12 @@ class TrackSightings(NamedTuple):
                 return self
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
+    def since(self, begin: int) -> "TrackSightings":
+        """Return the sightings without those from the poses before one."""
+        if not begin:
+            return self
+        return TrackSightings(self.track_ids, self.uvs_px[:, begin:], self.seen[:, begin:], self.ages[:, begin:])
+
     def joined(self, other: "TrackSightings") -> "TrackSightings":
         """Return the tracks of both in one."""
         track_ids, uvs_px = (

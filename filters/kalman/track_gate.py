@@ -6,7 +6,7 @@ window is left out, and the track is tested once more if two sightings remain. O
 track with bad luck: to leave out its worst sighting would choose the measurements by their agreement.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,9 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
 
+# Tracks are tested apart where that leaves out so many places for sightings in all: about what a group costs to form.
+_LEAST_LEFT_OUT = 300
+
 
 class WindowPoses(NamedTuple):
     """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the covariance (6 W, 6 W) of all."""
@@ -34,6 +37,12 @@ class WindowPoses(NamedTuple):
         """Return the window of a joint belief, linearised as chosen."""
         columns = joint.clone_columns
         return cls(joint.clones, at.clones(joint), joint.cov[columns, columns])
+
+    def since(self, begin: int) -> "WindowPoses":
+        """Return the window without the poses before one."""
+        poses = self.poses[begin:]
+        poses_at = poses if self.poses_at is self.poses else self.poses_at[begin:]
+        return WindowPoses(poses, poses_at, self.cov[6 * begin :, 6 * begin :]) if begin else self
 
 
 class TestedTracks(NamedTuple):
@@ -81,14 +90,69 @@ def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bound
 
     ``bounds`` (n,) is the NIS that is just accepted at each number of degrees of freedom.
     """
-    poses, P = window.poses, window.cov
-    points, reliable = triangulate(sightings.uvs_px, sightings.seen, poses, rig)
+    points, reliable = triangulate(sightings.uvs_px, sightings.seen, window.poses, rig)
     sightings, points = sightings.select(reliable), points[reliable]
     if rig.track_noise is not None:
-        points = multiview.refined(sightings, points, poses, rig)
+        points = multiview.refined(sightings, points, window.poses, rig)
+    groups = list(_by_first_pose(sightings.seen))
+    if len(groups) == 1 and not groups[0][0]:
+        return TestedTracks(sightings, points, *_constrained(sightings, points, window, rig, bounds))
+    parts = [
+        _constrained(sightings.select(rows).since(begin), points[rows], window.since(begin), rig, bounds)
+        for begin, rows in groups
+    ]
+    return TestedTracks(sightings, points, *_joined(groups, parts, window.cov.shape[0]))
+
+
+def _joined(groups: list[tuple[int, IntArray]], parts: list["_Constrained"], columns: int) -> "_Constrained":
+    """Return what was found of groups of tracks, each begun at a pose, in one; the rows of H by group."""
+    count = sum(len(rows) for _, rows in groups)
+    nis, dof, worst = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    H, end = np.zeros((sum(len(part.H) for part in parts), columns)), 0
+    for (begin, rows), part in zip(groups, parts, strict=True):
+        nis[rows], dof[rows], worst[rows] = part.nis, part.dof, np.where(part.worst < 0, -1, part.worst + begin)
+        H[end : end + len(part.H), 6 * begin :] = part.H
+        end += len(part.H)
+    tracks = [rows[part.track] for (_, rows), part in zip(groups, parts, strict=True)]
+    return _Constrained(nis, dof, worst, H, np.concatenate([part.residuals for part in parts]), np.concatenate(tracks))
+
+
+def _by_first_pose(seen: BoolArray) -> Iterator[tuple[int, IntArray]]:
+    """Yield tracks that were seen (F, W) late together: the pose from which on all were, and their rows.
+
+    All tracks of a group cost what the longest does, so each has the later half of the poses of the one before, where
+    that leaves out enough to pay for a group.
+    """
+    first, begin, rows = seen.argmax(axis=1), 0, np.arange(len(seen))
+    while True:
+        middle = begin + (seen.shape[1] - begin) // 2
+        late = first[rows] >= middle
+        if np.count_nonzero(late) * (middle - begin) < _LEAST_LEFT_OUT:
+            yield begin, rows
+            return
+        if not late.all():
+            yield begin, rows[~late]
+        begin, rows = middle, rows[late]
+
+
+class _Constrained(NamedTuple):
+    """What :class:`TestedTracks` has of tracks beside their sightings and points."""
+
+    nis: Array
+    dof: IntArray
+    worst: IntArray
+    H: Array
+    residuals: Array
+    track: IntArray
+
+
+def _constrained(
+    sightings: TrackSightings, points: Array, window: WindowPoses, rig: StereoRig, bounds: Array
+) -> _Constrained:
+    """Free tracks of their landmarks (F, 3) and test them."""
     linearised = _linearised(sightings, points, window, rig)
     constraints = multiview.without_landmark(linearised, sightings)
-    covs = innovation_covs(constraints, P)
+    covs = innovation_covs(constraints, window.cov)
     nis = mahalanobis_squared(constraints.residuals, covs)
     bound = bounds[constraints.dof]
     worst = np.full(len(nis), -1)
@@ -97,11 +161,11 @@ def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bound
         basis, residuals = multiview.null_space(linearised.select(far)), constraints.residuals[far]
         worst[far] = _worst_sighting(basis, residuals, covs[far], sightings.seen[far])
     below = np.flatnonzero(nis < bound)
-    H = constraints.H[below].reshape(-1, P.shape[0])
+    H = constraints.H[below].reshape(-1, window.cov.shape[0])
     used = H.any(axis=1)
     owner = np.repeat(below, constraints.H.shape[1])
     residuals = constraints.residuals[below].reshape(-1)
-    return TestedTracks(sightings, points, nis, constraints.dof, worst, H[used], residuals[used], owner[used])
+    return _Constrained(nis, constraints.dof, worst, H[used], residuals[used], owner[used])
 
 
 def _linearised(
