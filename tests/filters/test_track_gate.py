@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman import multiview
+from filters.kalman import multiview, track_gate
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.track_gate import TrackGate, innovation_covs
+from filters.kalman.track_gate import TrackGate, WindowPoses, innovation_covs
 from filters.kalman.triangulation import triangulate
 from toolkit.models import stereo
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.simulation import DRIVE
 
 WINDOW, TRACKS = 6, 12
@@ -97,3 +97,25 @@ def test_no_track_at_all_is_no_test(scene):
     accepted, gate = gated(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
     assert len(accepted.points) == 0
     assert gate.tested == 0
+
+
+def test_tracks_seen_late_are_tested_as_with_the_whole_window(scene, monkeypatch):
+    """In groups, each with the poses it was seen from, some with a mismatched sighting; 1e-9 is rounding's share."""
+    joint, rig, sightings = scene
+    sightings = mismatched(sightings, {0: [2], 5: [3], 8: [4]})
+    sightings = sightings._replace(seen=np.arange(WINDOW) >= np.arange(TRACKS)[:, None] % (WINDOW - 1))
+    arguments = sightings, WindowPoses.of(joint, AtLatestEstimates()), rig, chi2_bound(np.arange(3 * WINDOW), 0.95)
+    whole = track_gate.tested(*arguments)
+    monkeypatch.setattr(track_gate, "_LEAST_LEFT_OUT", 1)
+    assert len(list(track_gate._by_first_pose(sightings.seen))) == 3
+    grouped = track_gate.tested(*arguments)
+    assert grouped.nis == pytest.approx(whole.nis, rel=1e-9)
+    assert grouped.dof.tolist() == whole.dof.tolist()
+    assert grouped.worst.tolist() == whole.worst.tolist()
+    assert (whole.worst >= 0).any()
+    assert sorted(grouped.track) == sorted(whole.track)
+    for track in set(whole.track):
+        a, b = whole.H[whole.track == track], grouped.H[grouped.track == track]
+        r, s = whole.residuals[whole.track == track], grouped.residuals[grouped.track == track]
+        assert b.T @ b == pytest.approx(a.T @ a, abs=1e-9 * np.abs(a.T @ a).max())
+        assert b.T @ s == pytest.approx(a.T @ r, abs=1e-9 * np.abs(a.T @ a).max())
