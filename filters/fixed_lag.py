@@ -12,6 +12,7 @@ landmark (``filters/smoothing/chained_window.py``).
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from filters.kalman.thinning import Thinned
@@ -22,7 +23,7 @@ from filters.smoothing.indeterminate import Recovery, behind_camera
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models.factors import L
+from toolkit.models.factors import X, points_of
 from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
@@ -46,9 +47,11 @@ class FixedLag:
         chained = ChainedWindow(setup.rig, setup.settings.outliers.smoother_huber)
         self._tree = FixedLagTree(self._lag_ns, chained)
         self._builder = GraphBuilder(setup)
-        self._first_in_window = 0
-        self._states: list[Estimate] = []
-        self._points: dict[int, Array] = {}
+        self._stamps_ns: list[int] = []
+        # What the window was when it was last read: the values of its variables, and its landmarks (3,) m.
+        self._values, self._in_window = gtsam.Values(), dict[int, Array]()
+        # What has left it, as it was then.
+        self._states, self._points = list[Estimate](), dict[int, Array]()
         self._last_seen_ns: dict[int, int] = {}
         self._log: list[str] = []
 
@@ -57,48 +60,54 @@ class FixedLag:
         if self._builder.is_outdated:
             self._note(packet, self._tree.rebuild(self._builder.window_brought_up_to_date))
         extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
-        while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
-            self._complete(self._first_in_window)
-            self._first_in_window += 1
+        self._states += [self._state(k) for k in self._window() if self._stamps_ns[k] < t_ns - self._lag_ns]
         recovery = self._tree.add(extension, t_ns)
+        self._stamps_ns.append(t_ns)
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
         self._note(packet, recovery)
-        self._read(packet)
-        self._drop_landmarks(packet)
-        return replace(self._states[-1], info=self._builder.info)
+        newest = self._read(packet)
+        self._drop_landmarks(packet, newest)
+        return replace(newest, info=self._builder.info)
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
-        for k in range(self._first_in_window, len(self._states)):
-            self._complete(k)
-        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=(*self._builder.log(), *self._log))
+        states = [*self._states, *map(self._state, self._window())]
+        landmarks = Landmarks.of(self._points | self._in_window)
+        return Finished(Trajectory.of(states), landmarks, log=(*self._builder.log(), *self._log))
 
-    def _complete(self, k: int) -> None:
-        """Give a state of the window the covariance it has there."""
-        state = self._states[k]
-        cov = state_cov(self._builder.motion, self._tree, k, state.T_world_imu[:3, :3])
-        self._states[k] = replace(state, cov=cov)
+    def _window(self) -> range:
+        """Return the numbers of the states in the window."""
+        return range(len(self._states), len(self._stamps_ns))
 
-    def _read(self, packet: Packet) -> None:
-        """Take over every state and landmark of the window; what leaves it stays as last read."""
-        values = self._tree.values()
-        motion, window = self._builder.motion, range(self._first_in_window, packet.index + 1)
-        stamps_ns = [s.t_ns for s in self._states[self._first_in_window :]] + [packet.frame.t_ns]
-        self._states[self._first_in_window :] = [motion.read(values, k, stamps_ns[k - window[0]]) for k in window]
-        self._complete(packet.index)
-        self._forget({i for i, t_ns in self._last_seen_ns.items() if t_ns < packet.frame.t_ns - self._lag_ns})
-        in_tree = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
-        self._points |= in_tree
-        self._builder.update(self._states[-1], in_tree)
+    def _state(self, k: int) -> Estimate:
+        """Return a state of the window as it was last read, with the covariance the window has for it."""
+        state = self._builder.motion.read(self._values, k, self._stamps_ns[k])
+        return replace(state, cov=state_cov(self._builder.motion, self._tree, k, state.T_world_imu[:3, :3]))
+
+    def _pose(self, k: int) -> Array:
+        """Return a pose (4, 4) as it was last read, or as it left the window."""
+        return self._states[k].T_world_imu if k < len(self._states) else self._values.atPose3(X(k)).matrix()
+
+    def _read(self, packet: Packet) -> Estimate:
+        """Take over the landmarks of the window, and return its newest state; what leaves it stays as last read."""
+        self._values = self._tree.values()
+        newest = self._state(packet.index)
+        left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < packet.frame.t_ns - self._lag_ns}
+        # Rows of one array: a view of it would keep it whole.
+        self._points |= {i: self._in_window[i].copy() for i in left}
+        self._forget(left)
+        self._in_window = points_of(self._values, self._last_seen_ns)
+        self._builder.update(newest, self._in_window)
         k = packet.index - LEARNT_AFTER_FRAMES
         if k >= 0:
-            self._builder.learn(k, np.array([state.T_world_imu for state in self._states[k : k + 2]]))
+            self._builder.learn(k, np.array([self._pose(k), self._pose(k + 1)]))
+        return newest
 
-    def _drop_landmarks(self, packet: Packet) -> None:
+    def _drop_landmarks(self, packet: Packet, newest: Estimate) -> None:
         """Drop what is not in front of the camera any more, before it is linearised there, and what is elsewhere."""
         seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
-        points = np.array([self._points[i] for i in seen]).reshape(-1, 3)
-        rows = np.flatnonzero(behind_camera(points, self._states[-1].T_world_imu, self._rig))
+        points = np.array([self._in_window[i] for i in seen]).reshape(-1, 3)
+        rows = np.flatnonzero(behind_camera(points, newest.T_world_imu, self._rig))
         log = {seen[row]: "fell behind the camera" for row in rows}
         contradicted = self._builder.contradicted() & self._last_seen_ns.keys()
         log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
@@ -113,6 +122,7 @@ class FixedLag:
         self._forget(recovery.dropped)
         for i in recovery.dropped:
             self._points.pop(i, None)
+            self._in_window.pop(i, None)
 
     def _forget(self, landmark_ids: set[int]) -> None:
         """Let landmarks go that are not in the window any more."""

@@ -28,7 +28,7 @@ from filters.smoothing.robust_schedule import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models.factors import L, X
+from toolkit.models.factors import L, X, landmark_keys
 from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
@@ -60,18 +60,19 @@ class Isam2:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        self._note(packet, self._tree.see([L(i) for i in packet.frame.track_ids.tolist()]))
+        self._note(packet, self._tree.see(landmark_keys(packet.frame.track_ids.tolist())))
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
         recovery = self._tree.add(extension.factors, extension.values, extension.state_keys, extension.chained)
         self._note(packet, recovery)
         estimate = self._newest(extension, packet)
-        seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
-        points = self._tree.points(map(L, seen))
-        self._relinearise(packet, estimate)
-        self._builder.update(estimate, dict(zip(seen, points, strict=True)))
+        in_view = [i for i in sorted(packet.frame.track_ids.tolist()) if self._tree.has(L(i))]
+        points = dict(zip(in_view, self._tree.points(landmark_keys(in_view)), strict=True))
+        self._relinearise(points, estimate)
+        seen = {i: points[i] for i in extension.landmark_ids if i in points}
+        self._builder.update(estimate, seen)
         self._learn(packet)
-        self._drop_landmarks(seen, points, estimate, packet)
+        self._drop_landmarks(seen, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
@@ -95,12 +96,14 @@ class Isam2:
             poses = self._tree.read([X(k), X(k + 1)])
             self._builder.learn(k, np.array([poses.atPose3(X(i)).matrix() for i in (k, k + 1)]))
 
-    def _relinearise(self, packet: Packet, estimate: Estimate) -> None:
-        """Mark the landmarks in view, refused or not, that are no longer where they are linearised."""
-        in_view = [key for key in map(L, packet.frame.track_ids.tolist()) if self._tree.has(key)]
-        now, before = self._tree.points(in_view), self._tree.linearised_at(in_view)
-        rows = np.flatnonzero(linearised_badly(now, before, estimate.T_world_imu, self._rig))
-        self._tree.relinearise(in_view[row] for row in rows)
+    def _relinearise(self, in_view: dict[int, Array], estimate: Estimate) -> None:
+        """Mark the landmarks in view (3,) m, refused or not, that are no longer where they are linearised.
+
+        They come by ascending track.
+        """
+        keys, now = landmark_keys(in_view), np.array(list(in_view.values())).reshape(-1, 3)
+        rows = np.flatnonzero(linearised_badly(now, self._tree.linearised_at(keys), estimate.T_world_imu, self._rig))
+        self._tree.relinearise(keys[row] for row in rows)
 
     def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:
         values = self._tree.read(extension.state_keys)
@@ -108,10 +111,11 @@ class Isam2:
         cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov, info=self._builder.info)
 
-    def _drop_landmarks(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
+    def _drop_landmarks(self, seen: dict[int, Array], estimate: Estimate, packet: Packet) -> None:
         """Drop what is not in front of the camera any more, where sightings have no gradient, and what is elsewhere."""
-        rows = np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))
-        log = {seen[row]: "fell behind the camera" for row in rows}
+        points = np.array(list(seen.values())).reshape(-1, 3)
+        behind = behind_camera(points, estimate.T_world_imu, self._rig).tolist()
+        log = {i: "fell behind the camera" for i, is_behind in zip(seen, behind, strict=True) if is_behind}
         contradicted = {i for i in self._builder.contradicted() if self._tree.has(L(i))}
         log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
         if log:

@@ -50,6 +50,8 @@ class ChainedWindow:
 
         Such are the innovations of the next sightings, too. Those that follow go on from the sightings that stay.
         """
+        if not self.is_used:
+            return
         self._rows = self._rows.select(self._rows.t_ns >= oldest_ns)
         kept = [since_ns >= oldest_ns for since_ns in self._since_ns]
         self._slots = [slot for slot, stays in zip(self._slots, kept, strict=True) if stays]

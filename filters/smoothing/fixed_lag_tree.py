@@ -173,8 +173,8 @@ class FixedLagTree:
         old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < self._oldest_ns]
         # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it; and
         # CCOLAMD takes no place beyond the number of variables it orders.
-        moved = [*self._landmark_stamps_ns, *self._state_stamps_ns]
-        known = [key for key in moved if self._isam.valueExists(key)]
+        new = set(values.keys())
+        known = [key for key in (*self._landmark_stamps_ns, *self._state_stamps_ns) if key not in new]
         factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
         self._add(factors, values, slots, _key_list(known))
         # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.

@@ -180,10 +180,9 @@ class Isam2Tree:
         """Return the latest points (N, 3) of landmarks in the world."""
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
 
-    def linearised_at(self, landmarks: Iterable[int]) -> Array:
-        """Return the points (N, 3) in the world that landmarks are linearised at."""
-        values = self.isam.getLinearizationPoint()
-        return np.array([values.atPoint3(key) for key in landmarks]).reshape(-1, 3)
+    def linearised_at(self, ascending: list[int]) -> Array:
+        """Return the points (N, 3) in the world that landmarks, by ascending key, are linearised at."""
+        return gtsam.utilities.extractPoint3(self.isam.getLinearizationPoint().extract(ascending))
 
     def relinearise(self, landmarks: Iterable[int]) -> None:
         """Have the next frame linearise landmarks anew, unless they are frozen; the others stay as they are."""
@@ -202,9 +201,9 @@ class Isam2Tree:
     def _moved(self) -> set[int]:
         """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
         fixed = {*self.isam.getFixedVariables(), *(self._chained.settled if self._chained is not None else ())}
-        may_move = [key for key in self._frozen.others - fixed if self.has(key)]
-        landmarks = self._to_relinearise.intersection(may_move)
-        states = [key for key in may_move if kind_of(key) != "l"]
+        may_move = self._frozen.others - fixed
+        landmarks = {key for key in self._to_relinearise & may_move if self.has(key)}
+        states = [key for key in may_move - self._landmarks if kind_of(key) != "l" and self.has(key)]
         return landmarks.union(states if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else ())
 
     def _linearisations(

@@ -12,12 +12,12 @@ more sightings of its track are refused than were taken, and these agree with ea
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from filters.smoothing.robust_loss import Cauchy
-from toolkit.geometry import Array, BoolArray, se3_exp
+from toolkit.geometry import Array, BoolArray, se3_exp, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
@@ -59,8 +59,9 @@ class OutlierCheck:
         ``expected`` is the state as predicted, its covariance that of its motion relative to the map, ``share`` what
         sightings count for. What the motion is off by is none of the check's business any more.
         """
-        there = aligned(expected, frame, points, self.rig, share)
-        return there, frame.select(~self.outliers(frame, points, relative_to_its_map(there)))
+        known = _KnownSightings.of(frame, points)
+        there = _aligned(expected, known, self.rig, share)
+        return there, frame.select(~self._outliers(known, relative_to_its_map(there)))
 
     def outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> BoolArray:
         """Say which sightings (N,) of a frame are not of the landmarks (3,) m that their tracks have.
@@ -69,21 +70,37 @@ class OutlierCheck:
         as known as well as one sighting from here would tell. A sighting of an unknown landmark is no outlier. Where
         most are outliers the state is wrong, and none is returned.
         """
-        known = np.array([i in points for i in frame.track_ids.tolist()], dtype=bool)
-        if not known.any():
-            return known
-        landmarks = np.array([points[i] for i in frame.track_ids[known].tolist()])
-        predicted, uvs_px = stereo.predict(landmarks, expected.T_world_imu, self.rig), frame.uvs_px[known]
+        return self._outliers(_KnownSightings.of(frame, points), expected)
+
+    def _outliers(self, known: "_KnownSightings", expected: Belief) -> BoolArray:
+        if not len(known.points):
+            return known.rows
+        predicted, uvs_px = stereo.predict(known.points, expected.T_world_imu, self.rig), known.uvs_px
         H = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
         covs_px2 = 2.0 * left_only.noise_px2(uvs_px, self.rig) + H @ expected.cov[POSE, POSE] @ np.swapaxes(H, 1, 2)
         dof = left_only.degrees_of_freedom(uvs_px)
         bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
         far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
         if far.mean() > MOST_MISMATCHED:
-            return np.zeros_like(known)
-        result = known.copy()
-        result[known] = far
+            return np.zeros_like(known.rows)
+        result = known.rows.copy()
+        result[known.rows] = far
         return result
+
+
+class _KnownSightings(NamedTuple):
+    """Which of a frame's sightings (N,) are of known landmarks, these (n, 3) px, and the landmarks (n, 3) m."""
+
+    rows: BoolArray
+    uvs_px: Array
+    points: Array
+
+    @classmethod
+    def of(cls, frame: StereoFrame, points: Mapping[int, Array]) -> Self:
+        found = [points.get(i) for i in frame.track_ids.tolist()]
+        rows = np.array([point is not None for point in found], dtype=bool)
+        known = np.array([point for point in found if point is not None]).reshape(-1, 3)
+        return cls(rows, frame.uvs_px[rows], known)
 
 
 class _Refused(NamedTuple):
@@ -110,10 +127,13 @@ class RefusedTracks:
         """Take in a frame, of which some sightings (N,) were refused, and its pose; return the tracks to begin anew."""
         self._taken.update(frame.track_ids[~refused].tolist())
         seen = frame.select(refused & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
+        if not seen.track_ids.size:
+            self._refused = {}
+            return set()
         points = stereo.triangulate_world(seen.uvs_px, T_world_imu, self._rig)
         before = [self._refused.get(i) for i in seen.track_ids.tolist()]
         expected = np.array([point if one is None else one.point for one, point in zip(before, points, strict=True)])
-        off_px = seen.uvs_px - stereo.predict(expected.reshape(-1, 3), T_world_imu, self._rig).uv_px
+        off_px = seen.uvs_px - stereo.images(transform(se3_inverse(T_world_imu), expected), self._rig)[0]
         # Both sightings err.
         covs_px2 = np.broadcast_to(2.0 * self._rig.cov_uv_px2, (len(points), 3, 3))
         agree = mahalanobis_squared(off_px, covs_px2) <= self._bound
@@ -134,15 +154,18 @@ def aligned(
     Each sighting counts for a share of what it tells by itself, with the noise of the pixels; what is far is so by all
     of it. The covariance stays as it is.
     """
-    seen = frame.select(np.array([i in points for i in frame.track_ids.tolist()], dtype=bool))
-    if not seen.track_ids.size:
+    return _aligned(expected, _KnownSightings.of(frame, points), rig, share)
+
+
+def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig, share: float) -> Belief:
+    if not len(known.points):
         return expected
-    landmarks = np.array([points[i] for i in seen.track_ids.tolist()])
+    uvs_px, landmarks = known.uvs_px, known.points
     cov = expected.cov[POSE, POSE]
-    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), left_only.whitener(seen.uvs_px, rig)
+    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), left_only.whitener(uvs_px, rig)
     for _ in range(_STEPS):
         predicted = stereo.predict(landmarks, T_world_imu, rig)
-        residual = left_only.whitened_residuals(seen.uvs_px, predicted.uv_px, rig)
+        residual = left_only.whitened_residuals(uvs_px, predicted.uv_px, rig)
         weights = np.where(predicted.depth_m > 0.0, share * _LOSS.weight(np.linalg.norm(residual, axis=1)), 0.0)
         H = (whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
         weighed = H * np.repeat(weights, 3)[:, None]

@@ -17,6 +17,7 @@ X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_s
 SCALE: int = gtsam.symbol("s", 0)
 # A key is a character above an index of so many bits (gtsam/inference/Symbol.h); a Symbol takes several times as long.
 _INDEX_BITS = 56
+_FIRST_LANDMARK = ord("l") << _INDEX_BITS
 # GTSAM's Python wraps linear factors on up to this many variables; on more, only conditionals, which are factors too.
 _MOST_TERMS = 3
 
@@ -33,6 +34,21 @@ def latest_values(tree: gtsam.ISAM2, keys: Iterable[int], read_bias: Callable[[i
     for key in keys:
         values.insert(key, readers[kind_of(key)](key))
     return values
+
+
+def landmark_keys(track_ids: Iterable[int]) -> list[int]:
+    """Return the keys L(track id) of landmarks."""
+    return [_FIRST_LANDMARK + track_id for track_id in track_ids]
+
+
+def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array]:
+    """Return the points (3,) of landmarks, by track: rows of one array, read at once.
+
+    Raises RuntimeError, as GTSAM does, where one has no value.
+    """
+    ascending = sorted(track_ids)
+    points = gtsam.utilities.extractPoint3(values.extract(landmark_keys(ascending)))
+    return dict(zip(ascending, points, strict=True))
 
 
 def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:
