@@ -1,5 +1,5 @@
-"""What no estimator, start, metric or audit may depend on: where the world begins, what tracks are called, the clock's
-zero, and which side is left. Answers to a recording that is told otherwise are the same answers, told so.
+"""What no estimator, start, metric or audit may depend on: the world's origin and heading, track ids, the clock's zero,
+and which side is left. Answers to the same recording in other coordinates are the same answers in those.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A recording told otherwise is a sound one: its motion is that of its truth, and so are its images."""
+"""A turned, mirrored or reversed recording is a sound one: its motion and its images are those of its truth."""
 
 from dataclasses import replace
 

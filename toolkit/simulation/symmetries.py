@@ -1,7 +1,8 @@
-"""A recording seen otherwise: what an estimator, the audit or a metric makes of it must turn, move or flip with it.
+"""The same recording in other coordinates, and played backwards.
 
-``turned``, ``renamed``, ``delayed`` and ``mirrored`` tell the same measurements in other coordinates: answers are the
-same in those, to rounding. ``reversed_in_time`` is another recording with the same scene, camera and errors.
+``turned``, ``renamed``, ``delayed`` and ``mirrored`` express the same measurements in another world, with other track
+ids, by another clock or in a mirror: answers are the same in those coordinates, to rounding. ``reversed_in_time`` is
+another recording with the same scene, camera and errors.
 """
 
 from dataclasses import replace
@@ -14,8 +15,8 @@ from toolkit.measured_motion import ImuSamples, MotionSamples, TwistSamples
 from toolkit.resampling import Bridges, Pairing
 from toolkit.sequence import Observations, Prior, Sequence, StereoRig, Truth, is_left_only
 
-# Reflections of the y-axis of body and world, and of the x-axis of the camera; a vector that tells a rotation keeps
-# what is along the reflected axis and has the rest negated.
+# Reflections of the y-axis of body and world, and of the x-axis of the camera; a rotation vector keeps
+# its component along the reflected axis, and the other two change sign.
 _Y, _ROTATION = np.diag([1.0, -1.0, 1.0]), np.diag([-1.0, 1.0, -1.0])
 _POSE_Y, _CAMERA_X = np.diag([1.0, -1.0, 1.0, 1.0]), np.diag([-1.0, 1.0, 1.0, 1.0])
 # Of rotation, position, velocity and the biases [accel, gyro], in the body frame.
@@ -27,7 +28,7 @@ _REVERSED: dict[str, Pairing] = {"start": "end", "end": "start", "mean": "mean"}
 def turned(sequence: Sequence, yaw_rad: float, shift_m: Array) -> Sequence:
     """Return a recording whose world is another: turned about the vertical, and then shifted by (3,) m.
 
-    Truth and prior are told in it; what is measured stays.
+    Truth and prior are expressed in it; the measurements stay.
     """
     sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
     T_new_old = se3(np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]), shift_m)
@@ -41,16 +42,16 @@ def turned(sequence: Sequence, yaw_rad: float, shift_m: Array) -> Sequence:
 
 
 def renamed(sequence: Sequence, ids: IntArray) -> Sequence:
-    """Return a recording in which each sighting (N,) is of the track of another name (N,).
+    """Return a recording in which the sightings (N,) have other track ids (N,).
 
-    Who is withheld follows from names: give others to the visible tracks alone, or leave withheld ones out before.
+    Which tracks are withheld follows from the ids: rename visible tracks alone, or leave the withheld ones out before.
     """
     seen = sequence.observations
     return replace(sequence, observations=Observations.sorted(seen.frame, ids, seen.uv_px))
 
 
 def delayed(sequence: Sequence, by_ns: int) -> Sequence:
-    """Return a recording all of whose clocks show so much more."""
+    """Return a recording all of whose stamps are later by so many nanoseconds."""
     motion, truth, bridges = sequence.motion, sequence.truth, sequence.bridges
     if bridges is not None:
         bridges = replace(bridges, begin_t_ns=bridges.begin_t_ns + by_ns, end_t_ns=bridges.end_t_ns + by_ns)
