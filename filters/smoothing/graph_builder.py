@@ -57,8 +57,6 @@ class GraphBuilder:
         self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
         # What the sightings counted for that are longest in the graph, and whether all others count for that too.
         self._share_in_graph, self._count_alike = 1.0, True
-        # What a sighting is known to count for, which only learning changes.
-        self._known_share = self._tracks.share
         # What is new in a sighting of a track whose noise is stated has the filters' gate, as their tracks have.
         if setup.rig.track_noise is not None:
             outliers = msgspec.structs.replace(outliers, smoother_gate_factor=1.0)
@@ -79,7 +77,7 @@ class GraphBuilder:
         """Return what a packet adds, the new state being predicted from the latest known."""
         extension = GraphExtension()
         expected = self._add_state(self._noise.applied(packet), extension)
-        there, sound = self._outlier_check.placed(expected, packet.frame, self._points, self._known_share)
+        there, sound = self._outlier_check.placed(expected, packet.frame, self._points, self._tracks.share)
         if self._begins_there:
             self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
         self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
@@ -103,16 +101,15 @@ class GraphBuilder:
         """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
         points = {i: self._points[i] for i in seen_often(self._used.values()) if i in self._points}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
-        self._known_share = self._tracks.share
 
     @property
     def is_outdated(self) -> bool:
         """Say whether sightings in the graph count for far more, or less, than they are known to by now."""
-        return not 1.0 / _MOST_OUTDATED < self._known_share / self._share_in_graph < _MOST_OUTDATED
+        return not 1.0 / _MOST_OUTDATED < self._tracks.share / self._share_in_graph < _MOST_OUTDATED
 
     def brought_up_to_date(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
         """Return a graph whose sightings all count for what they are known to by now; the rest is as it was."""
-        if self._count_alike and self._known_share == self._share_in_graph:
+        if self._count_alike and self._tracks.share == self._share_in_graph:
             return graph
         factors = self._factors()
         self._share_in_graph, self._count_alike = self._share, True
@@ -187,8 +184,8 @@ class GraphBuilder:
 
     def _factors(self) -> StereoFactors:
         """Return what makes factors of sightings that count for what they are known to count for now."""
-        if self._share != self._known_share:
+        if self._share != self._tracks.share:
             rig, huber = self._tracks.now
-            self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._known_share
+            self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share
             self._count_alike = False
         return self._stereo
