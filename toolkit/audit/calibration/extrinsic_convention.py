@@ -8,7 +8,6 @@ way, as an extrinsic in regular axes and its inverse, differ in where the camera
 the camera's own velocity puts it.
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px, one_step_px_by_interval
-from toolkit.audit.parts.robust import Scalar, slope
+from toolkit.audit.parts.robust import Scalar, mean_in_sigmas, slope
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
 from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence
 
@@ -43,7 +42,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     misses = {name: one_step_px_by_interval(sequence, camera, T) for name, T in readings.items()}
     logs = {name: np.log(np.maximum(miss, 1e-9)) for name, miss in misses.items()}
     first, *others = sorted(logs, key=lambda name: float(np.mean(logs[name])))
-    certainty = {name: _sigmas(logs[name] - logs[first]) for name in others}
+    certainty = {name: mean_in_sigmas(logs[name] - logs[first]) for name in others}
     as_good = [name for name in others if not certainty[name] > AGAINST_SECOND]
     if len(as_good) == len(others):
         return Undecided(f"the tracks follow every reading of the extrinsic alike, {first} and {as_good[0]} the best")
@@ -114,12 +113,6 @@ def _settled(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
     facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_IN_DOUBT)
     provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is taken {reading}"))
     return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
-
-
-def _sigmas(difference: Array) -> float:
-    """Return the mean of differences (M,) in standard errors of that mean."""
-    error = float(np.std(difference)) / math.sqrt(difference.size)
-    return float(np.mean(difference)) / max(error, 1e-12)
 
 
 FAULT = Fault(

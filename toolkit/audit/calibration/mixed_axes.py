@@ -12,7 +12,6 @@ against the signs of the small components.
 """
 
 import itertools
-import math
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -24,16 +23,13 @@ from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px
-from toolkit.audit.parts.robust import spread
+from toolkit.audit.parts.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, cauchy, mean_in_sigmas
 from toolkit.geometry import Array, se3, se3_inverse
 
 # Mean difference of two explanations in its own standard errors: a doubt about the file as given must be far
 # beyond chance (intervals are correlated over about a second), a choice among repairs only beyond chance.
 AGAINST_GIVEN = 8.0
 AGAINST_SECOND = 4.0
-# What the camera's own rotation (rad/s) and velocity (m/s) of one interval are good for.
-LEAST_SPREAD_W = 0.003
-LEAST_SPREAD_V = 0.05
 # Cameras that look the same way to this angle: a turn of the body's axes and one of the camera's.
 SAME_WAY_RAD = 0.2
 # Places that are no further apart are one.
@@ -68,11 +64,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     readings = _readings(given)  # the first is the given
     costs = _costs(evidence.intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
     first, second = _best_two(readings, costs)
-    better, alone = sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
+    better, alone = mean_in_sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
     at_odds = _of_rotations(evidence.intervals, readings[first].T_imu_cam) != _OWN
     if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
         return _exchanged(alone)
-    if first == 0 and (certainty := sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
+    if first == 0 and (certainty := mean_in_sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
         return Undecided(
             f"{readings[second].name} explains the motion as well as what is given ({certainty:.1f} sigma)"
         )
@@ -80,7 +76,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if better < AGAINST_GIVEN:
         return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
-    certain = sigmas(costs[second] - costs[first]) > AGAINST_SECOND
+    certain = mean_in_sigmas(costs[second] - costs[first]) > AGAINST_SECOND
     taken, doubt = _settled(evidence, evidence.intervals, [readings[k] for k in _twins(readings, first)])
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
@@ -198,7 +194,7 @@ def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
     signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
     costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
     best = int(np.argmin(costs.mean(axis=1)))
-    return axes_named(signed[best]) if sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
+    return axes_named(signed[best]) if mean_in_sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
 
 
 def _costs(intervals: Intervals, candidates: Array) -> Array:
@@ -210,21 +206,6 @@ def _costs(intervals: Intervals, candidates: Array) -> Array:
         v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
         costs = costs + cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
     return costs
-
-
-def cauchy(residuals: Array, least_spread: float) -> Array:
-    """Return log(1 + r^2) (C, M) of residuals (C, M, 3) about their medians, in spreads of the best candidate."""
-    centred = residuals - np.median(residuals, axis=1, keepdims=True)
-    spreads = np.stack([spread(r) for r in residuals])
-    best = spreads[np.argmin(np.sum(spreads**2, axis=1))]
-    costs: Array = np.log1p(np.sum((centred / np.maximum(best, least_spread)) ** 2, axis=2))
-    return costs
-
-
-def sigmas(difference: Array) -> float:
-    """Return the mean of differences (M,) in standard errors of that mean."""
-    error = float(np.std(difference)) / math.sqrt(difference.size)
-    return float(np.mean(difference)) / max(error, 1e-12)
 
 
 def axes_named(turn: Array) -> str:

@@ -1,5 +1,6 @@
 """Statistics robust to a few outlying intervals."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,9 @@ SLIP_S = 1.5
 # factors, with the weight of this many stretches. 248 parts of ten drives have 2.0 on the median and 4.6 in nine of ten
 # at most, 03 alone 3.3 and 5.0; 258 parts beside an IMU 1.0 and 1.3. Chosen with them in view.
 INFLATION, INFLATION_STRETCHES = {"twist": 3.0, "imu": 1.5}, 8.0
+# What the camera's own rotation (rad/s) and velocity (m/s) of one interval are good for.
+LEAST_SPREAD_W = 0.003
+LEAST_SPREAD_V = 0.05
 
 
 class Scalar(NamedTuple):
@@ -36,6 +40,21 @@ def spread(residuals: Array) -> Array:
     centred = np.abs(residuals - median(residuals))
     deviation: Array = MAD_TO_SIGMA * median(centred)
     return deviation
+
+
+def cauchy(residuals: Array, least_spread: float) -> Array:
+    """Return log(1 + r^2) (C, M) of residuals (C, M, 3) about their medians, in spreads of the best candidate."""
+    centred = residuals - np.median(residuals, axis=1, keepdims=True)
+    spreads = np.stack([spread(r) for r in residuals])
+    best = spreads[np.argmin(np.sum(spreads**2, axis=1))]
+    costs: Array = np.log1p(np.sum((centred / np.maximum(best, least_spread)) ** 2, axis=2))
+    return costs
+
+
+def mean_in_sigmas(difference: Array) -> float:
+    """Return the mean of differences (M,) in standard errors of that mean."""
+    error = float(np.std(difference)) / math.sqrt(difference.size)
+    return float(np.mean(difference)) / max(error, 1e-12)
 
 
 def median(values: Array) -> Array:

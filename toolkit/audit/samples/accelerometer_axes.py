@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.calibration.mixed_axes import MIRRORED, axes_named, cauchy, sigmas, signed_axes
+from toolkit.audit.calibration.mixed_axes import MIRRORED, axes_named, signed_axes
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
+from toolkit.audit.parts.robust import cauchy, mean_in_sigmas
 from toolkit.geometry import Array, IntArray, so3_exp
 from toolkit.resampling import NS_PER_S
 
@@ -56,7 +57,7 @@ def check(evidence: Evidence) -> Symptom | None:
     ranked = [int(k) for k in np.argsort(costs.mean(axis=1))]
     best = ranked[0]
     given_mps2, best_mps2 = (float(np.median(np.linalg.norm(left[k], axis=1))) for k in (0, best))
-    if best == 0 or sigmas(costs[0] - costs[best]) < AGAINST_GIVEN or best_mps2 > MOST_LEFT * given_mps2:
+    if best == 0 or mean_in_sigmas(costs[0] - costs[best]) < AGAINST_GIVEN or best_mps2 > MOST_LEFT * given_mps2:
         return None
     return Symptom(
         count=1,

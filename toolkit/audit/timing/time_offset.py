@@ -13,13 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.audit.calibration.mixed_axes import LEAST_SPREAD_V, cauchy, sigmas
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LATE
 from toolkit.audit.parts.clocks import camera_offset, is_stamped_at_frames
 from toolkit.audit.parts.edits import keep_frames
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas
 from toolkit.audit.timing.twist_lag import LAG
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
@@ -97,7 +96,7 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
     R_imu_cam, p_imu_cam = evidence.sequence.rig.T_imu_cam[:3, :3], evidence.sequence.rig.T_imu_cam[:3, 3]
     seen = before.v_cam_mps @ R_imu_cam.T - np.cross(before.w_cam_radps @ R_imu_cam.T, p_imu_cam)
     costs = cauchy(np.stack([before.v_mps[here] - seen[here], after.v_mps[there] - seen[here]]), LEAST_SPREAD_V)
-    return sigmas(costs[1] - costs[0])
+    return mean_in_sigmas(costs[1] - costs[0])
 
 
 def _changing(detail: str, change: Scalar) -> Symptom:
