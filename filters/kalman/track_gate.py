@@ -96,25 +96,28 @@ def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bound
         points = multiview.refined(sightings, points, window.poses, rig)
     groups = list(_by_first_pose(sightings.seen))
     if len(groups) == 1 and not groups[0][0]:
-        return TestedTracks(sightings, points, *_constrained(sightings, points, window, rig, bounds))
+        return _constrained(sightings, points, window, rig, bounds)
     parts = [
         _constrained(sightings.select(rows).since(begin), points[rows], window.since(begin), rig, bounds)
         for begin, rows in groups
     ]
-    return TestedTracks(sightings, points, *_joined(groups, parts, window.cov.shape[0]))
+    return _joined(sightings, points, groups, parts)
 
 
-def _joined(groups: list[tuple[int, IntArray]], parts: list["_Constrained"], columns: int) -> "_Constrained":
-    """Return what was found of groups of tracks, each begun at a pose, in one; the rows of H by group."""
-    count = sum(len(rows) for _, rows in groups)
+def _joined(
+    sightings: TrackSightings, points: Array, groups: list[tuple[int, IntArray]], parts: list[TestedTracks]
+) -> TestedTracks:
+    """Return the results for groups of the tracks, each from a first pose on, as those of all; H has rows by group."""
+    count, window = sightings.seen.shape
     nis, dof, worst = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-    H, end = np.zeros((sum(len(part.H) for part in parts), columns)), 0
+    H, end = np.zeros((sum(len(part.H) for part in parts), 6 * window)), 0
     for (begin, rows), part in zip(groups, parts, strict=True):
         nis[rows], dof[rows], worst[rows] = part.nis, part.dof, np.where(part.worst < 0, -1, part.worst + begin)
         H[end : end + len(part.H), 6 * begin :] = part.H
         end += len(part.H)
-    tracks = [rows[part.track] for (_, rows), part in zip(groups, parts, strict=True)]
-    return _Constrained(nis, dof, worst, H, np.concatenate([part.residuals for part in parts]), np.concatenate(tracks))
+    residuals = np.concatenate([part.residuals for part in parts])
+    tracks = np.concatenate([rows[part.track] for (_, rows), part in zip(groups, parts, strict=True)])
+    return TestedTracks(sightings, points, nis, dof, worst, H, residuals, tracks)
 
 
 def _by_first_pose(seen: BoolArray) -> Iterator[tuple[int, IntArray]]:
@@ -135,20 +138,9 @@ def _by_first_pose(seen: BoolArray) -> Iterator[tuple[int, IntArray]]:
         begin, rows = middle, rows[late]
 
 
-class _Constrained(NamedTuple):
-    """What :class:`TestedTracks` has of tracks beside their sightings and points."""
-
-    nis: Array
-    dof: IntArray
-    worst: IntArray
-    H: Array
-    residuals: Array
-    track: IntArray
-
-
 def _constrained(
     sightings: TrackSightings, points: Array, window: WindowPoses, rig: StereoRig, bounds: Array
-) -> _Constrained:
+) -> TestedTracks:
     """Free tracks of their landmarks (F, 3) and test them."""
     linearised = _linearised(sightings, points, window, rig)
     constraints = multiview.without_landmark(linearised, sightings)
@@ -165,7 +157,7 @@ def _constrained(
     used = H.any(axis=1)
     owner = np.repeat(below, constraints.H.shape[1])
     residuals = constraints.residuals[below].reshape(-1)
-    return _Constrained(nis, constraints.dof, worst, H[used], residuals[used], owner[used])
+    return TestedTracks(sightings, points, nis, constraints.dof, worst, H[used], residuals[used], owner[used])
 
 
 def _linearised(
