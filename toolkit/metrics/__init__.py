@@ -133,7 +133,8 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
     """
     files = _found().files
     known = [metric for file in files for metric in file.METRICS]
-    by_name = {name: (metric,) for metric in known for name in (metric.column, metric.name, metric.key)}
+    by_name = {metric.column: (metric,) for metric in known} | {metric.name: (metric,) for metric in known}
+    by_name |= {metric.key: (metric,) for metric in known}
     by_name |= {file.GROUP: file.METRICS for file in files if hasattr(file, "GROUP")}
     chosen = tuple(names)
     for name in chosen:
