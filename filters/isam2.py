@@ -97,9 +97,9 @@ class Isam2:
             self._builder.learn(k, np.array([poses.atPose3(X(i)).matrix() for i in (k, k + 1)]))
 
     def _relinearise(self, in_view: dict[int, Array], estimate: Estimate) -> None:
-        """Mark the landmarks in view (3,) m, refused or not, that are no longer where they are linearised.
+        """Mark the landmarks (3,) m in view, refused or not, that are no longer where they are linearised.
 
-        They come by ascending track.
+        ``in_view`` is in ascending order of track ids.
         """
         keys, now = landmark_keys(in_view), np.array(list(in_view.values())).reshape(-1, 3)
         rows = np.flatnonzero(linearised_badly(now, self._tree.linearised_at(keys), estimate.T_world_imu, self._rig))

@@ -57,7 +57,7 @@ class OutlierCheck:
         """Return the state where a frame puts it, and the frame without what is an outlier there.
 
         ``expected`` is the state as predicted, its covariance that of its motion relative to the map, ``share`` what
-        sightings count for. What the motion is off by is none of the check's business any more.
+        sightings count for. There the error of the motion no longer enters the gate.
         """
         known = _KnownSightings.of(frame, points)
         there = _aligned(expected, known, self.rig, share)
