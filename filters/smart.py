@@ -20,6 +20,7 @@ import numpy as np
 from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.thinning import Thinned
 from filters.smoothing.discounted_tracks import DiscountedTracks
+from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera
 from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
@@ -49,7 +50,7 @@ class Smart:
         outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
         self._tracks, self._camera = DiscountedTracks(setup), RobustCamera.of(setup.rig, outliers.smoother_huber)
-        self._outlier_check = OutlierCheck(setup.rig, outliers)
+        self._outlier_check, self._landmarks = OutlierCheck(setup.rig, outliers), KnownLandmarks(setup.rig)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._predicted = self._motion.initial_belief(setup.prior)
         self._noise = MatchedNoise.of(setup)
@@ -91,10 +92,10 @@ class Smart:
         if packet.motion is None:
             return self._started(packet)
         increment = self._motion.integrate(packet.motion, self._belief.bias)
-        prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
+        prediction = increment.predict(self._belief)
         expected = relative_to_its_map(self._belief).predicted(prediction)
         # The state begins as predicted: the solver iterates.
-        _, sound = self._outlier_check.placed(expected, packet.frame, points, self._tracks.share)
+        _, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks, self._tracks.share)
         self._belief = self._predicted = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
@@ -123,8 +124,11 @@ class Smart:
         stamps_ns = [s.t_ns for s in self._states[first:]] + [packet.frame.t_ns]
         self._states[first:] = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
         self._complete([len(window.keys) - 1])
-        self._points |= self._tracked.points_by_id()
+        points = self._tracked.points_by_id()
+        self._points |= points
         self._belief = self._belief.at(self._states[-1])
+        self._landmarks.keep(points)
+        self._landmarks.see(self._tracked.newest(packet.frame), points, self._belief.T_world_imu, self._tracks.share)
         self._noise.learn(packet.frame.t_ns, self._predicted, self._belief)
 
     def _complete(self, places: Iterable[int]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.discounted_tracks import DiscountedTracks, discounted_past, seen_often
+from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, RefusedTracks, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
@@ -68,7 +69,7 @@ class GraphBuilder:
             self._bridge = gap_bridge_for(setup.noise, setup.settings.window.seconds(setup.motion_kind))
         self._refused_tracks = RefusedTracks(setup.rig, outliers.gate_probability)
         self._refused: tuple[StereoFrame, BoolArray] | None = None
-        self._points: dict[int, Array] = {}
+        self._landmarks = KnownLandmarks(setup.rig)
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
         self._noise, self._predicted = MatchedNoise.of(setup), self.belief
@@ -77,7 +78,7 @@ class GraphBuilder:
         """Return what a packet adds, the new state being predicted from the latest known."""
         extension = GraphExtension()
         expected = self._add_state(self._noise.applied(packet), extension)
-        there, sound = self._outlier_check.placed(expected, packet.frame, self._points, self._tracks.share)
+        there, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks, self._tracks.share)
         if self._begins_there:
             self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
         self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
@@ -95,11 +96,12 @@ class GraphBuilder:
         self._noise.learn(newest.t_ns, self._predicted, self.belief)
         if self._bridge is not None:
             self._bridge.learn(newest.T_world_imu)
-        self._points.update(points)
+        self._landmarks.move(points)
 
     def learn(self, k: int, T_world_imu: Array) -> None:
         """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
-        points = {i: self._points[i] for i in seen_often(self._used.values()) if i in self._points}
+        known = self._landmarks.points
+        points = {i: known[i] for i in seen_often(self._used.values()) if i in known}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
 
     @property
@@ -145,8 +147,7 @@ class GraphBuilder:
     def forget(self, landmark_ids: set[int]) -> None:
         """Drop landmarks that have left the graph; seen again, they start anew."""
         self._refused_tracks.forget(landmark_ids)
-        for i in landmark_ids:
-            self._points.pop(i, None)
+        self._landmarks.forget(landmark_ids)
 
     def _add_state(self, packet: Packet, extension: GraphExtension) -> Belief:
         """Add the new state; return it as expected against the map."""
@@ -167,11 +168,12 @@ class GraphBuilder:
 
     def _add_sightings(self, frame: StereoFrame, k: int, extension: GraphExtension) -> None:
         near = stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX
-        known = np.array([i in self._points for i in frame.track_ids.tolist()], dtype=bool)
+        known = self._landmarks.among(frame.track_ids.tolist())
         used = frame.select(known | near)
         new = frame.select(~known & near)
         points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._rig)
-        for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
+        placed = dict(zip(new.track_ids.tolist(), points, strict=True))
+        for track_id, point in placed.items():
             extension.values.insert(L(track_id), point)
         if self._rig.track_noise is not None:
             extension.chained = used, k
@@ -180,7 +182,7 @@ class GraphBuilder:
                 extension.factors.add(factor)
         self._used[k] = used
         extension.landmark_ids = used.track_ids.tolist()
-        self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))
+        self._landmarks.see(used, placed, self.belief.T_world_imu, self._tracks.share)
 
     def _factors(self) -> StereoFactors:
         """Return what makes factors of sightings that count for what they are known to count for now."""

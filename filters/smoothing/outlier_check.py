@@ -10,12 +10,13 @@ more sightings of its track are refused than were taken, and these agree with ea
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 
+from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.robust_loss import Cauchy
 from toolkit.geometry import Array, BoolArray, se3_exp, se3_inverse, transform
 from toolkit.models import left_only, stereo
@@ -52,32 +53,33 @@ class OutlierCheck:
     policy: Outliers
 
     def placed(
-        self, expected: Belief, frame: StereoFrame, points: Mapping[int, Array], share: float = 1.0
+        self, expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, share: float = 1.0
     ) -> tuple[Belief, StereoFrame]:
         """Return the state where a frame puts it, and the frame without what is an outlier there.
 
         ``expected`` is the state as predicted, its covariance that of its motion relative to the map, ``share`` what
         sightings count for. There the error of the motion no longer enters the gate.
         """
-        known = _KnownSightings.of(frame, points)
+        known = _KnownSightings.of(frame, landmarks)
         there = _aligned(expected, known, self.rig, share)
         return there, frame.select(~self._outliers(known, relative_to_its_map(there)))
 
-    def outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> BoolArray:
-        """Say which sightings (N,) of a frame are not of the landmarks (3,) m that their tracks have.
+    def outliers(self, frame: StereoFrame, landmarks: KnownLandmarks, expected: Belief) -> BoolArray:
+        """Say which sightings (N,) of a frame are not of the landmarks that their tracks have.
 
-        ``expected`` is the state as predicted, its covariance that of its motion relative to the map. A landmark counts
-        as known as well as one sighting from here would tell. A sighting of an unknown landmark is no outlier. Where
-        most are outliers the state is wrong, and none is returned.
+        ``expected`` is the state as predicted, its covariance that of its motion relative to the map. A sighting of an
+        unknown landmark is no outlier. Where most are outliers the state is wrong, and none is returned.
         """
-        return self._outliers(_KnownSightings.of(frame, points), expected)
+        return self._outliers(_KnownSightings.of(frame, landmarks), expected)
 
     def _outliers(self, known: "_KnownSightings", expected: Belief) -> BoolArray:
         if not len(known.points):
             return known.rows
         predicted, uvs_px = stereo.predict(known.points, expected.T_world_imu, self.rig), known.uvs_px
-        H = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
-        covs_px2 = 2.0 * left_only.noise_px2(uvs_px, self.rig) + H @ expected.cov[POSE, POSE] @ np.swapaxes(H, 1, 2)
+        by_pose = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        by_point = left_only.seen_rows(uvs_px, predicted.d_uv_d_point)
+        covs_px2 = left_only.noise_px2(uvs_px, self.rig) + _carried(by_pose, expected.cov[POSE, POSE])
+        covs_px2 = covs_px2 + _carried(by_point, known.covs)
         dof = left_only.degrees_of_freedom(uvs_px)
         bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
         far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
@@ -89,18 +91,20 @@ class OutlierCheck:
 
 
 class _KnownSightings(NamedTuple):
-    """Which of a frame's sightings (N,) are of known landmarks, these (n, 3) px, and the landmarks (n, 3) m."""
+    """Which of a frame's sightings (N,) are of known landmarks, these (n, 3) px, and the landmarks.
+
+    ``points`` (n, 3) are in m, ``covs`` (n, 3, 3) in m^2.
+    """
 
     rows: BoolArray
     uvs_px: Array
     points: Array
+    covs: Array
 
     @classmethod
-    def of(cls, frame: StereoFrame, points: Mapping[int, Array]) -> Self:
-        found = [points.get(i) for i in frame.track_ids.tolist()]
-        rows = np.array([point is not None for point in found], dtype=bool)
-        known = np.array([point for point in found if point is not None]).reshape(-1, 3)
-        return cls(rows, frame.uvs_px[rows], known)
+    def of(cls, frame: StereoFrame, landmarks: KnownLandmarks) -> Self:
+        rows = landmarks.among(frame.track_ids.tolist())
+        return cls(rows, frame.uvs_px[rows], *landmarks.of(frame.track_ids[rows].tolist()))
 
 
 class _Refused(NamedTuple):
@@ -146,15 +150,20 @@ class RefusedTracks:
         return {i for i, sightings in least if self._refused[i].sightings >= sightings}
 
 
+def _carried(H: Array, cov: Array) -> Array:
+    """Return what a covariance, one or one each, comes to in images by Jacobians (n, 3, d): (n, 3, 3) px^2."""
+    return np.asarray(H @ cov @ np.swapaxes(H, 1, 2))
+
+
 def aligned(
-    expected: Belief, frame: StereoFrame, points: Mapping[int, Array], rig: StereoRig, share: float = 1.0
+    expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, rig: StereoRig, share: float = 1.0
 ) -> Belief:
-    """Return the belief at the pose that a frame's sightings of points (3,) m and the expected pose agree on.
+    """Return the belief at the pose that a frame's sightings of known landmarks and the expected pose agree on.
 
     Each sighting counts for a share of what it tells by itself, with the noise of the pixels; what is far is so by all
     of it. The covariance stays as it is.
     """
-    return _aligned(expected, _KnownSightings.of(frame, points), rig, share)
+    return _aligned(expected, _KnownSightings.of(frame, landmarks), rig, share)
 
 
 def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig, share: float) -> Belief:

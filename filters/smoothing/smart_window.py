@@ -104,6 +104,12 @@ class TrackedWindow:
         )
         return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
 
+    def newest(self, frame: StereoFrame) -> StereoFrame:
+        """Return of the frame of the newest state what is in the window."""
+        seen = self.window.sightings
+        taken = self.track_ids[seen.point[seen.pose == len(self.window.keys) - 1]]
+        return frame.select(np.isin(frame.track_ids, taken))
+
     def compacted(self) -> "TrackedWindow":
         """Let the points go that nothing sees any more."""
         seen = self.window.sightings

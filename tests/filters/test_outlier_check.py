@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from toolkit.geometry import se3, se3_inverse
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet, Sequence
+from toolkit.sequence import Packet, Sequence, StereoFrame
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
-POLICY = POLICIES["classic"]
+POLICY = POLICIES["robust"]
 CLEAN = replace(DRIVE, duration_s=20.0)
 MISMATCHED = replace(CLEAN, camera=replace(CLEAN.camera, outlier_rate=0.05, outlier_px=(20.0, 30.0)))
 
@@ -42,6 +43,13 @@ def landmarks_of(scenario: Scenario, seed: int) -> dict[int, np.ndarray]:
     return points
 
 
+def known(frame: StereoFrame, points: dict[int, np.ndarray], at: Belief, sequence: Sequence) -> KnownLandmarks:
+    """Return landmarks as well known as one sighting in a frame, from a state, would tell."""
+    landmarks, seen = KnownLandmarks(sequence.rig), frame.select(np.isin(frame.track_ids, list(points)))
+    landmarks.see(seen, points, at.T_world_imu, share=1.0)
+    return landmarks
+
+
 def test_errors_of_twenty_pixels_are_distinguished_from_sound_sightings():
     """Which sightings are wrong is known because their stream of randomness moves no other."""
     sequence = simulate(MISMATCHED, 3)
@@ -51,9 +59,8 @@ def test_errors_of_twenty_pixels_are_distinguished_from_sound_sightings():
     caught = missed = accused = sound = 0
     for packet, expected in expected_states(sequence):
         ids = packet.frame.track_ids.tolist()
-        found = OutlierCheck(sequence.rig, POLICY).outliers(
-            packet.frame, {i: points[i] for i in before & set(ids)}, expected
-        )
+        landmarks = known(packet.frame, {i: points[i] for i in before & set(ids)}, expected, sequence)
+        found = OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, landmarks, expected)
         for i, is_outlier in zip(ids, found.tolist(), strict=True):
             if i in before and (packet.index, i) in wrong:
                 caught, missed = caught + is_outlier, missed + (not is_outlier)
@@ -73,7 +80,8 @@ def test_a_wrong_state_blames_no_track(scenario):
     sequence, points = simulate(scenario, 0), landmarks_of(scenario, 0)
     packet, expected = expected_states(sequence)[2]
     beside = replace(expected, T_world_imu=expected.T_world_imu @ se3(np.eye(3), np.array([0.0, 1.0, 1.0])))
-    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, points, beside).any()
+    landmarks = known(packet.frame, points, expected, sequence)
+    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, landmarks, beside).any()
 
 
 def test_where_the_world_is_does_not_matter():
@@ -84,13 +92,15 @@ def test_where_the_world_is_does_not_matter():
     found = []
     for start in (sequence, replace(sequence, prior=vague)):
         packet, expected = expected_states(start)[20]
-        found.append(OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, points, relative_to_its_map(expected)))
+        landmarks, expected = known(packet.frame, points, expected, sequence), relative_to_its_map(expected)
+        found.append(OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, landmarks, expected))
     np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_a_sighting_of_an_unknown_landmark_is_no_outlier():
     sequence = simulate(MISMATCHED, 3)
     packet, expected = expected_states(sequence)[0]
-    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, {}, expected).any()
+    check, none = OutlierCheck(sequence.rig, POLICY), KnownLandmarks(sequence.rig)
+    assert not check.outliers(packet.frame, none, expected).any()
     moved = replace(expected, T_world_imu=se3_inverse(expected.T_world_imu))
-    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, {}, moved).any()
+    assert not check.outliers(packet.frame, none, moved).any()

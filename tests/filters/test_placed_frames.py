@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, aligned
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
@@ -35,6 +36,14 @@ def frame_and_points(off_px: np.ndarray) -> tuple[StereoFrame, dict[int, np.ndar
     return StereoFrame(0, IDS, uvs_px, np.zeros_like(IDS)), dict(zip(IDS.tolist(), points, strict=True))
 
 
+def known(points: dict[int, np.ndarray]) -> KnownLandmarks:
+    """Return landmarks as well known as one sighting from the origin tells."""
+    landmarks, ids = KnownLandmarks(RIG), np.array(list(points), dtype=np.int64)
+    uvs_px = stereo.predict(np.array(list(points.values())).reshape(-1, 3), np.eye(4), RIG).uv_px
+    landmarks.see(StereoFrame(0, ids, uvs_px, np.zeros_like(ids)), points, np.eye(4), share=1.0)
+    return landmarks
+
+
 def moved_px(T_world_imu: np.ndarray, points: dict[int, np.ndarray]) -> float:
     """Return how far the images from a pose are from those from the origin, the root of the mean square."""
     places = np.array(list(points.values()))
@@ -45,17 +54,17 @@ def moved_px(T_world_imu: np.ndarray, points: dict[int, np.ndarray]) -> float:
 def test_a_state_begins_where_its_sightings_put_it_though_the_motion_is_off_and_some_are_mismatched():
     """Noise of half a pixel on 40 points: a tenth of a pixel of the pose, where the motion is off by eight."""
     frame, points = frame_and_points(np.random.default_rng(2).uniform(20.0, 60.0, (10, 3)))
-    assert moved_px(aligned(expected(), frame, points, RIG).T_world_imu, points) < 0.3
+    assert moved_px(aligned(expected(), frame, known(points), RIG).T_world_imu, points) < 0.3
     alone = expected()
-    assert aligned(alone, frame, {}, RIG) is alone
+    assert aligned(alone, frame, known({}), RIG) is alone
 
 
 def test_what_moves_by_itself_is_an_outlier_though_the_motion_might_explain_it():
     """Eight tracks are off by twelve pixels, as on a car: within the gate of a motion that is uncertain by as many."""
     frame, points = frame_and_points(np.tile([12.0, 12.0, 0.0], (8, 1)))
-    check = OutlierCheck(RIG, POLICIES["classic"])
-    assert not check.outliers(frame, points, expected()).any()
-    there, sound = check.placed(expected(), frame, points)
+    check = OutlierCheck(RIG, POLICIES["robust"])
+    assert not check.outliers(frame, known(points), expected()).any()
+    there, sound = check.placed(expected(), frame, known(points))
     assert moved_px(there.T_world_imu, points) < 0.5
     np.testing.assert_array_equal(sound.track_ids, IDS[8:])
 
@@ -63,8 +72,8 @@ def test_what_moves_by_itself_is_an_outlier_though_the_motion_might_explain_it()
 def test_what_the_motion_leaves_open_is_no_outlier_where_no_other_track_denies_it():
     """One track, off by as many pixels as the motion may be: it may be the motion."""
     frame, points = frame_and_points(np.array([[12.0, 12.0, 0.0]]))
-    alone = {0: points[0]}
-    _, sound = OutlierCheck(RIG, POLICIES["classic"]).placed(expected(), frame, alone)
+    alone = known({0: points[0]})
+    _, sound = OutlierCheck(RIG, POLICIES["robust"]).placed(expected(), frame, alone)
     np.testing.assert_array_equal(sound.track_ids, IDS)
 
 
@@ -72,4 +81,4 @@ def test_a_state_that_is_certain_stays_where_it_is():
     """Sightings have nothing to say where the motion leaves no doubt."""
     frame, points = frame_and_points(np.empty((0, 3)))
     certain = replace(expected(), cov=np.zeros((9, 9)))
-    np.testing.assert_array_equal(aligned(certain, frame, points, RIG).T_world_imu, OFF)
+    np.testing.assert_array_equal(aligned(certain, frame, known(points), RIG).T_world_imu, OFF)

@@ -1,0 +1,72 @@
+"""Where an incremental smoother has its landmarks, and how well their sightings so far tell where that is.
+
+A landmark seen once, far away, is expected within many pixels of where it will be seen from near by; one seen often,
+within a fraction of one. Poses are taken for certain, for a landmark and what sees it share their error.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from toolkit.geometry import Array, BoolArray
+from toolkit.models import left_only, stereo
+from toolkit.sequence import StereoFrame, StereoRig
+
+
+class KnownLandmarks:
+    """Points (3,) m in the world by track id, and of each the information (3, 3) 1/m^2 of its sightings."""
+
+    def __init__(self, rig: StereoRig) -> None:
+        self._rig = rig
+        self._points: dict[int, Array] = {}
+        self._information: dict[int, Array] = {}
+
+    def __contains__(self, track_id: int) -> bool:
+        """Say whether a track has a landmark."""
+        return track_id in self._points
+
+    @property
+    def points(self) -> Mapping[int, Array]:
+        """Return all of them."""
+        return self._points
+
+    def among(self, track_ids: Iterable[int]) -> BoolArray:
+        """Say which of some tracks (N,) have a landmark."""
+        return np.array([i in self._points for i in track_ids], dtype=bool)
+
+    def see(self, frame: StereoFrame, placed: Mapping[int, Array], T_world_imu: Array, share: float) -> None:
+        """Take in the sightings of a frame from a pose (4, 4), of landmarks that are known or ``placed`` here.
+
+        Each counts for a share in (0, 1] of what its noise leaves it. Where noise of tracks is stated, errors are taken
+        along from sighting to sighting, and the newest alone tells how far a landmark is from the next.
+        """
+        if not frame.track_ids.size:
+            return
+        ids = frame.track_ids.tolist()
+        points = [placed[i] if i in placed else self._points[i] for i in ids]
+        expected = stereo.predict(np.array(points), T_world_imu, self._rig)
+        H = left_only.whitener(frame.uvs_px, self._rig) @ left_only.seen_rows(frame.uvs_px, expected.d_uv_d_point)
+        for i, point, told in zip(ids, points, share * (np.swapaxes(H, 1, 2) @ H), strict=True):
+            before = self._information.get(i) if self._rig.track_noise is None else None
+            self._points[i], self._information[i] = point, told if before is None else before + told
+
+    def move(self, points: Mapping[int, Array]) -> None:
+        """Take over where landmarks are by now."""
+        self._points.update({i: point for i, point in points.items() if i in self._points})
+
+    def keep(self, points: Mapping[int, Array]) -> None:
+        """Take over where landmarks are by now, and drop all others."""
+        self.forget([i for i in self._points if i not in points])
+        self.move(points)
+
+    def forget(self, track_ids: Iterable[int]) -> None:
+        """Drop landmarks; seen again, they start anew."""
+        for i in track_ids:
+            self._points.pop(i, None)
+            self._information.pop(i, None)
+
+    def of(self, track_ids: Iterable[int]) -> tuple[Array, Array]:
+        """Return the points (n, 3) m of some known tracks and the covariances (n, 3, 3) m^2 of their errors."""
+        ids = list(track_ids)
+        points = np.array([self._points[i] for i in ids]).reshape(-1, 3)
+        return points, np.linalg.inv(np.array([self._information[i] for i in ids]).reshape(-1, 3, 3))
