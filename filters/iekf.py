@@ -32,13 +32,17 @@ from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.joint_landmarks import LandmarkSightings
 from filters.kalman.linearisation import AtLatestEstimates, Linearisation
 from filters.kalman.online_output import OnlineOutput
+from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.sequence import StereoFrame, StereoRig
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"
-RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
+RULES = {
+    "tracks": "a landmark in its state has no state for the error of its track",
+    "match_tracks": ("imu",),
+}
 # In standard deviations of what is known after the update.
 NEGLIGIBLE_STEP = 1e-4
 MOST_STEPS, MOST_HALVINGS = 10, 6
@@ -47,7 +51,8 @@ MOST_STEPS, MOST_HALVINGS = 10, 6
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
-    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct))
+    correlation = LandmarkCorrelation.of(setup) if setup.motion_kind == "imu" else None
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct, correlation))
 
 
 class Iterate(NamedTuple):

@@ -119,14 +119,21 @@ def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
 def test_a_module_says_which_common_rules_it_treats_otherwise(package):
     write(package, "says.py", 'RULES = {"window": "it keeps all", "bridge_gaps": True}')
     write(package, "silent.py", "")
-    says, silent = find("says"), find("silent")
+    write(package, "parts.py", 'RULES = {"match_tracks": ("imu",)}')
+    says, silent, parts = find("says"), find("silent"), find("parts")
+    assert parts.obeys("match_tracks", "imu")
+    assert not parts.obeys("match_tracks", "twist")
+    assert not parts.obeys("match_tracks")
     assert {rule for rule in RULES if says.obeys(rule)} == {"outliers", "tracks", "bridge_gaps"}
     assert says.ignores() == {"window": "it keeps all"}
     assert {rule for rule in RULES if silent.obeys(rule)} == {"outliers", "tracks", "window"}
     assert not silent.ignores()
 
 
-@pytest.mark.parametrize("rules", ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '("window",)'])
+@pytest.mark.parametrize(
+    "rules",
+    ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '{"window": ("car",)}', '("window",)'],
+)
 def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(package, rules):
     write(package, "odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
     with pytest.raises(EstimatorError, match=r"odd: RULES in odd.py maps some of outliers, .* to True"):

@@ -5,7 +5,8 @@ a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its do
 ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the ladder, in which every
 rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared where no estimator is
 named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` lists the common rules below for which it differs
-from the default: True where it obeys a rule, else the reason why not; ``CITES`` is what ``vislam cite`` prints for it,
+from the default: True where it obeys a rule, the kinds of motion beside which it does, as ``("imu",)``, or the reason
+why it does not; ``CITES`` is what ``vislam cite`` prints for it,
 keys of toolkit/report/references.bib or BibTeX itself.
 """
 
@@ -19,7 +20,7 @@ from toolkit.discovery import FoundModule, MissingDependency, announced
 from toolkit.errors import EstimatorError, no_such
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
-from toolkit.measured_motion import MotionKind, MotionNoise
+from toolkit.measured_motion import MOTION_KINDS, MotionKind, MotionNoise
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, StereoRig
 from toolkit.settings import DEFAULTS, Scalar, Settings
@@ -102,23 +103,22 @@ class EstimatorEntry:
         options = self.found.constants().get("OPTIONS", ())
         return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
 
-    def obeys(self, rule: str) -> bool:
-        """Say whether the estimator obeys a common rule, one of :data:`RULES`."""
-        return self._rules().get(rule, RULES[rule]) is True
+    def obeys(self, rule: str, motion_kind: MotionKind | None = None) -> bool:
+        """Say whether the estimator obeys a common rule, one of :data:`RULES`, beside a kind of motion or any."""
+        says = self._rules().get(rule, RULES[rule])
+        return motion_kind in says if isinstance(says, tuple) else says is True
 
     def ignores(self) -> Mapping[str, str]:
         """Return the common rules that the estimator does not obey although most do, and why."""
         return {rule: why for rule, why in self._rules().items() if isinstance(why, str)}
 
-    def _rules(self) -> Mapping[str, bool | str]:
+    def _rules(self) -> Mapping[str, bool | str | tuple[str, ...]]:
         rules = self.found.constants().get("RULES", {})
         declared = rules if isinstance(rules, dict) else {"": False}
-        if not all(
-            rule in RULES and (what is True or (what and isinstance(what, str))) for rule, what in declared.items()
-        ):
+        if not all(rule in RULES and _is_said_of_a_rule(what) for rule, what in declared.items()):
             raise EstimatorError(
                 f"estimator {self.name}: RULES in {self.found.path.name} maps some of {', '.join(RULES)} to True, "
-                "or to the reason why the estimator does not obey it"
+                f"to kinds of motion ({', '.join(MOTION_KINDS)}), or to the reason why the estimator does not obey it"
             )
         return declared
 
@@ -152,6 +152,12 @@ class EstimatorEntry:
         if not callable(getattr(module, "build", None)):
             raise EstimatorError(f"estimator {self.name}: {self.found.path.name} defines no function build(setup)")
         return cast(Build, module.build)
+
+
+def _is_said_of_a_rule(what: object) -> bool:
+    if isinstance(what, tuple):
+        return bool(what) and set(what) <= set(MOTION_KINDS)
+    return what is True or (isinstance(what, str) and bool(what))
 
 
 def discover() -> dict[str, EstimatorEntry]:

@@ -5,7 +5,7 @@ There are three kinds: measured body twists, the samples of an IMU, and no measu
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, get_args
 
 import numpy as np
 
@@ -188,6 +188,7 @@ def with_noise_scaled(motion: Motion, variance: float) -> Motion:
 
 
 MotionKind = Literal["twist", "imu", "none"]
+MOTION_KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
     (TwistSamples, TwistNoise, "twist"),
     (ImuSamples, ImuNoise, "imu"),

@@ -32,3 +32,10 @@ def poses(name: str, sequence: Sequence, noise: Noise) -> Array:
 def test_correlated_tracks_count_for_less_in_those_estimators_that_say_so(name: str, realistic: Sequence) -> None:
     apart = poses(name, realistic, Noise()) - poses(name, realistic, Noise(match_tracks=False))
     assert (np.abs(apart).max() > 1e-6) == find(name).obeys("match_tracks")
+
+
+@pytest.mark.parametrize("name", ["riekf", "iekf"])
+def test_beside_an_imu_they_count_for_less_in_those_that_obey_there_alone(name: str) -> None:
+    flown = simulate(replace(SCENARIOS["flight-realistic"], duration_s=1.0), 3)
+    assert np.abs(poses(name, flown, Noise()) - poses(name, flown, Noise(match_tracks=False))).max() > 1e-6
+    assert find(name).obeys("match_tracks", "imu")

@@ -284,7 +284,7 @@ def _comparison(
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
         white={} if sequence.rig.track_noise is None else _taken_for_white(entries),
-        lacking=lacking(entries, plan.settings.noise, decisive_parts(case.prepared)),
+        lacking=lacking(entries, plan.settings.noise, case.prepared),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
@@ -297,17 +297,20 @@ def _taken_for_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
 
-def lacking(
-    entries: Mapping[str, EstimatorEntry], noise: Noise, decisive: frozenset[str]
-) -> dict[str, tuple[str, ...]]:
+def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, prepared: Prepared) -> dict[str, tuple[str, ...]]:
     """Return, for each optional part of the noise model that is requested and matters, the estimators without it."""
+    motion_kind, decisive = prepared.sequence.motion_kind, decisive_parts(prepared)
     requested = {
         "disparity_scale": noise.disparity_scale is not None,
         "bridge_gaps": noise.bridge_gaps,
         "match_tracks": noise.match_tracks,
     }
-    parts = {part: tuple(name for name, entry in entries.items() if not entry.obeys(part)) for part in requested}
-    return {part: names for part, names in parts.items() if requested[part] and part in decisive and names}
+    in_question = [part for part, is_requested in requested.items() if is_requested and part in decisive]
+    parts = {
+        part: tuple(name for name, entry in entries.items() if not entry.obeys(part, motion_kind))
+        for part in in_question
+    }
+    return {part: names for part, names in parts.items() if names}
 
 
 def decisive_parts(prepared: Prepared) -> frozenset[str]:
