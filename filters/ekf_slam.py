@@ -25,7 +25,7 @@ from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
-RUNG, CHANGE = 30, "+ cross-covariances, first estimates or anew, inverse depth, share, matched; no loss"
+RUNG, CHANGE = 30, "+ cross-covariances, first estimates or anew, inverse depth, share, matched"
 RULES = {"tracks": "a landmark in its state has no state for the error of its track", "match_tracks": True}
 
 # Of its distance, by which a landmark may have moved since its first estimate beside an IMU.

@@ -29,7 +29,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 90, "+ relinearisation; sightings kept at once; all landmarks; gate x 4 once placed, loss"
+RUNG, CHANGE = 90, "+ relinearisation; sightings kept at once; all landmarks; each gated once placed"
 RULES = {"bridge_gaps": True, "match_tracks": True}
 
 

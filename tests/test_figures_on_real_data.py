@@ -12,9 +12,12 @@ from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.estimate import Output, Run
+from toolkit.geometry import Array
 from toolkit.initialization import start_from_measurements
-from toolkit.metrics import score_run
+from toolkit.jackknife import jackknife_error
+from toolkit.metrics import Evaluation, score_run
 from toolkit.sequence import Prior, Sequence
+from toolkit.settings import Noise, Settings
 
 
 class Case(NamedTuple):
@@ -104,13 +107,37 @@ def test_on_03_the_filter_finds_the_gyro_bias(dataset_03, run_on):
     assert_gyro_bias_of_03(run_on("ekf", dataset_03))
 
 
-def test_on_03_the_smoother_is_no_worse_than_the_filter_and_finds_the_bias_too(dataset_03, run_on):
-    """One test, for the run takes ten seconds and workers do not share it."""
+def held_out_px(run: Run, case: Case) -> Array:
+    """Return the errors (N,) px of the sightings of withheld tracks by a run's final poses, in the order of time."""
+    assert run.status == "ok", run.log
+    rows, errors_px = Evaluation(run, "final", case.sequence).held_out_errors
+    return errors_px[np.argsort(case.sequence.held_out.frame[rows], kind="stable")]
+
+
+def more_px(one_px: Array, other_px: Array) -> float:
+    """Return by how much the median of some errors is above that of others, of the same sightings."""
+    return float(np.median(one_px) - np.median(other_px))
+
+
+def test_on_03_the_smoother_told_what_the_filter_is_told_is_better_and_finds_the_bias_too(
+    dataset_03, run_on, run_estimator
+):
+    """The filter counts all tracks in full. One test, for the run takes ten seconds and workers do not share it."""
+    told = Settings(noise=Noise(match_tracks=False))
+    smoothed = run_estimator("batch", dataset_03.sequence, dataset_03.prior, settings=told)
+    assert_gyro_bias_of_03(smoothed)
+    assert more_px(held_out_px(smoothed, dataset_03), held_out_px(run_on("ekf", dataset_03), dataset_03)) < -0.01
+
+
+def test_on_03_the_smoother_is_no_worse_than_the_filter_beyond_chance_and_finds_the_bias_too(dataset_03, run_on):
+    """Tracks count for a ninth there, and a motion that errs for seconds for as much more.
+
+    Over eight draws of the withheld tracks the smoother has 0.0006 +- 0.0028 px more than the filter.
+    """
     smoothed = run_on("batch", dataset_03)
     assert_gyro_bias_of_03(smoothed)
-    (smoother_px,) = scored(smoothed, dataset_03, "final", HELD_OUT)
-    (filter_px,) = scored(run_on("ekf", dataset_03), dataset_03, "final", HELD_OUT)
-    assert smoother_px <= filter_px
+    errors_px = held_out_px(smoothed, dataset_03), held_out_px(run_on("ekf", dataset_03), dataset_03)
+    assert more_px(*errors_px) < 2.0 * jackknife_error(more_px, *errors_px)
 
 
 def test_a_recording_without_features_is_dead_reckoned(prepare, run_on):

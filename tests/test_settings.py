@@ -9,7 +9,16 @@ import pytest
 from scipy.special import chdtri
 
 from toolkit import settings
-from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, describe, settings_of, with_assignments
+from toolkit.settings import (
+    DEFAULTS,
+    POLICIES,
+    Settings,
+    SettingsError,
+    as_values,
+    describe,
+    settings_of,
+    with_assignments,
+)
 
 
 def test_every_setting_is_described_with_its_default() -> None:
@@ -80,9 +89,18 @@ def test_a_file_that_is_not_toml_is_refused_with_its_place(tmp_path: Path) -> No
         settings.read_toml(tmp_path / "absent.toml")
 
 
-def test_the_smoothers_threshold_is_the_filters_gate_as_a_length() -> None:
-    gate = float(np.sqrt(chdtri(3, 1.0 - DEFAULTS.outliers.gate_probability)))
-    assert DEFAULTS.outliers.smoother_huber == gate
+def test_the_smoothers_threshold_is_under_the_classic_policy_the_filters_gate_as_a_length() -> None:
+    classic = POLICIES["classic"]
+    assert classic.gate_probability is not None
+    assert classic.smoother_huber == float(np.sqrt(chdtri(3, 1.0 - classic.gate_probability)))
+
+
+def test_by_default_all_estimators_obey_one_gate_and_one_loss() -> None:
+    outliers = DEFAULTS.outliers
+    assert outliers.smoother_gate_factor == 1.0
+    assert outliers.joint_huber == outliers.filter_huber == outliers.smoother_huber == outliers.batch_huber
+    assert outliers.gate_probability is not None and outliers.batch_cut_probability is not None
+    assert 1.0 - outliers.batch_cut_probability == outliers.gate_probability
 
 
 def test_settings_cannot_be_changed() -> None:

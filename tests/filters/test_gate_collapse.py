@@ -1,4 +1,8 @@
-"""Where the gate of the decoupled filter collapses its run is diverged, and no other rung is."""
+"""Where the gate of the decoupled filter collapses its run is diverged, and no other rung is.
+
+A gate at 95 % refuses what a state is off by as soon as its covariance is a little too small, and without corrections
+the state runs off: the policy by default, at 99.9 %, spares the same filter that on the same recording.
+"""
 
 from dataclasses import replace
 
@@ -8,6 +12,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import score_run
+from toolkit.settings import POLICIES, Settings
 from toolkit.simulation import FLIGHT, simulate
 
 # A hand-held rig as they are: biases unknown before the start and drifting fast, few tracks that end soon.
@@ -29,10 +34,16 @@ def recording():
 
 
 def test_the_decoupled_filter_that_ran_off_is_reported_to_have_diverged(recording, run_estimator):
-    run = run_estimator("ekf", recording)
+    run = run_estimator("ekf", recording, settings=Settings(outliers=POLICIES["classic"]))
     assert score_run(run, "causal", recording, only=["ate_yaw_m"]).values["ate_yaw_m"] > 1.0
     assert run.status == "diverged"
     assert "passed its own gate: its covariance does not cover its error" in run.log[-1]
+
+
+def test_it_does_not_run_off_behind_a_gate_that_passes_what_chance_makes(recording, run_estimator):
+    run = run_estimator("ekf", recording)
+    assert run.status == "ok"
+    assert score_run(run, "causal", recording, only=["ate_yaw_m"]).values["ate_yaw_m"] < 0.3
 
 
 @pytest.mark.parametrize(

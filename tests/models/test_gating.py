@@ -5,7 +5,6 @@ import pytest
 from scipy import integrate, stats
 
 from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared, mean_below_bound
-from toolkit.settings import DEFAULTS
 
 HUBER = 1.5
 
@@ -14,11 +13,6 @@ def test_the_bound_is_the_textbooks_quantile():
     """Abramowitz & Stegun, table 26.8: 95 % of three degrees of freedom, 99.9 % of six."""
     assert chi2_bound(3, 0.95) == pytest.approx(7.81473, abs=5e-6)
     assert chi2_bound(np.array([6]), 0.999) == pytest.approx([22.458], abs=5e-4)
-
-
-def test_the_smoothers_huber_threshold_is_the_length_at_the_filters_gate():
-    outliers = DEFAULTS.outliers
-    assert outliers.smoother_huber == pytest.approx(np.sqrt(chi2_bound(3, outliers.gate_probability)), rel=1e-12)
 
 
 def test_the_bound_passes_95_percent_of_gaussian_innovations():

@@ -94,7 +94,7 @@ def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimato
         return checked.verdict
 
     assert mark(95.0) == "timid"
-    assert mark(76.0) == "heavy-tailed"
+    assert mark(88.0) == "heavy-tailed"
 
 
 def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(
@@ -135,7 +135,7 @@ def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Compari
         reported = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
         return [line for line in note_lines(reported) if "outlier gate" in line]
 
-    assert words(81.0) == []
+    assert words(91.0) == []
     (line,) = words(55.0)
     assert "steady 45 %" in line
     assert "calibration, time stamps or noise" in line

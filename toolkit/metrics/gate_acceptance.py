@@ -13,9 +13,10 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 ORDER = 72
 CAUSAL_ONLY = INNOVATIONS_ARE_CAUSAL
 ACCEPTED = "gate_accepted_percent"
-# In 258 sound simulated runs of all estimators no gate accepted less than 85 %; on real course files and drives, where
-# errors of tracks are not white, gates accept 40 to 96 %. Chosen by looking at these.
-_LEAST_USUAL_PERCENT = 80.0
+# In 254 sound simulated runs of all estimators no gate of 99.9 % accepted less than 93 %, and one of 95 % no less than
+# 85; on real recordings, where errors of tracks are not white, gates of 99.9 % accept 79 to 100 %. Chosen by looking at
+# these.
+_LEAST_USUAL_PERCENT = 90.0
 METRICS = (
     Metric(
         ACCEPTED,

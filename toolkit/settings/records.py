@@ -42,49 +42,48 @@ class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     policy: Annotated[PolicyName, _setting("the policy all of these are taken from, but for what is set by itself")] = (
-        "classic"
+        "robust"
     )
     gate_probability: Annotated[
         Probability | None, _setting("chi-square probability below which a measurement is accepted")
-    ] = 0.95
+    ] = 0.999
     smoother_gate_factor: Annotated[
         float, _setting("the incremental smoothers' gate, as a multiple of the filters'", ge=1.0)
-    ] = 4.0
-    joint_huber: Annotated[HuberThreshold, _setting("Huber threshold of the joint and the windowed filters")] = None
+    ] = 1.0
+    joint_huber: Annotated[HuberThreshold, _setting("Huber threshold of the joint and the windowed filters")] = 1.5
     filter_huber: Annotated[HuberThreshold, _setting("Huber threshold of the decoupled filters")] = 1.5
-    smoother_huber: Annotated[HuberThreshold, _setting("Huber threshold of the incremental smoothers")] = (
-        2.7954834829151074  # a 95 % gate of three degrees of freedom, as a length
-    )
+    smoother_huber: Annotated[HuberThreshold, _setting("Huber threshold of the incremental smoothers")] = 1.5
     batch_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's first solve")] = 1.5
     batch_cauchy: Annotated[HuberThreshold, _setting("Cauchy scale of batch's second solve")] = 2.0
     batch_cut_probability: Annotated[
         Probability | None, _setting("probability below which batch's last solve leaves a sighting out")
     ] = 1e-3
+    # Beyond the cut no sightings are left to weigh down, and a loss would weigh down sound ones.
     batch_last_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's last solve")] = None
 
 
-def _alike(policy: PolicyName, gate_probability: float | None, huber: float | None) -> Outliers:
-    """Return a policy with one gate and one loss for every estimator."""
-    return Outliers(
-        policy=policy,
-        gate_probability=gate_probability,
-        smoother_gate_factor=1.0,
-        joint_huber=huber,
-        filter_huber=huber,
-        smoother_huber=huber,
-        batch_huber=1.5 if gate_probability else huber,
-        batch_cauchy=2.0 if gate_probability else None,
-        batch_cut_probability=1.0 - gate_probability if gate_probability else None,
-        # Beyond the cut no sightings are left to weigh down, and a loss would weigh down sound ones.
-        batch_last_huber=None,
-    )
-
-
 POLICIES: Mapping[PolicyName, Outliers] = {
-    "robust": _alike("robust", 0.999, 1.5),
-    "gate": _alike("gate", 0.999, None),
-    "none": _alike("none", None, None),
-    "classic": Outliers(),
+    # One gate and one loss for every estimator.
+    "robust": Outliers(),
+    "gate": Outliers(policy="gate", joint_huber=None, filter_huber=None, smoother_huber=None),
+    "none": Outliers(
+        policy="none",
+        gate_probability=None,
+        joint_huber=None,
+        filter_huber=None,
+        smoother_huber=None,
+        batch_huber=None,
+        batch_cauchy=None,
+        batch_cut_probability=None,
+    ),
+    # Each estimator's own, as it was until there was one for all.
+    "classic": Outliers(
+        policy="classic",
+        gate_probability=0.95,
+        smoother_gate_factor=4.0,
+        joint_huber=None,
+        smoother_huber=2.7954834829151074,  # a 95 % gate of three degrees of freedom, as a length
+    ),
 }
 
 
