@@ -11,7 +11,6 @@ channels are wrong and not the extrinsic, and nothing is repaired. Velocities al
 against the signs of the small components.
 """
 
-import itertools
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -20,6 +19,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.alignment import alignment
+from toolkit.audit.parts.axes import MIRRORED, axes_named, right_handed_axes, signed_axes
 from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px
@@ -50,10 +50,6 @@ class Reading(NamedTuple):
     cause: str
     done: str
     other_m: Array
-
-
-# What a mirror image does to both: it turns the other way about two axes and moves the other way along one.
-MIRRORED = "; images that are mirrored look so too"
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -107,7 +103,7 @@ def _exchanged(alone: str) -> Symptom:
 
 def _readings(given: Array) -> tuple[Reading, ...]:
     """Return the extrinsic in all conventions: as given, the body's axes named otherwise, the camera's, inverted."""
-    place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in _right_handed_axes()[1:]]
+    place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
     as_given = Reading(given, _OWN, "", "", place_m)
     return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
 
@@ -172,23 +168,6 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple
     return here, f"; whether the camera is at {metres(here)}, as taken, or at {metres(other)}, turns do not tell"
 
 
-def _right_handed_axes() -> Array:
-    """Return the rotations (24, 3, 3) that map axes to axes, the identity first."""
-    signed = signed_axes()
-    return np.asarray(signed[np.linalg.det(signed) > 0.0])
-
-
-def signed_axes() -> Array:
-    """Return the matrices (48, 3, 3) that exchange and negate axes, the identity first."""
-    return np.stack(
-        [
-            np.eye(3)[list(order)] * np.array(signs)[:, None]
-            for order in itertools.permutations(range(3))
-            for signs in itertools.product((1.0, -1.0), repeat=3)
-        ]
-    )
-
-
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
     """Name the axes of an extrinsic that the gyro's channels are: its own ones, but where others are beyond doubt."""
     signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
@@ -206,12 +185,6 @@ def _costs(intervals: Intervals, candidates: Array) -> Array:
         v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
         costs = costs + cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
     return costs
-
-
-def axes_named(turn: Array) -> str:
-    """Return the axes (3, 3) that another three are, in words."""
-    largest = np.argmax(np.abs(turn), axis=1)
-    return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 
 
 def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:

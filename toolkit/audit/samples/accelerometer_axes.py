@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.calibration.mixed_axes import MIRRORED, axes_named, signed_axes
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.alignment import chained
+from toolkit.audit.parts.axes import MIRRORED, axes_named, signed_axes
 from toolkit.audit.parts.intervals import Intervals, interval_means
 from toolkit.audit.parts.robust import cauchy, mean_in_sigmas
 from toolkit.geometry import Array, IntArray, so3_exp
