@@ -9,9 +9,9 @@ import pytest
 
 from toolkit.audit import Audit, audit
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.parts.clocks import camera_offset
+from toolkit.audit.parts.clocks import camera_offset, change_of_offset
 from toolkit.audit.timing.clock_change import check
-from toolkit.audit.timing.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s, change_of_offset
+from toolkit.audit.timing.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

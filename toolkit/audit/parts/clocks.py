@@ -22,7 +22,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import CameraMotion
-from toolkit.resampling import NS_PER_S
+from toolkit.resampling import NS_PER_S, Pairing
 from toolkit.sequence import Sequence, Truth
 
 # Range of the search, and its step in intervals.
@@ -49,6 +49,13 @@ FEWEST = LEAST_INTERVALS + 10
 SLOPE_STEP = 0.1
 # Largest rate; beyond it, other stretches of a motion fit as well.
 MOST_RATE = 0.1
+# The offset changes between the halves beyond so many standard errors of the difference, and what sound recordings at
+# hand have beyond them (s): the halves of drives 14 ms at most, those of recordings beside an IMU 3 ms. Chosen with
+# them in view.
+CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
+# The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
+# k plus s times sample k + 1.
+LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 
 
 def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
@@ -140,6 +147,21 @@ def _share_apart(w_imu: Array, mean: Array) -> float:
     apart = apart - np.median(apart, axis=0)
     sound = (np.abs(apart) <= GROSS_SPREADS * spread(apart)).all(axis=1)
     return float(np.sum(apart[sound] ** 2) / max(np.sum(seen[sound] ** 2 + measured[sound] ** 2), 1e-300))
+
+
+def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
+    """Return by how much (s) the camera's offset changes between the halves; None where a half shows none."""
+    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    early = np.arange(len(w_imu)) < len(w_imu) // 2
+    first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
+    if first is None or second is None:
+        return None
+    return Scalar(second.value - first.value, float(np.hypot(first.error, second.error)))
+
+
+def least_change_s(sequence: Sequence, error_s: float) -> float:
+    """Return the least difference (s) of the halves' offsets, known to a standard error, that is none of chance."""
+    return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
 
 
 def is_stamped_at_frames(sequence: Sequence) -> bool:

@@ -8,10 +8,10 @@ that of the rotations.
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import CHANGE
+from toolkit.audit.parts.clocks import change_of_offset, least_change_s
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import self_calibration
-from toolkit.audit.timing.time_offset import change_of_offset, least_change_s
 
 # Where a change must be larger than this (s) to be seen, nothing is said.
 LARGEST_S = 0.1

@@ -14,7 +14,7 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.edits import keep_frames, keep_samples
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar
-from toolkit.audit.timing.time_order import NOT_A_TIME
+from toolkit.audit.parts.stamps import NOT_A_TIME
 from toolkit.geometry import Array, IntArray
 from toolkit.models.camera_motion import camera_motion
 from toolkit.resampling import NS_PER_S

@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import is_comparable
-from toolkit.audit.timing.time_gap import GAP_RATIO
+from toolkit.audit.parts.stamps import GAP_RATIO
 from toolkit.geometry import Array, IntArray
 from toolkit.measured_motion import ImuNoise, MotionNoise, MotionSamples, NoSamples, TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S, Bridges

@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import is_comparable
-from toolkit.audit.timing.time_gap import GAP_RATIO
+from toolkit.audit.parts.stamps import GAP_RATIO
 from toolkit.resampling import NS_PER_S
 
 # A vehicle turns and stops within so long (s); samples that come more rarely, and so much more rarely than frames, are

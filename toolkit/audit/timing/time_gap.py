@@ -9,13 +9,12 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.edits import keep_frames
+from toolkit.audit.parts.stamps import GAP_RATIO
 from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# A step this many times the usual one is a hole; one missing stamp makes 2, two make 3.
-GAP_RATIO = 3.5
-# Motion samples may be further apart than that (a dropped sample of a fast IMU) and still be interpolated.
+# Motion samples may be further apart than a usual gap (a dropped sample of a fast IMU) and still be interpolated.
 MOTION_GAP_S = 1.5
 
 

@@ -15,11 +15,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LATE
-from toolkit.audit.parts.clocks import camera_offset, is_stamped_at_frames
+from toolkit.audit.parts.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.parts.edits import keep_frames
-from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas
-from toolkit.audit.timing.twist_lag import LAG
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -32,10 +30,6 @@ SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
 DOUBTFUL_SIGMAS = 3.2
 # Between frames nothing of that can be told from the clock, and what the shift mends is either.
 LEAST_OFF_FRAMES = 0.25
-# The offset changes between the halves beyond so many standard errors of the difference, and what sound recordings at
-# hand have beyond them (s): the halves of drives 14 ms at most, those of recordings beside an IMU 3 ms. Chosen with
-# them in view.
-CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 # The velocities speak against a shift that explains them worse by so many standard errors. The halves and thirds of the
 # indoor recording whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a
 # simulated one, -0.1 at most. Chosen between these.
@@ -188,21 +182,6 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
         LEAST_TWIST_INTERVALS * step_s if is_stamped_at_frames(sequence) else max(LEAST_S, LEAST_OFF_FRAMES * step_s)
     )
     return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
-
-
-def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
-    """Return by how much (s) the camera's offset changes between the halves; None where a half shows none."""
-    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
-    early = np.arange(len(w_imu)) < len(w_imu) // 2
-    first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
-    if first is None or second is None:
-        return None
-    return Scalar(second.value - first.value, float(np.hypot(first.error, second.error)))
-
-
-def least_change_s(sequence: Sequence, error_s: float) -> float:
-    """Return the least difference (s) of the halves' offsets, known to a standard error, that is none of chance."""
-    return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
 
 
 def _shifted(sequence: Sequence, offset_s: float) -> Sequence:

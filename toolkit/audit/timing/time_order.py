@@ -4,12 +4,10 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.edits import keep_frames, keep_samples
+from toolkit.audit.parts.stamps import NOT_A_TIME
 from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
-
-# What a cast of NaN to int64 gives.
-NOT_A_TIME = np.iinfo(np.int64).min
 
 # A step forward that is so many times the usual one takes time back to where it was; a clock that jumped goes on with
 # fewer than two. So many stamps must follow, lest one that is out of place at the very end passes for a jump.

@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.clocks import LAG
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import BoolArray, IntArray
 from toolkit.measured_motion import TwistSamples
-from toolkit.resampling import Pairing
 from toolkit.sequence import Sequence
 
-LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 # The lag must be known to this and differ from the present pairing's by so many standard errors.
 LARGEST_ERROR = 0.1
 SIGMAS = 5.0
