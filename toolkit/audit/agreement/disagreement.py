@@ -9,13 +9,21 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
+from toolkit.audit.parts.ratios import (
+    FORCES,
+    MOST_FORCE_RATIO,
+    MOST_RATIO,
+    RATES,
+    SPEEDS,
+    force_ratio,
+    rotation_ratio,
+    speed_ratio,
+)
 from toolkit.audit.parts.robust import Scalar
-from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
-from toolkit.audit.samples.units import FORCES, RATES, SPEEDS
 
-# Ratios of the samples' speed, rate of rotation and specific force to what the camera and gravity say. Sound recordings
-# have speeds of 0.96 to 1.02; the noise of the camera's rotation lowers that of rotations, so only a larger one counts.
-MOST_RATIO, MOST_FORCE_RATIO, SIGMAS = 1.25, 1.5, 5.0
+# A ratio counts that is so many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio
+# of the rates of rotation, so only a larger one counts.
+SIGMAS = 5.0
 # Vision's speed is good to 5 % in sound recordings: a unit's factor that is nearer than this is named.
 NEAR_UNIT = 0.08
 # Named and not converted: they are too near to the factors of other units, or of other faults.

@@ -5,10 +5,10 @@ A share of the depths scales every step of the camera. Odometry shows it in velo
 
 import numpy as np
 
-from toolkit.audit.agreement.disagreement import MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import BASELINE
 from toolkit.audit.parts.calibration_limits import hidden_baseline
+from toolkit.audit.parts.ratios import MOST_RATIO
 
 # A scale counts that is no chance, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the odometry of
 # cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.

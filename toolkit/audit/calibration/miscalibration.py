@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.agreement.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, doubtful, hidden, wrong
 from toolkit.audit.parts.extrinsic import angle_of, turn_by_rotations, turn_by_velocities
 from toolkit.audit.parts.intervals import Intervals
+from toolkit.audit.parts.ratios import MOST_FORCE_RATIO, MOST_RATIO, force_ratio, rotation_ratio
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.units import force_ratio, rotation_ratio
 from toolkit.measured_motion import MotionKind
 from toolkit.sequence import StereoRig
 

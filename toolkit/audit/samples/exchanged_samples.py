@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.units import force_ratio, is_from_scatter, rotation_ratio, speed_ratio
+from toolkit.audit.parts.ratios import force_ratio, is_from_scatter, rotation_ratio, speed_ratio
 from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.sequence import Sequence
 

@@ -7,7 +7,7 @@ far from one, names the unit; one that is neither is not judged here. The baseli
 that a rig cannot have in another unit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,24 +16,23 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px
-from toolkit.audit.parts.robust import Scalar
-from toolkit.audit.parts.units import (
+from toolkit.audit.parts.ratios import (
+    FORCES,
+    RATES,
+    SPEEDS,
     force_ratio,
-    in_other_unit,
-    linear_scaled,
+    is_from_scatter,
     ratio_of_speeds,
     rotation_ratio,
     speed_ratio,
 )
+from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import se3
+from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
-RATES = {"deg/s": 180.0 / np.pi}
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
-# Of mg and cm/s^2, 2 % apart, gravity tells neither.
-FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665, "cm/s^2": 100.0, "mm/s^2": 1000.0}
 # A unit is named where the ratio is within this factor of it, and this many standard errors from one.
 WITHIN_FACTOR, SIGMAS = 1.25, 5.0
 # Vision's speed is good to 5 % in sound recordings, which tells km/h from ft/s, a factor of 1.1 apart.
@@ -117,7 +116,7 @@ def _baseline(evidence: Evidence) -> _Wrong | None:
     summary = f"baseline_m is {rig.baseline_m:g}, which no rig has"
     if ratio is not None:
         measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
-        unit = in_other_unit(ratio, measured, WITHIN_FACTOR, SIGMAS)
+        unit = _in_other_unit(ratio, measured, WITHIN_FACTOR, SIGMAS)
         fitting = [unit] if unit is not None else []
         summary += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
     if len(fitting) != 1:
@@ -149,13 +148,13 @@ def _lever_arm(evidence: Evidence) -> _Wrong | None:
 
 def _speed(evidence: Evidence) -> _Wrong | None:
     ratio = speed_ratio(evidence.intervals)
-    unit = None if ratio is None else in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, SIGMAS)
+    unit = None if ratio is None else _in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, SIGMAS)
     if ratio is None or unit is None:
         return None
     summary = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
     if not _all_along(evidence, speed_ratio, SPEEDS[unit]):
         return _Wrong(f"{summary}{IN_A_PART}", None)
-    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
+    return _Wrong(summary, _scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
 
 
 def _rotation(evidence: Evidence) -> _Wrong | None:
@@ -163,13 +162,13 @@ def _rotation(evidence: Evidence) -> _Wrong | None:
     if intervals is None:
         return None
     ratio = rotation_ratio(intervals)
-    unit = in_other_unit(ratio, RATES, WITHIN_FACTOR, SIGMAS)
+    unit = _in_other_unit(ratio, RATES, WITHIN_FACTOR, SIGMAS)
     if unit is None:
         return None
     summary = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
     if not _all_along(evidence, rotation_ratio, RATES[unit]):
         return _Wrong(f"{summary}{IN_A_PART}", None)
-    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
+    return _Wrong(summary, _scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
 
 
 def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
@@ -184,11 +183,11 @@ def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None
 
 def _force(evidence: Evidence) -> _Wrong | None:
     ratio = force_ratio(evidence.sequence)
-    unit = None if ratio is None else in_other_unit(ratio, FORCES, WITHIN_FACTOR, SIGMAS)
+    unit = None if ratio is None else _in_other_unit(ratio, FORCES, WITHIN_FACTOR, SIGMAS)
     if ratio is None or unit is None:
         return None
     summary = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
-    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0 / FORCES[unit]))
+    return _Wrong(summary, _scaled(evidence.sequence, 1.0 / FORCES[unit]))
 
 
 def _truth(evidence: Evidence) -> _Wrong | None:
@@ -205,7 +204,7 @@ def _truth(evidence: Evidence) -> _Wrong | None:
     rows = inside[intervals.interval] & inside[intervals.interval + 1]
     measured = intervals.v_cam_mps if intervals.v_mps is None else intervals.v_mps
     ratio = ratio_of_speeds(v_true[intervals.interval[rows]], measured[rows])
-    unit = None if ratio is None else in_other_unit(ratio, LENGTHS, WITHIN_FACTOR, SIGMAS)
+    unit = None if ratio is None else _in_other_unit(ratio, LENGTHS, WITHIN_FACTOR, SIGMAS)
     if ratio is None or unit is None:
         return None
     scale = 1.0 / LENGTHS[unit]
@@ -214,6 +213,37 @@ def _truth(evidence: Evidence) -> _Wrong | None:
     remedy = replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
     summary = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
     return _Wrong(summary, remedy)
+
+
+def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
+    """Return the only unit whose factor a ratio matches; None where none does, several do, or the ratio may be 1."""
+    if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
+        return None
+    apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}
+    near = [unit for unit in apart if apart[unit] < np.log(within_factor)]
+    return near[0] if len(near) == 1 else None
+
+
+def _scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Sequence:
+    """Return the sequence with its motion samples multiplied, linear and angular ones.
+
+    Noise that the file did not state, but a loader estimated from the scatter of the samples, is in their unit and
+    is scaled as well.
+    """
+    motion, noise = sequence.motion, sequence.noise
+    scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
+    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
+        return replace(sequence, motion=scaled)
+    velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
+    if linear != 1.0 and is_from_scatter(velocity, motion.v_mps, motion.t_ns):
+        velocity = linear * velocity
+    if angular != 1.0 and is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
+        gyro_noise = angular * gyro_noise
+    return replace(
+        sequence,
+        motion=scaled,
+        noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
+    )
 
 
 FAULT = Fault(

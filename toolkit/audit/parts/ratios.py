@@ -1,29 +1,27 @@
-"""Ratios of one motion by two sources, the units that they show, and samples converted to SI."""
+"""Ratios of one motion by two sources, and the factors of the units that such ratios show.
 
-from collections.abc import Mapping
-from dataclasses import replace
+The ratios are those of the samples' speeds and rates of rotation to the camera's, and of specific force to gravity.
+"""
 
 import numpy as np
 
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar, median_error
 from toolkit.geometry import Array, IntArray
-from toolkit.measured_motion import ImuSamples, TwistNoise, TwistSamples
+from toolkit.measured_motion import ImuSamples
 from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
+# Largest ratios, of speeds and rates of rotation and of specific force, for which a scale that is a little off can
+# account; beyond them the sources disagree (`disagreement`). Sound recordings have ratios of speeds of 0.96 to 1.02.
+MOST_RATIO, MOST_FORCE_RATIO = 1.25, 1.5
+# Factors of units. Of mg and cm/s^2, 2 % apart, gravity tells neither.
+SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
+RATES = {"deg/s": 180.0 / np.pi}
+FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665, "cm/s^2": 100.0, "mm/s^2": 1000.0}
 # Noise that is this share of the samples' own scatter, or more, was estimated from them and is in their unit.
 FROM_SCATTER = 0.5
-
-
-def in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
-    """Return the only unit whose factor a ratio matches; None where none does, several do, or the ratio may be 1."""
-    if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
-        return None
-    apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}
-    near = [unit for unit in apart if apart[unit] < np.log(within_factor)]
-    return near[0] if len(near) == 1 else None
 
 
 def rotation_ratio(intervals: Intervals) -> Scalar:
@@ -66,28 +64,6 @@ def force_ratio(sequence: Sequence) -> Scalar | None:
         return None
     ratio = np.linalg.norm(sequence.motion.accel_mps2, axis=1)[:, None] / np.linalg.norm(sequence.gravity_world)
     return Scalar(float(np.median(ratio)), float(median_error(ratio)[0]))
-
-
-def linear_scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Sequence:
-    """Return the sequence with its motion samples multiplied, linear and angular ones.
-
-    Noise that the file did not state, but a loader estimated from the scatter of the samples, is in their unit and
-    is scaled as well.
-    """
-    motion, noise = sequence.motion, sequence.noise
-    scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
-    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
-        return replace(sequence, motion=scaled)
-    velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
-    if linear != 1.0 and is_from_scatter(velocity, motion.v_mps, motion.t_ns):
-        velocity = linear * velocity
-    if angular != 1.0 and is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
-        gyro_noise = angular * gyro_noise
-    return replace(
-        sequence,
-        motion=scaled,
-        noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
-    )
 
 
 def is_from_scatter(density: Array, values: Array, t_ns: IntArray) -> bool:
