@@ -7,11 +7,10 @@ all the same, and no estimator's covariance holds it.
 
 import numpy as np
 
-from toolkit.audit.agreement.vision_scale import LARGEST_ERROR, SYSTEMATIC
-from toolkit.audit.calibration.miscalibration import SYSTEMATIC_RAD
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.extrinsic import angle_of, turn_by_velocities
-from toolkit.audit.tracks.correlated_tracks import err_by_themselves
+from toolkit.audit.parts.alignment import LARGEST_SCALE_ERROR, SYSTEMATIC_SCALE
+from toolkit.audit.parts.extrinsic import SYSTEMATIC_RAD, angle_of, turn_by_velocities
+from toolkit.audit.parts.one_step import errors_are_independent
 
 # Tracks that creep from image to image make so much more of both (a share, rad) in simulations, where nothing slips.
 SCALE_BY_CREEP, TURN_BY_CREEP_RAD = 0.005, 0.003
@@ -36,11 +35,11 @@ def check(evidence: Evidence) -> Symptom | None:
 
 def _scale(evidence: Evidence) -> str | None:
     found = evidence.alignment
-    if found is None or found.scale.error > LARGEST_ERROR or found.by_velocities is None:
+    if found is None or found.scale.error > LARGEST_SCALE_ERROR or found.by_velocities is None:
         return None
     scale, error = found.scale
     beyond = abs(scale) - found.scale_by_chance
-    if not 0.0 < beyond < SYSTEMATIC["twist"] or not _is_no_creep(evidence, beyond, SCALE_BY_CREEP):
+    if not 0.0 < beyond < SYSTEMATIC_SCALE["twist"] or not _is_no_creep(evidence, beyond, SCALE_BY_CREEP):
         return None
     return (
         f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
@@ -65,7 +64,7 @@ def _direction(evidence: Evidence) -> str | None:
 
 def _is_no_creep(evidence: Evidence, beyond: float, by_creep: float) -> bool:
     """Say whether what is beyond chance is more than tracks that creep make of it, or each sighting errs by itself."""
-    return beyond > by_creep or err_by_themselves(evidence)
+    return beyond > by_creep or errors_are_independent(evidence.step_correlation)
 
 
 FAULT = Fault(

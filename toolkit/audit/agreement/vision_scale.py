@@ -6,15 +6,13 @@ A share of the depths scales every step of the camera. Odometry shows it in velo
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.alignment import LARGEST_SCALE_ERROR, SYSTEMATIC_SCALE
 from toolkit.audit.parts.bundle import BASELINE
 from toolkit.audit.parts.calibration_limits import hidden_baseline
 from toolkit.audit.parts.ratios import MOST_RATIO
 
-# A scale counts that is no chance, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the odometry of
-# cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
-SYSTEMATIC = {"twist": 0.03, "imu": 0.025}
-# A scale that is known worse than this is not judged; where a fault must be larger than that to show, it is said.
-LARGEST_ERROR, LARGEST_HIDDEN = 0.02, 0.08
+# Where a fault must be larger than this share to show, it is said.
+LARGEST_HIDDEN = 0.08
 # Beside odometry a difference is told from chance on (`steady_difference`); where that is more, it is said: 2 % of all
 # disparities make runs on `drive` six times as wrong.
 LARGEST_CHANCE = 0.02
@@ -28,8 +26,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     kind, found = evidence.sequence.motion_kind, evidence.alignment
-    known = found is not None and found.scale.error <= LARGEST_ERROR
-    least = np.inf if found is None else SYSTEMATIC[kind] + found.scale_by_chance
+    known = found is not None and found.scale.error <= LARGEST_SCALE_ERROR
+    least = np.inf if found is None else SYSTEMATIC_SCALE[kind] + found.scale_by_chance
     if found is None or not known or abs(found.scale.value) < least:
         return _unseen(evidence, least if known else np.inf)
     scale, error = found.scale
@@ -67,7 +65,7 @@ def _unseen(evidence: Evidence, least: float) -> Undecided | None:
         return Undecided("too little change of velocity: the scale of vision against the samples is unknown")
     scale, error = found.scale
     if not np.isfinite(least):
-        share = 100.0 * (SYSTEMATIC[evidence.sequence.motion_kind] + found.scale_by_chance)
+        share = 100.0 * (SYSTEMATIC_SCALE[evidence.sequence.motion_kind] + found.scale_by_chance)
         known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would hide"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     if least + abs(scale) < LARGEST_HIDDEN:

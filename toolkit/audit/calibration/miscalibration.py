@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, doubtful, hidden, wrong
-from toolkit.audit.parts.extrinsic import angle_of, turn_by_rotations, turn_by_velocities
+from toolkit.audit.parts.extrinsic import SYSTEMATIC_RAD, angle_of, turn_by_rotations, turn_by_velocities
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.ratios import MOST_FORCE_RATIO, MOST_RATIO, force_ratio, rotation_ratio
 from toolkit.audit.parts.robust import Scalar
@@ -21,12 +21,10 @@ from toolkit.measured_motion import MotionKind
 from toolkit.sequence import StereoRig
 
 SIGMAS = 5.0
-# What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
-# and by rotations. Chosen with them in view.
-SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
-# The same of the force over gravity, and of the gyro's rates over the camera's, whose noise lowers that: beyond five
-# standard errors above one, of 699 parts of sound recordings two beside odometry have 0.011 at most and none beside an
-# IMU anything. Chosen with them in view.
+# Limits of the ratios of specific force to gravity and of the gyro's rates to the camera's, beyond five standard
+# errors. The noise of the camera's rates lowers the second ratio, so only values above one count. Of 699 parts of sound
+# recordings, two beside odometry exceed one by 0.011 at most beyond five standard errors, and none beside an IMU
+# exceeds it. Chosen with them in view.
 SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
 # Where a turn must be larger than this to be seen, it is said.
 LARGEST_RAD = 0.05

@@ -32,6 +32,9 @@ MOST_SIGMAS = 4.0
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
 # The same of sound recordings beside an IMU (m): 0.06 at most.
 BESIDE_IMU_M = 0.05
+# Limits beyond the standard errors for a rotation (rad) estimated by velocities, which slip and pitch of cars bias, and
+# by rates of rotation. Chosen with the sound recordings at hand in view.
+SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
 # Axes about which the error of the rotation is this many times that of the best axis are not judged: a velocity does
 # not determine the rotation about its own direction, and slip would bias it.
 MOST_ERROR_RATIO = 4.0

@@ -28,6 +28,11 @@ TIMES_EXPLAINED = 2.0
 # Residuals beyond so many robust standard deviations are left out: mismatches and what moves are no noise.
 USUAL = 3.0
 LEAST_TRIPLES = 300
+# Limit of the correlation of neighbouring residuals. Errors with a white part and a random walk along the track have
+# the correlation -1 / (2 + w), where w is the walk's variance per frame over that of the white part; above the limit w
+# is more than 2. Simulated white tracks have -0.40 to -0.48, because the camera's motion is fitted to them, and real
+# ones 0.1 to 0.9. The correlation must be beyond the limit by so many standard errors.
+MOST_CORRELATION, CORRELATION_SIGMAS = -0.25, 5.0
 # Of a standard deviation: with less, tracks are without errors.
 _NO_ERROR = 1e-6
 
@@ -134,6 +139,11 @@ def step_correlation(sequence: Sequence, steps: OneStep) -> Scalar | None:
     if len(first) < LEAST_TRIPLES or not (first.any() and second.any()):
         return None
     return Scalar(_correlation(first, second), jackknife_error(_correlation, first, second))
+
+
+def errors_are_independent(correlation: Scalar | None) -> bool:
+    """Say whether the correlation of `step_correlation` shows that the sightings of a track err independently."""
+    return correlation is not None and correlation.value + CORRELATION_SIGMAS * correlation.error < MOST_CORRELATION
 
 
 def _neighbouring_residuals(sequence: Sequence, steps: OneStep) -> tuple[Array, Array]:

@@ -8,8 +8,8 @@ a gyro's drift turns its direction alone.
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.one_step import errors_are_independent
 from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar
-from toolkit.audit.tracks.correlated_tracks import err_by_themselves
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 
@@ -39,7 +39,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return Undecided("too few intervals whose camera motion is known, to read gravity before and after")
     share, step = max(found.items(), key=lambda one: abs(one[1].value) / one[1].error)
     least = SYSTEMATIC * gravity + SIGMAS * step.error
-    if abs(step.value) > least and not err_by_themselves(evidence):
+    if abs(step.value) > least and not errors_are_independent(evidence.step_correlation):
         least = BY_CREEP * gravity + SIGMAS * step.error
     if abs(step.value) < least:
         hidden = least / gravity

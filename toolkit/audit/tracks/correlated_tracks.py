@@ -8,10 +8,7 @@ is white noise that estimators are told unless a setting or the recording says o
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-
-# -1 / (2 + w), w a walk's variance a frame over that of the white part: beyond it the walk has more than twice that.
-# Simulated white tracks have -0.40 to -0.48, for the camera's motion is fitted to them; real ones 0.1 to 0.9.
-MOST_CORRELATION, SIGMAS = -0.25, 5.0
+from toolkit.audit.parts.one_step import CORRELATION_SIGMAS, MOST_CORRELATION
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -25,7 +22,7 @@ def check(evidence: Evidence) -> Symptom | None:
     if found is None:
         return None
     value, error = found
-    if value < MOST_CORRELATION + SIGMAS * error:
+    if value < MOST_CORRELATION + CORRELATION_SIGMAS * error:
         return None
     return Symptom.information(
         count=1,
@@ -35,12 +32,6 @@ def check(evidence: Evidence) -> Symptom | None:
         ),
         treatment="'vislam card' shows how, noise.tracks=fitted tells them",
     )
-
-
-def err_by_themselves(evidence: Evidence) -> bool:
-    """Say whether the sightings of a track err each by itself, beyond doubt."""
-    found = evidence.step_correlation
-    return found is not None and found[0] + SIGMAS * found[1] < MOST_CORRELATION
 
 
 FAULT = Fault(

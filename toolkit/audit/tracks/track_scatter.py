@@ -16,7 +16,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-from toolkit.audit.tracks.correlated_tracks import MOST_CORRELATION
+from toolkit.audit.parts.one_step import errors_are_independent
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
@@ -79,13 +79,13 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     if left <= 0.0 or scatter < _NO_ERROR or correlation is None:
         return None
     scatter, error = scatter / np.sqrt(left), error / np.sqrt(left)
-    each_by_itself = correlation[0] + SIGMAS * correlation[1] < MOST_CORRELATION
-    least = 1.0 / (MOST_OVERSTATED if each_by_itself else MOST_OVERSTATED_CORRELATED)
+    independent = errors_are_independent(correlation)
+    least = 1.0 / (MOST_OVERSTATED if independent else MOST_OVERSTATED_CORRELATED)
     if scatter + SIGMAS * error > least:
         return None
     times = f"{1.0 / scatter:.2g}" if scatter > 0.1 else f"{1.0 / scatter:.0f}"
     cause = f"the noise is stated {times} times too large, or the errors last along whole tracks"
-    if not each_by_itself:
+    if not independent:
         cause = f"the noise is stated too large, by less than {times} times as the errors go together between frames"
     symptom = _symptom(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
     if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
