@@ -1,9 +1,14 @@
 """Image coordinates in the wrong columns: left and right images exchanged, or rows and columns.
 
-A point in front of a rectified pair is farther left in the right image, so in a sound recording nearly every
-disparity uL - uR is positive. Where many are not, the orders in which the three coordinates can stand are tried: the
-one is right under which the tracks follow the measured motion. Exchanged rows and columns of both images leave two
-rows where uL and uR belong, which differ by noise alone; with them the depth is lost, and nothing repairs that.
+A point in front of a rectified pair is farther left in the right image, so in a sound recording nearly every disparity
+uL - uR is positive. Where many are not, the five other orders of the three coordinates are tried; the right order is
+the one under which the tracks follow the measured motion. Where rows and columns of both images are exchanged, uL and
+uR hold the rows of the two images, which differ by noise alone. The depth is then lost, and there is no repair.
+
+Rows and columns may be exchanged in some of the tracks only. The camera's own motion, estimated from the other tracks,
+predicts on which part of its epipolar line a point of unknown depth is seen next (Hartley & Zisserman, "Multiple View
+Geometry in Computer Vision", section 9.2). A track with exchanged rows and columns follows this line once they are
+exchanged back.
 """
 
 import itertools
@@ -12,10 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.exchanged_rows import exchanged_rows, like_rows
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.audit.parts.intervals import moved_by
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.models.camera_motion import CameraMotion, neighbours
 from toolkit.models.stereo import disparity_px
-from toolkit.sequence import Sequence, is_left_only
+from toolkit.sequence import Sequence, StereoRig, is_left_only
 
 # Share of the disparities that is not positive from which their order is doubted: a repair by dropping would block.
 SUSPECT_SHARE = 0.2
@@ -26,6 +32,11 @@ ROW_SIGMAS = 5.0
 # Share of the sightings in tracks of exchanged rows that counts: no sound recording at hand has any. Most of the tracks
 # like rows must be so, or the camera's motion, or what they are, is not known.
 LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
+# A track may have rows in the place of uL and uR if the mean of its disparities is within so many standard errors of
+# zero. Its distance from the epipolar lines is judged from so many pairs of neighbouring sightings on.
+TRACK_SIGMAS, LEAST_PAIRS = 4.0, 3
+# Inverse depths (1/m) along an epipolar line, from infinity to half a metre.
+_INVERSE_DEPTHS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 23)])
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
 NAMES = ("uL", "uR", "v")
@@ -62,13 +73,13 @@ def check(evidence: Evidence) -> Symptom | None:
 def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
     """Tell of tracks that follow the camera's own motion, which the others show, with u and v exchanged alone."""
     sequence = evidence.sequence
-    candidates = like_rows(sequence)
+    candidates = _like_rows(sequence)
     if (
         candidates.sum() < max(LEAST_EXCHANGED * candidates.size, 1)
         or not np.isfinite(sequence.observations.uv_px[:, [0, 2]]).all()
     ):
         return None
-    exchanged = exchanged_rows(sequence, evidence.camera_motion)
+    exchanged = _exchanged_rows(sequence, evidence.camera_motion)
     count = int(exchanged.sum())
     if count < max(LEAST_EXCHANGED * len(exchanged), MOSTLY * candidates.sum()):
         return None
@@ -81,6 +92,60 @@ def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
         treatment=f"the depth is lost with the exchange: these and what else is like rows dropped ({candidates.sum()})",
         remedy=replace(sequence, observations=sequence.observations.select(~candidates)),
     )
+
+
+def _exchanged_rows(sequence: Sequence, camera: CameraMotion) -> BoolArray:
+    """Say of each sighting (N,) whether its track, without disparity, follows the camera's motion only if exchanged.
+
+    Its median distance from the epipolar lines is then less than half of what it is as given.
+    """
+    candidates = _like_rows(sequence)
+    pairs = neighbours(sequence.observations)
+    pairs = pairs.select(camera.known[pairs.interval] & candidates[pairs.before])
+    exchanged = np.zeros(len(sequence.observations), dtype=bool)
+    if not pairs.before.size:
+        return exchanged
+    T_after_before = se3_inverse(moved_by(camera, sequence))[pairs.interval]
+    uv_px, track_id = sequence.observations.uv_px, sequence.observations.track_id[pairs.before]
+    rows_px = uv_px[:, :2].mean(axis=1)
+    as_given, turned = np.stack([rows_px, uv_px[:, 2]], axis=1), np.stack([uv_px[:, 2], rows_px], axis=1)
+    off_px = [
+        _median_of_each(track_id, _off_line_px(pixels[pairs.before], pixels[pairs.after], T_after_before, sequence.rig))
+        for pixels in (as_given, turned)
+    ]
+    enough = np.unique(track_id, return_counts=True)[1] >= LEAST_PAIRS
+    struck = np.unique(track_id)[enough & (off_px[1] < 0.5 * off_px[0])]
+    return np.asarray(np.isin(sequence.observations.track_id, struck) & candidates)
+
+
+def _like_rows(sequence: Sequence) -> BoolArray:
+    """Say of each sighting (N,) whether the disparities of its track are zero but for the noise of rows."""
+    disparity = disparity_px(sequence.observations.uv_px)
+    _, member, counts = np.unique(sequence.observations.track_id, return_inverse=True, return_counts=True)
+    mean = np.bincount(member, weights=disparity) / counts
+    spread = np.sqrt(np.maximum(np.bincount(member, weights=(disparity - mean[member]) ** 2) / counts, 0.0))
+    sigma = np.minimum(spread, np.sqrt(2.0 * sequence.rig.cov_uv_px2[2, 2]))
+    near = np.abs(mean) <= TRACK_SIGMAS * sigma / np.sqrt(counts)
+    return np.asarray((near & (counts > LEAST_PAIRS))[member])
+
+
+def _off_line_px(before_px: Array, after_px: Array, T_after_before: Array, rig: StereoRig) -> Array:
+    """Return how far (P,) px pixels (P, 2) in a frame are from where those before, at any depth, would come to lie."""
+    focal_px, centre_px = np.array([rig.fx_px, rig.fy_px]), np.array([rig.cx_px, rig.cy_px])
+    ray = np.concatenate([(before_px - centre_px) / focal_px, np.ones((len(before_px), 1))], axis=1)
+    turned = (T_after_before[:, :3, :3] @ ray[:, :, None])[..., 0]
+    seen = turned[:, None] + _INVERSE_DEPTHS[:, None] * T_after_before[:, None, :3, 3]
+    in_front = seen[..., 2] > 0.01
+    at_px = focal_px * seen[..., :2] / np.where(in_front, seen[..., 2], 1.0)[..., None] + centre_px
+    distance = np.where(in_front, np.linalg.norm(at_px - after_px[:, None], axis=2), np.inf)
+    return np.asarray(distance.min(axis=1))
+
+
+def _median_of_each(group: IntArray, values: Array) -> Array:
+    """Return the median of values (P,) over each group, in the order of the groups' numbers."""
+    order = np.lexsort((values, group))
+    _, first, counts = np.unique(group[order], return_index=True, return_counts=True)
+    return np.asarray(values[order][first + (counts - 1) // 2])
 
 
 def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
