@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
+from toolkit.audit.agreement.conflict import Deviation, sustained
 from toolkit.audit.calibration import lever_arm
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.parts.alignment import alignment, velocity_regression
-from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.extrinsic import Turn, turn_by_velocities
 from toolkit.audit.tracks import track_scatter
 from toolkit.geometry import Array, interpolate_poses, se3, se3_inverse, so3_exp, transform

@@ -7,7 +7,7 @@ from typing import Self
 
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.clocks import TruthClock, truth_clock
-from toolkit.audit.parts.deviations import Fallen, fallen_mps
+from toolkit.audit.parts.integrated_gravity import IntegratedGravity, integrated_gravity
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import Agreement, OneStep, agreement, one_step, step_correlation
 from toolkit.audit.parts.robust import Scalar
@@ -143,10 +143,10 @@ class Evidence:
         return self_calibration(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
-    def fallen(self) -> Fallen:
-        """The camera's velocity less what the IMU gained, of a recording that has ``intervals``."""
+    def integrated_gravity(self) -> IntegratedGravity:
+        """The camera's velocity less the integrated specific force, of a recording that has ``intervals``."""
         assert self.intervals is not None
-        return fallen_mps(self.sequence, self.camera_motion, self.intervals)
+        return integrated_gravity(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
     def truth_clock(self) -> TruthClock | None:
@@ -165,7 +165,7 @@ class Evidence:
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
             known = ["camera_motion", "one_step", "step_correlation"]
             if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
-                known += ["intervals", "agreement", "alignment", "self_calibration", "fallen"]
+                known += ["intervals", "agreement", "alignment", "self_calibration", "integrated_gravity"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

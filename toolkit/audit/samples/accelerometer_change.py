@@ -30,9 +30,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if evidence.intervals is None:
         return evidence.blind
-    middle_ns, fallen = evidence.fallen
+    middle_ns, v_mps = evidence.integrated_gravity
     t_s, known = (middle_ns - sequence.frames_t_ns[0]) / NS_PER_S, evidence.camera_motion.known
-    steps = {share: _step(t_s, fallen, known, share * sequence.duration_s) for share in CUTS}
+    steps = {share: _step(t_s, v_mps, known, share * sequence.duration_s) for share in CUTS}
     found = {share: step for share, step in steps.items() if step is not None}
     gravity = float(np.linalg.norm(sequence.gravity_world))
     if not found:
