@@ -19,7 +19,8 @@ from toolkit.audit.fault import Evidence, Fault, Finding, Symptom, Undecided
 from toolkit.errors import UnknownNameError, no_such
 from toolkit.sequence import Sequence
 
-# Share of the sightings that a repair may drop. Sightings of frames that are cut off do not count.
+# Largest share of the sightings that a repair may drop; beyond it the finding blocks. Sightings of frames that the
+# repair cuts off are not counted.
 MOST_LOST = 0.2
 
 __all__ = ["Audit", "Finding", "audit", "checked_again", "faults"]

@@ -23,10 +23,10 @@ Spans = tuple[tuple[int, int], ...]
 class Finding:
     """One fault found in a recording, as it is reported.
 
-    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means
-    that the fault is harmful and still there, so that a check of the recording has to fail. A ``warning`` has no
-    repair and does not block, but every result has to be read with it in mind. ``spans_ns`` are the times at which
-    the fault is there, none for all of them.
+    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means that the
+    fault is harmful and was not repaired, so that a check of the recording has to fail. A ``warning`` has no repair and
+    does not block, but may affect every result of the recording. ``spans_ns`` are the times (ns) at which the fault is
+    present; it is empty where the fault is present throughout.
     """
 
     fault: str
@@ -42,10 +42,10 @@ class Finding:
 class Symptom:
     """The result of a check: a count, a description, and the sequence without the fault.
 
-    ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
-    the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks. One
-    that ``warns`` does not block either, but may spoil results: all of them, or those of its ``spans_ns``. One that
-    ``spoils_vision`` and is not repaired leaves nothing to conclude from the tracks.
+    ``remedy`` is None where there is nothing to repair, or no repair is known to be right; ``treatment`` describes what
+    the remedy does, or why there is none. A symptom that is not ``harmful`` is information and never blocks. One that
+    ``warns`` does not block either, but may spoil results: all of them, or those within its ``spans_ns``. After one
+    that ``spoils_vision`` and is not repaired, no later check uses the tracks.
     """
 
     count: int
@@ -59,12 +59,12 @@ class Symptom:
 
     @classmethod
     def information(cls, count: int, detail: str, treatment: str) -> Self:
-        """Return what is worth knowing, spoils nothing and needs no repair."""
+        """Return a symptom that spoils no result and needs no repair."""
         return cls(count, detail, treatment, remedy=None, harmful=False)
 
     @classmethod
     def warning(cls, count: int, detail: str, treatment: str, spans_ns: Spans = ()) -> Self:
-        """Return what may spoil results, or those of its spans, and has no sound repair."""
+        """Return a symptom that may spoil results, or those within its spans, and has no repair."""
         return cls(count, detail, treatment, remedy=None, harmful=False, warns=True, spans_ns=spans_ns)
 
 
@@ -79,7 +79,7 @@ class Undecided:
 class Evidence:
     """The sequence at the time a fault is checked, with quantities that several checks derive from it.
 
-    ``spoilt_by`` names a fault that is still there and leaves nothing to conclude from the tracks.
+    ``spoilt_by`` names a fault that was not repaired and after which the tracks cannot be used; it is empty otherwise.
     """
 
     sequence: Sequence
@@ -92,7 +92,7 @@ class Evidence:
 
     @cached_property
     def one_step(self) -> OneStep:
-        """The residual of each sighting in the next frame, by the camera's own motion."""
+        """The residual of each sighting predicted from the previous frame by the camera's own motion."""
         return one_step(self.sequence, self.camera_motion)
 
     @cached_property
@@ -127,12 +127,13 @@ class Evidence:
 
     @cached_property
     def agreement(self) -> Agreement:
-        """How well the tracks follow the measured motion of a recording that has ``intervals``."""
+        """How well the tracks follow the measured motion; needs ``intervals``."""
         return agreement(self.sequence, self.camera_motion)
 
     @cached_property
     def alignment(self) -> Alignment | None:
-        """The scale of vision and the position of the camera; None where ``intervals`` is, or they are undetermined."""
+        """The scale of vision and the position of the camera; None without ``intervals``, or where they are
+        undetermined."""
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
@@ -144,7 +145,7 @@ class Evidence:
 
     @cached_property
     def integrated_gravity(self) -> IntegratedGravity:
-        """The camera's velocity less the integrated specific force, of a recording that has ``intervals``."""
+        """The camera's velocity less the integrated specific force; needs ``intervals``."""
         assert self.intervals is not None
         return integrated_gravity(self.sequence, self.camera_motion, self.intervals)
 

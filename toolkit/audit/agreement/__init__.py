@@ -1,5 +1,6 @@
-"""Where vision and the measured motion disagree, each sound by itself.
+"""Faults that show only where vision is compared with the measured motion.
 
-Read ``disagreement`` (tracks against the motion between two frames), ``conflict`` (for seconds), ``steady_difference``,
-``vision_scale`` and ``scale_change`` (in length or direction, throughout or in part).
+Read ``disagreement`` (tracks against the motion between two frames), ``conflict`` (differences that last for seconds),
+``vision_scale`` and ``scale_change`` (the scale, constant or changing), then ``steady_difference`` (scale and direction
+within the limits of sound recordings).
 """

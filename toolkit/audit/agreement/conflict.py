@@ -1,10 +1,10 @@
 """Seconds during which vision and the measured motion disagree: many moving objects, or samples that are wrong.
 
-Most of the points in view may move with the traffic, wheels may slip, an IMU may be shaken: then the two tell
-different motions for as long as it lasts, and no estimator can know which one is right. Nothing is repaired.
+Most of the points in view may belong to traffic, wheels may slip, or an IMU may be shaken. As long as that lasts,
+vision and the samples give different motions, and the data do not show which one is right. Nothing is repaired.
 
-The mean deviation of the samples from the camera's own motion over a stretch of time is compared with the scatter of
-such means in the rest of the recording, which includes noise, slip and other usual errors.
+The deviation of the samples from the camera's own motion is averaged over stretches of time and compared with the
+scatter of such means in the rest of the recording, which includes noise, slip and other usual errors.
 """
 
 from functools import partial
@@ -22,31 +22,34 @@ from toolkit.models.camera_motion import CameraMotion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# A mean counts from so many of its standard deviations on; the largest of a sound recording has 3 to 9.
+# A mean is reported from so many of its standard deviations on; the largest mean of a sound recording has 3 to 9.
 SIGMAS = 10.0
-# The smallest deviation that counts, by what deviates: sound recordings at hand have 0.05 rad/s, a tenth of the speed
-# where wheels slip or depths are off, and 0.4 m/s^2.
+# Smallest deviation that is reported (rad/s, m/s, m/s^2); of a velocity, a share of the speed is added. The sound
+# recordings at hand have up to 0.05 rad/s, a tenth of the speed where wheels slip or depths are wrong, and 0.4 m/s^2.
 LEAST = {"rate of rotation": 0.06, "velocity": 0.2, "specific force": 0.5}
 LEAST_OF_SPEED = 0.1
-# Length of the stretches that are averaged: longer than a correction of the steering, shorter than a red light.
+# Length (s) of the stretches that are averaged: longer than a correction of the steering, shorter than a stop at a
+# traffic light.
 STRETCH_S = 2.0
 # Least number of intervals for a mean.
 LEAST_IN_STRETCH = 8
-# With this many stretches the scatter of their means is estimated from the recording itself.
+# From this many stretch lengths on, the scatter of the means is estimated from the recording itself.
 LEAST_STRETCHES = 10
-# The specific force is compared with gravity as it was within so many seconds: the gyro's drift turns it after that.
+# The specific force is compared with the gravity estimated within this time (s), before the gyro's drift rotates it.
 GRAVITY_S = 10.0
-# A velocity is the median of so many; its standard deviation is that of a single one times this, for normal errors.
+# A velocity is the median of so many neighbours; its standard deviation is that of a single one times this factor, for
+# normal errors.
 _MEDIAN_OF, _MEDIAN_ERROR = 5, 0.536
 # The quartile of the absolute value of a normal variable, over its standard deviation.
 _LOWER_QUARTILE = 0.3186
 
 
 class Deviation(NamedTuple):
-    """Samples less camera, at times (n,) s from the first frame: (n, 3), named ``what``, in ``unit``.
+    """Samples less camera, ``value`` (n, 3) in ``unit``, at times ``t_s`` (n,) from the first frame; ``what`` is its
+    name.
 
-    ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of n, or times n where
-    ``telescopes``: a change of velocity averages to that between the ends.
+    ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of n. Where ``telescopes`` it is
+    times n: the mean of changes of velocity depends only on the velocities at both ends.
     """
 
     what: str
@@ -66,7 +69,7 @@ class Span(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Name the times at which what the samples and the camera say differs for seconds, and by how much."""
+    """Report the times at which samples and camera differ for seconds, and by how much."""
     if evidence.intervals is None:
         return evidence.blind
     sequence, found = evidence.sequence, list[tuple[Deviation, Span]]()
@@ -116,10 +119,11 @@ def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ..
 
 
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
-    """Return the spans in which the means of the stretches deviate by so many of their standard deviations.
+    """Return the spans in which the means over stretches exceed ``sigmas`` of their standard deviations.
 
-    Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either
-    of its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
+    The standard deviation of a mean is that of white noise. In a long recording it is no less than the scatter of the
+    means, taken from the less scattered half of them in each half of the recording, the smaller of both. ``least`` is
+    the smallest deviation that is reported, in its unit.
     """
     if deviation.t_s.size < LEAST_IN_STRETCH:
         return []
@@ -128,7 +132,7 @@ def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
         return []
     noise = stretches.noise
     if np.ptp(stretches.centre_s) > LEAST_STRETCHES * STRETCH_S:
-        # A fault that begins in the middle and stays must not be what is usual.
+        # A fault that begins in the middle and lasts to the end must not raise the usual scatter.
         first, second = (_scatter_of_means(half) for half in np.array_split(stretches.mean, 2))
         noise = np.maximum(noise, np.minimum(first, second))
     improbable = np.linalg.norm(stretches.mean / noise, axis=1) > sigmas
@@ -136,7 +140,7 @@ def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
 
 
 def _scatter_of_means(mean: Array) -> Array:
-    """Return the standard deviation (3,) of means (m, 3) by the quieter half of them."""
+    """Return the standard deviation (3,) of means (m, 3), from the half of them nearest to their median."""
     off_centre = np.abs(mean - np.median(mean, axis=0))
     return np.asarray(np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
 
@@ -169,7 +173,7 @@ def _stretches(deviation: Deviation) -> _Stretches:
 
 
 def _spans(stretches: _Stretches, deviates: BoolArray) -> list[Span]:
-    """Join stretches that deviate and overlap; each counts from a quarter to three quarters of its length."""
+    """Join stretches that deviate and overlap; each stands for its middle half, from a quarter to three quarters."""
     spans: list[Span] = []
     size = np.linalg.norm(stretches.mean, axis=1)
     for row in np.flatnonzero(deviates).tolist():
@@ -192,11 +196,11 @@ def _scatter(value: Array) -> Array:
 
 
 def _specific_force(sequence: Sequence, camera: CameraMotion, found: IntegratedGravity) -> Deviation:
-    """Return what the change of the camera's velocity leaves of the specific force, less gravity as it is around then.
+    """Return the change of the camera's velocity less the specific force, less the gravity estimated around that time.
 
-    In the axes of the first frame, into which the gyro turns everything, the velocity changes by the specific force
-    plus gravity, a constant but for the drift of the gyro. Of five velocities the median is taken, less the integrals
-    of both: a median of what shakes or falls is no mean.
+    In the axes of the first frame, by the gyro, the velocity changes by the specific force plus gravity, which is
+    constant but for the drift of the gyro. The integrals of both are subtracted from the velocities before the median
+    of five neighbours is taken: the median of velocities that vibrate or fall differs from their mean.
     """
     frames_t_ns = sequence.frames_t_ns
     middle_ns = found.middle_ns
@@ -211,7 +215,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: IntegratedG
     t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
     value = (np.diff(smooth, axis=0) / h_s)[rows]
     bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(fallen) - 2]]
-    # Where no stretch is long enough, the scatter of the velocities is unknown.
+    # Without three known intervals in a row, the scatter of the velocities is unknown.
     bent_mps = np.median(bend, axis=0) if len(bend) else np.full(3, np.inf)
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * bent_mps / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
@@ -225,7 +229,8 @@ def _neighbours(values: Array, reach: int) -> Array:
 
 
 def _around(t_s: Array, value: Array) -> Array:
-    """Return the median (n, 3) of the means over a stretch of values (n, 3) within GRAVITY_S of each, once a second."""
+    """Return the median (n, 3) of the stretch means of values (n, 3) within GRAVITY_S of each time, updated once a
+    second."""
     if len(t_s) < LEAST_IN_STRETCH:
         return np.zeros_like(value)
     knots_s: Array = np.unique(np.floor(t_s))

@@ -1,6 +1,6 @@
-"""Tracks that do not follow the measured motion, whatever was repaired before: calibration or samples are wrong.
+"""Tracks that do not follow the measured motion after all repairs: the calibration or the samples are wrong.
 
-The last word on the calibration: what no other fault explains, or what a repair has left, is said here.
+This is the final check of the calibration. It reports what no other fault explains, and what a repair has left.
 """
 
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ from toolkit.audit.parts.ratios import (
 )
 from toolkit.audit.parts.robust import Scalar
 
-# A ratio counts that is so many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio
-# of the rates of rotation, so only a larger one counts.
+# A ratio must be so many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio of the
+# rates of rotation, so that ratio has only an upper limit.
 SIGMAS = 5.0
-# Vision's speed is good to 5 % in sound recordings: a unit's factor that is nearer than this is named.
+# Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
 NEAR_UNIT = 0.08
-# Named and not converted: they are too near to the factors of other units, or of other faults.
+# Units that are named and not converted: their factors are too near to those of other units or other faults.
 OTHER_SPEEDS, OTHER_FORCES = {"knots": 1.944}, {"ft/s^2": 3.281}
 OTHER_RATES = {"turns a minute": 30.0 / np.pi, "mrad/s": 1000.0}
-# Velocities of the faster half that point elsewhere have a wrong sign, or axes that nothing mended.
+# Velocities in the faster half whose median angle exceeds this have a wrong sign, or axes that no repair corrected.
 MOST_ANGLE_DEG = 60.0
 
 
@@ -53,7 +53,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _ratios(evidence: Evidence) -> list[str]:
-    """Say which sizes of the motion differ from the camera's, or from gravity, by a factor."""
+    """Describe which sizes of the motion differ from the camera's, or from gravity, by a factor."""
     assert evidence.intervals is not None
     speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
     rotation = rotation_ratio(evidence.intervals)
@@ -76,13 +76,13 @@ def _ratios(evidence: Evidence) -> list[str]:
 
 
 def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:
-    """Name the units whose factor a ratio is nearly, if there are any."""
+    """Name the units whose factor is near a ratio, if there are any."""
     units = [unit for unit, factor in factors.items() if abs(ratio / factor - 1.0) < NEAR_UNIT]
     return f", as if in {' or '.join(units)}" if units else ""
 
 
 def _median_angle_deg(evidence: Evidence) -> float | None:
-    """Return the angle between the samples' velocity and the camera's where it moves; None beside an IMU."""
+    """Return the median angle between the samples' velocity and the camera's in the faster half; None with an IMU."""
     intervals = evidence.intervals
     assert intervals is not None
     if intervals.v_mps is None:

@@ -1,7 +1,7 @@
-"""Odometry, or depths, whose scale changes during the recording: a tyre that loses air, another gear, a new focus.
+"""Odometry or depths whose scale changes during the recording: a tyre loses air, a gear or a focus is changed.
 
-The size of the measured velocity over the camera's is followed through ten stretches of the recording; a step between
-any two of them counts that the scatter within either part does not explain.
+The ratio of the measured velocity to the camera's is computed in ten stretches of the recording. A step between two
+stretches is reported where the scatter within the parts before and after does not explain it.
 """
 
 import numpy as np
@@ -14,19 +14,19 @@ from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES
 from toolkit.resampling import NS_PER_S
 
-# A step is one at this level over all places where it can be, and beyond this share: sound drives at hand have 0.057
-# at most. Chosen with them in view.
+# Level of significance of a step, over all places where it can be, and its least share: the sound drives at hand have
+# 0.057 at most. Chosen with them in view.
 LEVEL, SYSTEMATIC = 1e-3, 0.06
-# Where a step must be larger than this to show, it is said.
+# Where only a step larger than this would be found, the finding is undecided and says so.
 LARGEST_HIDDEN = 0.08
-# A camera that is slower stands, and its speed is noise.
+# Below this speed the camera is taken to stand, and its speed is noise.
 STANDING_MPS = 0.05
-# Of a step either side has so many stretches at least.
+# Either side of a step has at least so many stretches.
 LEAST_STRETCHES = 2
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Find the step of the scale that is the least likely chance."""
+    """Find the step of the scale that is largest in its standard errors, and report it if it is beyond the limit."""
     if evidence.intervals is None:
         return evidence.blind
     intervals, T_imu_cam = evidence.intervals, evidence.sequence.rig.T_imu_cam
@@ -57,7 +57,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _hidden(step: Scalar, hidden: float) -> Undecided | None:
-    """Say how large a step the wandering of the scale may hide, where that is much."""
+    """Return the size of a step that variations of the scale may hide, where it is larger than LARGEST_HIDDEN."""
     if hidden < LARGEST_HIDDEN:
         return None
     wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as those of sound drives do"
@@ -67,7 +67,7 @@ def _hidden(step: Scalar, hidden: float) -> Undecided | None:
 
 
 def _largest_step(ratio: Array) -> tuple[int, Scalar]:
-    """Return the first stretch after the most certain step of ratios (n,) in time, and its size."""
+    """Return the first stretch after the most significant step of ratios (n,) in time, and the size of the step."""
     stretch = np.arange(len(ratio)) * STRETCHES // len(ratio)
     level = np.array([np.median(ratio[stretch == k]) for k in range(STRETCHES)])
     own = np.array([median_error(ratio[stretch == k][:, None])[0] for k in range(STRETCHES)])

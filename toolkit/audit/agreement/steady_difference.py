@@ -1,8 +1,8 @@
-"""Vision and odometry that part all along by more than chance, and by no more than slip makes of sound recordings.
+"""A constant difference of vision and odometry beyond chance, and within what slip causes in sound recordings.
 
-Odometry has a scale and a direction of its own, of tyres, slip and pitch. Where both differ from vision's by as much as
-those of sound drives do, nothing tells whether the calibration or the wheels are off by it; that they differ is certain
-all the same, and no estimator's covariance holds it.
+Tyres, slip and pitch give odometry a scale and a direction of its own. Where these differ from vision's by as much as
+in sound drives, the data do not show whether the calibration or the wheels are wrong. The difference is significant all
+the same, and no estimator's covariance accounts for it.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from toolkit.audit.parts.alignment import LARGEST_SCALE_ERROR, SYSTEMATIC_SCALE
 from toolkit.audit.parts.extrinsic import SYSTEMATIC_RAD, angle_of, turn_by_velocities
 from toolkit.audit.parts.one_step import errors_are_independent
 
-# Tracks that creep from image to image make so much more of both (a share, rad) in simulations, where nothing slips.
+# Excess beyond chance (a share, rad) that tracks which drift from image to image cause in simulations without slip.
 SCALE_BY_CREEP, TURN_BY_CREEP_RAD = 0.005, 0.003
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Tell the scale and the direction by which both differ, between chance and what counts as a fault."""
+    """Report differences of scale and direction that are beyond chance and below the limits of a fault."""
     if evidence.intervals is None or evidence.sequence.motion_kind != "twist":
         return None
     differences = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
@@ -63,7 +63,8 @@ def _direction(evidence: Evidence) -> str | None:
 
 
 def _is_no_creep(evidence: Evidence, beyond: float, by_creep: float) -> bool:
-    """Say whether what is beyond chance is more than tracks that creep make of it, or each sighting errs by itself."""
+    """Say whether tracks that drift cannot cause the excess beyond chance: it is larger, or their errors are
+    independent."""
     return beyond > by_creep or errors_are_independent(evidence.step_correlation)
 
 

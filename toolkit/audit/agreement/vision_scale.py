@@ -1,6 +1,7 @@
-"""Vision's steps that are longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
+"""Steps of vision that are longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
 
-A share of the depths scales every step of the camera. Odometry shows it in velocities, an IMU in accelerations.
+A relative error of all depths scales every step of the camera by the same factor. With odometry the velocities show it,
+with an IMU the accelerations.
 """
 
 import numpy as np
@@ -11,18 +12,18 @@ from toolkit.audit.parts.bundle import BASELINE
 from toolkit.audit.parts.calibration_limits import hidden_baseline
 from toolkit.audit.parts.ratios import MOST_RATIO
 
-# Where a fault must be larger than this share to show, it is said.
+# Where only an error larger than this share would be found, the finding is undecided and says so.
 LARGEST_HIDDEN = 0.08
-# Beside odometry a difference is told from chance on (`steady_difference`); where that is more, it is said: 2 % of all
-# disparities make runs on `drive` six times as wrong.
+# With odometry `steady_difference` reports a scale from chance on. Where chance is more than this share, the finding is
+# undecided: an error of 2 % in all disparities makes the errors on `drive` six times as large.
 LARGEST_CHANCE = 0.02
-# Beside an IMU nothing else holds the scale for as long as its noise hides it: a fault of it is as good as all of the
-# drift of a stereo system with an IMU, about a percent of the way.
+# The same limit with an IMU, where only vision determines the scale over the times at which the IMU's noise is large.
+# It is about the drift of a stereo system with an IMU, one percent of the distance.
 LARGEST_HIDDEN_BESIDE_IMU = 0.01
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare the camera's translation with the measured one in size; what is beyond MOST_RATIO is a disagreement."""
+    """Compare the camera's translation with the measured one; a ratio beyond MOST_RATIO is a `disagreement`."""
     if evidence.intervals is None:
         return evidence.blind
     kind, found = evidence.sequence.motion_kind, evidence.alignment
@@ -47,9 +48,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _unseen(evidence: Evidence, least: float) -> Undecided | None:
-    """Say how large a scale must be to be told, where that is much: by this, or by points that are followed for longer.
+    """Return the smallest error of the scale that would be found, where it is large: by the regression or, with an IMU,
+    by the self-calibration.
 
-    ``least`` is from where on the regression's scale counts, infinite where it is not judged.
+    ``least`` is the limit of the regression's scale, infinite where the scale is not judged.
     """
     found, fitted = evidence.alignment, evidence.self_calibration
     if fitted is not None:
@@ -76,7 +78,7 @@ def _unseen(evidence: Evidence, least: float) -> Undecided | None:
 
 
 def _unseen_at_all(scale: float, error: float, hidden: float) -> Undecided | None:
-    """Say from where on beside odometry not even a steady difference is told, where that is much."""
+    """Return, with odometry, the scale below which not even `steady_difference` reports it, where it is large."""
     if hidden < LARGEST_CHANCE:
         return None
     known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, as by chance"
