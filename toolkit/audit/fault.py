@@ -132,8 +132,7 @@ class Evidence:
 
     @cached_property
     def alignment(self) -> Alignment | None:
-        """The scale of vision and the position of the camera; None without ``intervals``, or where they are
-        undetermined."""
+        """The scale of vision and the position of the camera; None without ``intervals``, or where undetermined."""
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property

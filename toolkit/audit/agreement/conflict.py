@@ -45,8 +45,9 @@ _LOWER_QUARTILE = 0.3186
 
 
 class Deviation(NamedTuple):
-    """Samples less camera, ``value`` (n, 3) in ``unit``, at times ``t_s`` (n,) from the first frame; ``what`` is its
-    name.
+    """Samples less camera: ``value`` (n, 3) in ``unit``, at times ``t_s`` (n,) after the first frame.
+
+    ``what`` names the quantity.
 
     ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of n. Where ``telescopes`` it is
     times n: the mean of changes of velocity depends only on the velocities at both ends.
@@ -229,8 +230,7 @@ def _neighbours(values: Array, reach: int) -> Array:
 
 
 def _around(t_s: Array, value: Array) -> Array:
-    """Return the median (n, 3) of the stretch means of values (n, 3) within GRAVITY_S of each time, updated once a
-    second."""
+    """Return the median (n, 3) of the means over stretches of values (n, 3) within GRAVITY_S, updated once a second."""
     if len(t_s) < LEAST_IN_STRETCH:
         return np.zeros_like(value)
     knots_s: Array = np.unique(np.floor(t_s))

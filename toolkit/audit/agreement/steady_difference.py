@@ -63,8 +63,7 @@ def _direction(evidence: Evidence) -> str | None:
 
 
 def _is_no_creep(evidence: Evidence, beyond: float, by_creep: float) -> bool:
-    """Say whether tracks that drift cannot cause the excess beyond chance: it is larger, or their errors are
-    independent."""
+    """Say whether tracks that drift cannot cause the excess: it is larger, or the errors are independent."""
     return beyond > by_creep or errors_are_independent(evidence.step_correlation)
 
 

@@ -48,9 +48,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _unseen(evidence: Evidence, least: float) -> Undecided | None:
-    """Return the smallest error of the scale that would be found, where it is large: by the regression or, with an IMU,
-    by the self-calibration.
+    """Return the smallest error of the scale that would be found, where it is large.
 
+    With an IMU it is that of the self-calibration, where there is one, else that of the regression.
     ``least`` is the limit of the regression's scale, infinite where the scale is not judged.
     """
     found, fitted = evidence.alignment, evidence.self_calibration

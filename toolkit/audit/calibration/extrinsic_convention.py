@@ -1,11 +1,11 @@
-"""An extrinsic of a format that does not settle its direction, nor the axes of its camera.
+"""An extrinsic whose direction and camera axes its file format leaves open.
 
-The same four by four numbers can take the IMU to the camera or the camera to the IMU, and the camera's axes can be
-x right, y down, z forward (optical) or x forward, y left, z up (regular). Points triangulated in one frame, moved
-by the motion samples through each of the four and projected into the next, miss the tracks the least through the right
-one. The intervals' medians decide, which wrong matches do not reach. Two readings whose cameras look nearly the same
-way, as an extrinsic in regular axes and its inverse, differ in where the camera is: then it decides where, in turns,
-the camera's own velocity puts it.
+The same 4 x 4 matrix can take coordinates from the IMU to the camera or from the camera to the IMU, and the camera's
+axes can be x right, y down, z forward (optical) or x forward, y left, z up (regular). Points triangulated in one frame,
+moved by the motion samples through each of the four readings and projected into the next frame, have the smallest
+residuals under the right one. Medians over each interval are compared, which wrong matches hardly affect. Two readings
+under which the camera looks in nearly the same direction, as an extrinsic in regular axes and its inverse, differ in
+the position of the camera; the camera's own velocity in turns then decides between them.
 """
 
 from dataclasses import replace
@@ -19,15 +19,15 @@ from toolkit.audit.parts.robust import Scalar, mean_in_sigmas, slope
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
 from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence
 
-# Mean difference of the logarithms of two readings' residuals, in its own standard errors: between readings that a
-# file allows alike it needs to be beyond chance only (intervals are correlated over about a second).
+# Least mean difference of the logarithms of two readings' residuals, in its own standard errors. The file allows all
+# readings, so the difference only has to be beyond chance (intervals are correlated over about a second).
 AGAINST_SECOND = 4.0
-# Cameras that look the same way to this angle: there the noise of the samples, which the lever arm makes a motion of
-# the camera, moves the residuals more than which reading is right.
+# Two readings look the same way if their cameras differ by less than this angle. The noise of the samples, which the
+# lever arm turns into motion of the camera, then changes the residuals more than the choice of the reading.
 SAME_WAY_RAD = 0.05
-# Largest standard error of the share of the way between two readings: twice that is the way to the middle.
+# Largest standard error of the share between two readings: two of them reach from either reading to the middle.
 LARGEST_ERROR = 0.25
-# Optical axes (right, down, forward) in regular ones (forward, left, up).
+# From optical axes (right, down, forward) to regular ones (forward, left, up).
 _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 
 
@@ -69,7 +69,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _readings(T_imu_cam: Array) -> dict[str, Array]:
-    """Return T_imu_cam (4, 4), of optical axes, in the four readings of the one given; that itself is the first."""
+    """Return T_imu_cam (4, 4), with optical camera axes, in the four readings of the given one, which is the first."""
     inverse = se3_inverse(T_imu_cam)
     return {
         "as given, camera axes optical": T_imu_cam,
@@ -80,11 +80,11 @@ def _readings(T_imu_cam: Array) -> dict[str, Array]:
 
 
 def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scalar | None:
-    """Return how far the measured velocity is on its way from that through one extrinsic to that through another.
+    """Return where the measured velocity lies between those that two extrinsics predict: 0 is the first, 1 the other.
 
-    Constant differences do not count, for a wheel's slip and an error of the rotation are such. The measured rate of
-    rotation is the instrument, which the camera's noise cannot touch: its rotation and its velocity err together. None
-    where no velocity is measured, or there was too little rotation to tell.
+    Constant differences are removed, because slip of a wheel and an error of the rotation cause them. The measured rate
+    of rotation is the instrument: the errors of the camera's rotation and velocity are correlated, and those of the
+    gyro are independent of both. None where no velocity is measured, or there is too little rotation.
     """
     if intervals.v_mps is None:
         return None
@@ -95,7 +95,7 @@ def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scal
 
 
 def _velocities(intervals: Intervals, T_imu_cam: Array) -> Array:
-    """Return the velocity (M, 3) of the IMU that the camera's own motion has through an extrinsic."""
+    """Return the velocity (M, 3) of the IMU by the camera's own motion and an extrinsic."""
     w_imu = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
     return np.asarray(intervals.v_cam_mps @ T_imu_cam[:3, :3].T - np.cross(w_imu, T_imu_cam[:3, 3]))
 
@@ -109,7 +109,7 @@ def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
 
 
 def _settled(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
-    """Return the sequence with this extrinsic, which is in no doubt any more."""
+    """Return the sequence with this extrinsic, and without the fact that its convention is in doubt."""
     facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_IN_DOUBT)
     provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is taken {reading}"))
     return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)

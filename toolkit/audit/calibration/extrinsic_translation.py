@@ -1,10 +1,9 @@
-"""An extrinsic whose translation belongs to its inverse.
+"""An extrinsic whose translation is that of its inverse.
 
-A file can hold a rotation IMU -> camera beside the camera's position in the IMU frame; inverted like a proper
-transform it puts the camera at p = -R_imu_cam t instead of t. Turns distinguish the two: the camera's velocity differs
-from the IMU's by w x p. Where it is, the regression over the whole file says that also lets the scale and the turn of
-the camera be a little off, as they are in real recordings; how far that is on the way from the given p to the candidate
-t decides.
+A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like a rigid
+transform, it puts the camera at p = -R_imu_cam t instead of t. Turns distinguish the two, because the camera's velocity
+differs from the IMU's by w x p. The regression of `parts.alignment` over the whole recording estimates the position,
+with the scale and the rotation of the camera as further unknowns. Where it lies between p and t decides.
 """
 
 from dataclasses import replace
@@ -17,7 +16,7 @@ from toolkit.geometry import se3
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Weigh the translation as given against that of the inverse; replace it where the latter is far likelier."""
+    """Compare the translation as given with that of the inverse; replace it where the latter is far more likely."""
     if evidence.intervals is None:
         return evidence.blind
     if evidence.intervals.v_mps is None or evidence.alignment is None:

@@ -1,7 +1,7 @@
-"""Intrinsics that belong to other pixels: a principal point outside of what was seen, a focal length no lens has.
+"""Intrinsics that do not fit the pixels: a principal point outside the sightings, a focal length that no lens has.
 
-Both are named from the sightings' range, and accused only where other values let the tracks follow one rigid motion
-of the camera better, whatever the motion samples say.
+Suspects are found from the range of the sightings. They are reported only where ordinary values let the tracks follow
+one rigid motion of the camera better. The motion samples are not used.
 """
 
 from dataclasses import replace
@@ -16,25 +16,28 @@ from toolkit.geometry import Array
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence, StereoRig, is_measured
 
-# Quantiles of the sightings that are their range: tracks may slide out of the image.
+# Quantiles of the sightings that are taken as their range: tracks may slide out of the image.
 RANGE = (0.005, 0.995)
-# The range over the focal length: 2 is a view of 90 degrees, 12 one of 161; below 0.02 a view of 1 degree.
+# Limits of the range over the focal length: 2 is a view of 90 degrees, 12 one of 161 degrees, 0.02 one of 1 degree.
 WIDEST, NARROWEST = 12.0, 0.02
-# An image in pixels is wider than this, one in multiples of the focal length is not.
+# Coordinates in pixels exceed this value, normalised ones (in multiples of the focal length) do not.
 NORMALISED = 10.0
-# What a usual lens has, and the least factor between two sizes of an image; in width and height they are alike to this.
+# A usual range over the focal length, also the least factor between two sizes of an image; and the largest ratio of the
+# factors of width and height for one change of size.
 USUAL, ALIKE = 1.5, 1.3
-# Share by which other intrinsics must lower the tracks' residual: 0.15 and more where the point is off by half a view.
+# Least share by which other intrinsics must lower the tracks' residual. A principal point that is wrong by half the
+# view gives 0.15 and more.
 LEAST_GAIN = 0.05
 TRIED_FRAMES = 300
-# A principal point that is farther than this share of their range from the middle of the sightings is tried in it.
+# Where the principal point is farther than this share of the range from the middle of the sightings, the middle is
+# tried.
 MOST_OFF_MIDDLE = 0.2
-# Pixels are square but for a rescaled image's.
+# Largest ratio of fy and fx in either direction: pixels are square unless an image was rescaled.
 MOST_STRETCHED = 1.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Name the intrinsics that the sightings cannot have; without images there is no way to mend them."""
+    """Report the intrinsics that contradict the sightings; the true ones are not in the data, so there is no repair."""
     sequence = evidence.sequence
     uv_px = sequence.observations.uv_px
     if len(uv_px) < LEAST_INTERVALS or not is_measured(uv_px).all():
@@ -66,7 +69,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _normalised(rig: StereoRig, low: Array, high: Array) -> Symptom:
-    """Tell of sightings that K was taken off already: x / z and y / z of a point, not its pixels."""
+    """Report sightings in normalised image coordinates, x / z and y / z of a point, instead of pixels."""
     u, v = (f"{a:.2g} to {b:.2g}" for a, b in zip(low, high, strict=True))
     return Symptom(
         count=1,
@@ -78,7 +81,7 @@ def _normalised(rig: StereoRig, low: Array, high: Array) -> Symptom:
 
 
 def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, Any], str]]:
-    """Return ordinary values instead of those that sightings from ``low`` to ``high`` (u, v) cannot have, and why."""
+    """Return ordinary values for the fields that contradict sightings from ``low`` to ``high`` (u, v), and why."""
     found: list[tuple[dict[str, Any], str]] = []
     middle, width_px = 0.5 * (low + high), float((high - low).max())
     centre = np.array([rig.cx_px, rig.cy_px])
@@ -101,7 +104,7 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
 
 
 def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None:
-    """Return the K of images that are larger or smaller by one factor, if that brings the principal point there."""
+    """Return the K of images larger or smaller by one factor, if it puts the principal point into the middle."""
     ratio = middle / np.maximum([rig.cx_px, rig.cy_px], 1.0)
     factor = float(np.sqrt(ratio[0] * ratio[1]))
     if ratio.max() > ALIKE * ratio.min() or 1.0 / USUAL < factor < USUAL:
@@ -116,7 +119,7 @@ def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None
 
 
 def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
-    """Return the median residual of the camera's own best motion; infinite where there is none."""
+    """Return the median residual (px) under the camera's own best motion; infinite where there is none."""
     own_px = own_one_step_px(sequence, camera)
     return own_px if np.isfinite(own_px) else np.inf
 

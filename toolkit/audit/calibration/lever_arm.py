@@ -1,8 +1,9 @@
-"""A camera that stands elsewhere on the vehicle than the extrinsic says, or velocities of another point of it.
+"""A camera at another position than the extrinsic says, or velocities of another point of the vehicle.
 
-In a turn of rate w a camera that is off by p moves by w x p against what is expected of it: residuals that come and go
-with the turns. Neither source tells which is wrong. Beside an IMU the points that are followed for a second show it
-better, where a calibration near the given one fits them: what a regression of a few seconds errs by lasts as long.
+In a turn of rate w, a camera whose position is wrong by p moves by w x p more than expected, so that residuals appear
+in turns only. The data do not show which of the two is wrong. With an IMU the self-calibration, which follows points
+over seconds, is used where it finds a calibration near the given one. The regression of `parts.alignment` over a few
+seconds has errors that last as long as these and that its standard errors do not contain.
 """
 
 from typing import NamedTuple
@@ -16,25 +17,26 @@ from toolkit.audit.parts.extrinsic import MOST_SIGMAS, is_there, metres, share_o
 from toolkit.audit.parts.self_calibration import OFF_BY
 from toolkit.geometry import Array, BoolArray
 
-# Each axis counts from so many standard errors on (by the self-calibration, as many as all that it finds), beyond what
+# Limits of an axis: so many standard errors (by the self-calibration, as many as for its other unknowns) beyond what
 # sound recordings at hand have (m). The velocities of cars are those of another point, or slip: 0.43 to 0.85 m along x
-# in all of seven; beside IMUs a regression errs by 0.06 m at most, a self-calibration by nothing.
+# in all seven. With IMUs the regression is off by 0.06 m at most, a self-calibration by nothing.
 SIGMAS, SYSTEMATIC_M, SYSTEMATIC_FITTED_M = 5.0, {"twist": 0.6, "imu": 0.05}, 0.015
-# An axis about which the position is known worse than this (m) is not judged.
+# An axis along which the standard error of the position is larger than this (m) is not judged.
 LARGEST_ERROR_M = 0.25
-# Where a camera must be farther off than this (m) to be told, it is said.
+# Where only a camera farther off than this (m) would be found, the finding is undecided and says so.
 HIDDEN_M = {"twist": 1.2, "imu": 0.5}
-# The prior of the self-calibration is taken off again: by the share of what is known that the data tell, or this.
+# The prior of the self-calibration is removed again, by the share of the information that comes from the data; the
+# share is no less than this.
 LEAST_BY_DATA = 1e-3
-# A place that a slip of who wrote the file would give is told if it is so far (m) from the one given; what sound
-# recordings have stands beside the scatter (m).
+# A position that a mistake in the file explains must be so far (m) from the given one. The second number (m) is the
+# systematic error that is added to the standard errors.
 LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
 class _Place(NamedTuple):
-    """What the camera's position in the IMU frame lacks (3,) m, its standard errors (3,) m, and from where it counts.
+    """Correction of the camera's position in the IMU frame, its standard errors, and its limits, (3,) m each.
 
-    ``slip`` says in words by what slip it would be there, if one explains it.
+    ``slip`` names the mistake in writing the file that explains the correction, if there is one.
     """
 
     lacking_m: Array
@@ -44,7 +46,7 @@ class _Place(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Name the axes along which the camera is not where the extrinsic has it."""
+    """Report the axes along which the camera is not at the position of the extrinsic."""
     if evidence.intervals is None:
         return evidence.blind
     found, kind = _place(evidence), evidence.sequence.motion_kind
@@ -69,7 +71,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _hidden(found: _Place, decidable: BoolArray, most_m: float) -> Undecided | None:
-    """Say how far off the camera could be along the axes that are judged, where that is much."""
+    """Return how far off the camera could be along the judged axes without being found, where that is far."""
     far = np.flatnonzero(decidable & (found.least_m > most_m)).tolist()
     if not far:
         return None
@@ -78,7 +80,7 @@ def _hidden(found: _Place, decidable: BoolArray, most_m: float) -> Undecided | N
 
 
 def _place(evidence: Evidence) -> _Place | None:
-    """Return the place by the self-calibration or, where there is none, by the regression."""
+    """Return the position by the self-calibration or, where there is none, by the regression."""
     fitted, regressed = evidence.self_calibration, evidence.alignment
     if fitted is not None:
         by_data = np.maximum(1.0 - (fitted.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
@@ -94,7 +96,7 @@ def _place(evidence: Evidence) -> _Place | None:
 
 
 def _slip(lacking_m: Array, cov_m2: Array, T_imu_cam: Array) -> str:
-    """Say how the translation was written down otherwise than it is meant, if the camera then is where it is found."""
+    """Return in words the mistake in the translation that puts the camera where it was found; empty if none does."""
     given = T_imu_cam[:3, 3]
     meant = {"its sign were changed": -given, "it were that of the inverse": -T_imu_cam[:3, :3].T @ given}
     likely = {how: place for how, place in meant.items() if _explains(place - given, lacking_m, cov_m2)}
@@ -105,7 +107,7 @@ def _slip(lacking_m: Array, cov_m2: Array, T_imu_cam: Array) -> str:
 
 
 def _explains(way_m: Array, lacking_m: Array, cov_m2: Array) -> bool:
-    """Say whether the end of a way (3,) m from the given place is where the camera is, and not beside the way."""
+    """Say whether the camera is at the end of a vector (3,) m from the given position, and not beside the vector."""
     if float(np.linalg.norm(way_m)) < LEAST_APART_M:
         return False
     cov_m2 = cov_m2 + SLIP_M**2 * np.eye(3)

@@ -1,9 +1,9 @@
-"""A calibration that is nearly right: the camera turned in its mount, a principal point or a scale a little off.
+"""Small errors of the calibration: the rotation of the camera, a focal length, the principal point, a sensor's scale.
 
-Too little to be told from noise in single frames, and enough to bend every trajectory. From frame to frame the
-recording does not say what is wrong: a camera turned by an angle and a principal point off by the focal length times
-that angle look the same. Points that are followed for a second tell most of it apart (`parts.self_calibration`); beside
-odometry, which slips for as long, the turn from frame to frame is judged as well.
+They are too small to show in single frames and large enough to bend every trajectory. From frame to frame, a camera
+rotated by an angle cannot be distinguished from a principal point that is off by the focal length times that angle.
+Points followed over a second distinguish most of the errors (`parts.self_calibration`). With odometry, whose slip lasts
+as long, the rotation estimated from frame to frame is judged as well.
 """
 
 from typing import NamedTuple
@@ -26,12 +26,12 @@ SIGMAS = 5.0
 # recordings, two beside odometry exceed one by 0.011 at most beyond five standard errors, and none beside an IMU
 # exceeds it. Chosen with them in view.
 SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
-# Where a turn must be larger than this to be seen, it is said.
+# Where only a rotation (rad) larger than this would be found, the finding is undecided and says so.
 LARGEST_RAD = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare directions and sizes of the camera's motion with the measured ones, or adjust the calibration to them."""
+    """Report the errors that the self-calibration, the direction of the motion, or ratios of rates and forces show."""
     intervals = evidence.intervals
     if intervals is None:
         return evidence.blind
@@ -58,14 +58,14 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 class _Calibration(NamedTuple):
-    """What is wrong, and in words what would not show."""
+    """What is wrong, and in words which errors would not be found (None where these are small)."""
 
     wrongs: list[Wrong]
     hidden: str | None
 
 
 def _calibration(evidence: Evidence, intervals: Intervals) -> _Calibration:
-    """Judge by the self-calibration; beside odometry, and where there is none, also from frame to frame."""
+    """Judge by the self-calibration; with odometry, and where there is none, also by the motion from frame to frame."""
     sequence = evidence.sequence
     kind, found = sequence.motion_kind, evidence.self_calibration
     if kind == "twist":
@@ -87,7 +87,7 @@ def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> 
 
 
 def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
-    """Judge where the camera looks from frame to frame, which leaves the intrinsics open."""
+    """Judge the rotation of the camera by the motion from frame to frame, which does not determine the intrinsics."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
     whole = None if evidence.alignment is None else evidence.alignment.by_velocities
     turn = turn_by_rotations(intervals, rig.T_imu_cam) if whole is None else turn_by_velocities(whole)

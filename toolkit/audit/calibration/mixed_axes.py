@@ -1,14 +1,14 @@
-"""Motion samples and extrinsic that follow different conventions for axes, or for the direction of the extrinsic.
+"""Motion samples and extrinsic with different conventions of axes, or an extrinsic in the inverse direction.
 
-The camera's own motion, taken through the extrinsic, must be the measured motion. Either the body's axes are named
-otherwise, and the extrinsic turns as a whole, or the camera's are, and it turns in its place: 24 right-handed ways to
-name three axes each, and the inverse of the extrinsic. The one that explains the samples best is found; if it is not
-the recording's own, and the difference is beyond doubt, it is taken. Which of the two places the camera has, turns of
-the vehicle tell, or it is said that they do not. A gyro bias does not matter here: the median is off.
+The camera's own motion, transformed by the extrinsic, must equal the measured motion. Three axes have 24 right-handed
+conventions. If the body's axes follow another one, the whole extrinsic is rotated; if the camera's do, the camera is
+rotated at its position. All of these and the inverse of the extrinsic are compared. The one that explains the samples
+best is taken if it is not the given one and is better beyond doubt. Turns of the vehicle decide between two possible
+positions of the camera, or the finding says that they do not. Medians are subtracted, so a gyro bias has no effect.
 
-The rotations alone must not speak against it, over all ways to exchange and negate three channels: where they do, some
-channels are wrong and not the extrinsic, and nothing is repaired. Velocities alone decide nothing: cars slip sideways,
-against the signs of the small components.
+A convention is taken only if the rotations alone do not contradict it, among all 48 ways to exchange and negate three
+channels. Where they do, channels of the samples are wrong and not the extrinsic, and nothing is repaired. Velocities
+alone decide nothing, because cars slip sideways, which changes the signs of the small components.
 """
 
 from dataclasses import replace
@@ -26,23 +26,23 @@ from toolkit.audit.parts.one_step import median_one_step_px
 from toolkit.audit.parts.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, cauchy, mean_in_sigmas
 from toolkit.geometry import Array, se3, se3_inverse
 
-# Mean difference of two explanations in its own standard errors: a doubt about the file as given must be far
-# beyond chance (intervals are correlated over about a second), a choice among repairs only beyond chance.
+# Least mean difference of the costs of two readings, in its own standard errors. To reject the file as given it must be
+# far beyond chance (intervals are correlated over about a second), to choose among repairs only beyond chance.
 AGAINST_GIVEN = 8.0
 AGAINST_SECOND = 4.0
-# Cameras that look the same way to this angle: a turn of the body's axes and one of the camera's.
+# Two readings look the same way if their cameras differ by less than this angle.
 SAME_WAY_RAD = 0.2
-# Places that are no further apart are one.
+# Positions nearer than this to each other are taken as one.
 NEAR_M = 0.01
 _OWN = "x, y, z"
 
 
 class Reading(NamedTuple):
-    """An extrinsic (4, 4) that another convention makes of the given one.
+    """An extrinsic (4, 4) under another convention than the given one.
 
-    ``name`` says which, ``cause`` what is wrong with the given one, and ``done`` what is done to it. ``other_m`` (3,)
-    is where else the camera may be: a turn of the body's axes moves its place as well, unless that was measured by hand
-    in the right ones, and one of the camera's does not.
+    ``name`` is the convention, ``cause`` says what is wrong with the given extrinsic, and ``done`` what is done to it.
+    ``other_m`` (3,) is the other possible position of the camera: a rotation of the body's axes also rotates the
+    position, unless that was measured in the right axes; a rotation of the camera's axes does not.
     """
 
     T_imu_cam: Array
@@ -53,7 +53,7 @@ class Reading(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Find the extrinsic with which samples and camera agree; take it where it is not the given one."""
+    """Find the extrinsic under which samples and camera agree; take it where it is not the given one."""
     if evidence.intervals is None:
         return evidence.blind
     given = evidence.sequence.rig.T_imu_cam
@@ -102,7 +102,7 @@ def _exchanged(alone: str) -> Symptom:
 
 
 def _readings(given: Array) -> tuple[Reading, ...]:
-    """Return the extrinsic in all conventions: as given, the body's axes named otherwise, the camera's, inverted."""
+    """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
     place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
     as_given = Reading(given, _OWN, "", "", place_m)
     return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
@@ -127,16 +127,17 @@ def _inverse(given: Array) -> Reading:
 
 
 def _best_two(readings: tuple[Reading, ...], costs: Array) -> tuple[int, int]:
-    """Return the best reading and the best that looks another way."""
+    """Return the best reading, and the best among those under which the camera looks another way."""
     order = [int(k) for k in np.argsort(costs.mean(axis=1))]
     twins = _twins(readings, order[0])
     return order[0], next(k for k in order if k not in twins)
 
 
 def _twins(readings: tuple[Reading, ...], one: int) -> list[int]:
-    """Return the readings that look as one does, itself among them: the camera's axes turned, or the body's.
+    """Return the readings under which the camera looks the same way as under one, which is among them.
 
-    What is given and its inverse are nobody's twins.
+    A rotation of the camera's axes and one of the body's can be such a pair. The given extrinsic and its inverse have
+    none.
     """
     R_imu_cam = np.stack([reading.T_imu_cam[:3, :3] for reading in readings])
     apart_rad = np.linalg.norm(R_imu_cam - R_imu_cam[one], axis=(1, 2)) / np.sqrt(2.0)  # of small angles
@@ -145,7 +146,7 @@ def _twins(readings: tuple[Reading, ...], one: int) -> list[int]:
 
 
 def _settled(evidence: Evidence, intervals: Intervals, twins: list[Reading]) -> tuple[Reading, str]:
-    """Return the best of readings that look the same way, at the place that turns tell, and the doubt in words."""
+    """Return the best of readings that look the same way, at the position that turns show, and any doubt in words."""
     costs = _costs(intervals, np.stack([one.T_imu_cam for one in twins])).mean(axis=1)
     place_m, doubt = _placed(evidence, intervals, twins[int(np.argmin(costs))])
     placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in twins]
@@ -154,7 +155,7 @@ def _settled(evidence: Evidence, intervals: Intervals, twins: list[Reading]) -> 
 
 
 def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple[Array, str]:
-    """Return the place (3,) m of a reading's camera, or its other one where turns have it there."""
+    """Return the position (3,) m of a reading's camera, or its other one where turns show that, and doubt in words."""
     here, other = reading.T_imu_cam[:3, 3], reading.other_m
     turned = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=reading.T_imu_cam))
     found = alignment(turned, evidence.camera_motion, intervals)
@@ -169,7 +170,7 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple
 
 
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
-    """Name the axes of an extrinsic that the gyro's channels are: its own ones, but where others are beyond doubt."""
+    """Name the axes of an extrinsic that the gyro's channels measure: x, y, z unless others are better beyond doubt."""
     signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
     costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
     best = int(np.argmin(costs.mean(axis=1)))
@@ -177,7 +178,7 @@ def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
 
 
 def _costs(intervals: Intervals, candidates: Array) -> Array:
-    """Return how badly each extrinsic (C, 4, 4) explains each interval (C, M): a Cauchy log-likelihood."""
+    """Return the negative Cauchy log-likelihood (C, M) of each interval under each extrinsic (C, 4, 4)."""
     R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
     w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)
     costs = cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)

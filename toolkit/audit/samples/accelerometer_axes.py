@@ -1,8 +1,8 @@
-"""An accelerometer whose channels are exchanged or have the wrong sign, against a gyro and a camera that agree.
+"""An accelerometer whose channels are exchanged or have the wrong sign, while gyro and camera agree.
 
-The change of the camera's velocity less the specific force is gravity, the same all along in the axes of one frame,
-into which the gyro turns everything. All 48 ways to exchange and negate three channels are tried; the right one leaves
-the least. What turns about one axis only, and hardly accelerates, tells few of them apart.
+In the axes of one frame, by the gyro, the change of the camera's velocity less the specific force is gravity, which is
+constant. All 48 ways to exchange and negate three channels are tried; the right one leaves the smallest variation. A
+motion that turns about one axis only and hardly accelerates distinguishes few of them.
 """
 
 from typing import NamedTuple
@@ -17,22 +17,25 @@ from toolkit.audit.parts.robust import cauchy, mean_in_sigmas
 from toolkit.geometry import Array, IntArray, so3_exp
 from toolkit.resampling import NS_PER_S
 
-# The camera's velocity changes by more than its noise over so long; the gyro drifts little over a window.
+# Durations (s). Over a stride the camera's velocity changes by more than its noise; over a window the gyro drifts
+# little.
 STRIDE_S, WINDOW_S = 0.5, 10.0
-# A stride begins so many times in the length of one.
+# So many strides begin within the length of one.
 OVERLAP = 2
 LEAST_STRIDES = 20
-# What such a change of velocity is good for (m/s^2).
+# Accuracy of such a change of velocity (m/s^2).
 LEAST_SPREAD = 0.1
-# Another order must be beyond doubt (sound recordings have the given one as the best), and leave at most this share of
-# what that leaves: other faults are explained in part.
+# Another order must be better than the given one by so many standard errors, and leave at most this share of what the
+# given one leaves, because an order can also explain a part of other faults. In sound recordings the given order is the
+# best.
 AGAINST_GIVEN, MOST_LEFT = 5.0, 0.7
 
 
 class _Changes(NamedTuple):
-    """Over M strides: the change of velocity (M, 3) and what each channel makes along each axis (M, 3, 3, 3), m/s^2.
+    """Over M strides: the change of velocity (M, 3), and that of each channel in each axis (M, 3, 3, 3), in m/s^2.
 
-    ``along`` is [stride, axis of the IMU, channel, axis of the first frame]; ``window`` (M,) numbers the windows.
+    ``along`` is the mean of each channel if it measured each axis: [stride, axis of the IMU, channel, axis of the first
+    frame]. ``window`` (M,) numbers the windows.
     """
 
     velocity: Array
@@ -41,7 +44,7 @@ class _Changes(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Name the order and the signs of the channels with which the specific force is the camera's, if it is another."""
+    """Report the order and the signs of the channels that fit the camera's motion, if they are not the given ones."""
     intervals, sequence = evidence.intervals, evidence.sequence
     if intervals is None or sequence.motion_kind != "imu":
         return None
@@ -72,7 +75,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _changes(evidence: Evidence, intervals: Intervals) -> _Changes:
-    """Take the camera's velocities in the middles of the intervals, turned by the gyro less its bias to the first."""
+    """Return changes of the camera's velocity between the middles of intervals, in axes of the first frame."""
     sequence, camera = evidence.sequence, evidence.camera_motion
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ R_imu_cam.T, axis=0)
@@ -101,7 +104,7 @@ def _changes(evidence: Evidence, intervals: Intervals) -> _Changes:
 
 
 def _left(changes: _Changes, order: Array) -> Array:
-    """Return what an order (3, 3) of the channels leaves of the changes (M, 3), less the median of each window."""
+    """Return the changes (M, 3) less the specific force in an order (3, 3) of channels, about the window's median."""
     left = changes.velocity - np.einsum("kaci,ac->ki", changes.along, order.T)
     for window in np.unique(changes.window):
         here = changes.window == window

@@ -1,8 +1,8 @@
-"""An accelerometer that reads another gravity from some time on: another range, a knock, a scale that was set anew.
+"""An accelerometer that reads another gravity from some time on: its range or scale was changed, or it was knocked.
 
-The camera's velocity less what the IMU gained falls with gravity. How fast it does within a few seconds, in whatever
-direction, is the gravity that the accelerometer reads there: a camera that sees well knows it to some thousandths, and
-a gyro's drift turns its direction alone.
+The camera's velocity less the integrated specific force changes by gravity. The size of its slope over a few seconds is
+the gravity that the accelerometer reads there, to a few thousandths with good tracks. The gyro's drift changes only its
+direction, which is not used.
 """
 
 import numpy as np
@@ -13,18 +13,20 @@ from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, 
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 
-# A change counts between the parts before and after one of these shares of the recording, by so many standard errors,
-# and beyond a share of gravity: parts of sound recordings at hand have 0.3 % at most beyond five standard errors, and
-# simulated flights whose tracks creep from image to image 0.8 %. Chosen with them in view.
+# The parts before and after each of these shares of the recording are compared. A change must be beyond so many
+# standard errors and a share of gravity, a larger one unless the errors of the tracks are independent. Beyond five
+# standard errors, parts of sound recordings at hand have 0.3 % at most, and simulated flights whose tracks drift from
+# image to image 0.8 %. Chosen with them in view.
 CUTS, SIGMAS, SYSTEMATIC, BY_CREEP = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
-# Gravity is read within windows of so long (s), shorter than the gyro's drift bends, each of so many intervals.
+# Length (s) of the windows in which gravity is read, short enough for the gyro's drift to be negligible, and the least
+# number of intervals of a window.
 WINDOW_S, LEAST_INTERVALS = 4.0, 12
-# Where a change must be larger than this share to show, it is said.
+# Where only a change larger than this share of gravity would be found, the finding is undecided and says so.
 LARGEST_HIDDEN = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare the gravity that is read before and after."""
+    """Compare the gravity that is read before and after three times."""
     sequence = evidence.sequence
     if sequence.motion_kind != "imu":
         return None
@@ -55,7 +57,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _step(t_s: Array, fallen: Array, known: BoolArray, at_s: float) -> Scalar | None:
-    """Return how much more gravity is read after a time than before it (m/s^2); None where one of them is not known."""
+    """Return how much more gravity (m/s^2) is read after a time than before it; None where one of both is not known."""
     before, after = _gravity(t_s, fallen, known & (t_s < at_s)), _gravity(t_s, fallen, known & (t_s >= at_s))
     if before is None or after is None:
         return None
@@ -63,7 +65,7 @@ def _step(t_s: Array, fallen: Array, known: BoolArray, at_s: float) -> Scalar | 
 
 
 def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
-    """Return the mean of the gravity (m/s^2) read in the windows of some rows (n,), by how well each is known."""
+    """Return the weighted mean of the gravity (m/s^2) read in the windows of some rows (n,), and its standard error."""
     at = np.flatnonzero(rows)
     if at.size < LEAST_INTERVALS:
         return None
@@ -82,7 +84,7 @@ def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
 
 
 def _read(t_s: Array, fallen: Array) -> tuple[float, float]:
-    """Return how fast velocities (n, 3) at times (n,) fall (m/s^2), and its standard error, with Cauchy weights."""
+    """Return the size of the slope (m/s^2) of velocities (n, 3) at times (n,), and its error, with Cauchy weights."""
     weight = np.ones(len(t_s))
     for _ in range(ITERATIONS):
         share = weight / weight.sum()

@@ -1,8 +1,8 @@
-"""Motion samples that come in steps: of a converter of few bits, or of a log of few digits.
+"""Motion samples that come in steps, because a converter has few bits or a log few digits.
 
-Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals", 1948); where
-a vehicle goes evenly they are the same for seconds, which no white noise is. Values that come in steps repeat, and no
-two of them are closer than one; of a sensor with noise nearly all are different.
+Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals", 1948). While
+a vehicle moves uniformly they stay the same for seconds, so they are not white noise. Rounded values repeat, and
+different ones are at least a step apart; without rounding, noise makes nearly all values different.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ from toolkit.geometry import Array
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistNoise
 from toolkit.resampling import NS_PER_S
 
-# Of fewer samples, or of fewer different values, nothing is said.
+# Fewer samples, or fewer different values, are not judged.
 LEAST_SAMPLES, LEAST_VALUES = 100, 5
-# Rounding counts from this share of the stated standard deviation of a sample on, as that of pixels does.
+# Rounding is reported from this share of the stated standard deviation of a sample on, as for pixels.
 MOST_SHARE = 0.5
 _SENSORS = {
     "twist": (("velocities", "m/s"), ("rates of rotation", "rad/s")),
@@ -25,7 +25,7 @@ _SENSORS = {
 
 
 class _Coarse(NamedTuple):
-    """The largest step of a sensor's axes beside the noise stated of one, in its unit."""
+    """The step of a sensor's axis, and the stated standard deviation of a sample, in its unit."""
 
     step: float
     stated: float
@@ -36,7 +36,7 @@ class _Coarse(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Tell the steps of the samples whose rounding is no little part of the stated noise."""
+    """Report the steps of the samples where the rounding is more than MOST_SHARE of the stated noise."""
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or sequence.motion.t_ns.size < LEAST_SAMPLES:
         return None
@@ -71,7 +71,7 @@ def _stated(noise: MotionNoise) -> Array:
 
 
 def _step(column: Array) -> float:
-    """Return the least distance of two values (S,) that differ, 0 where these are few or most are different."""
+    """Return the least distance of two different values (S,); 0 where few or most of the values are different."""
     distinct = np.unique(column[np.isfinite(column)])
     if not LEAST_VALUES <= distinct.size < column.size // 2:
         return 0.0

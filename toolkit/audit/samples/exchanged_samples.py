@@ -1,7 +1,8 @@
-"""Velocities where the rates of rotation belong, and these in their place; with an IMU the two sensors.
+"""Velocities and rates of rotation in each other's columns; with an IMU, specific forces and rates.
 
-A vehicle goes faster than it turns, in numbers, and an accelerometer that hardly accelerates reads gravity. Where the
-samples have both sizes the other way round, by far, and the right way once they are exchanged, they were exchanged.
+In SI units the speed of a vehicle exceeds its rate of rotation by far, and specific force is gravity on average. Where
+the sizes of the samples contradict the camera's motion and gravity by far, and agree once the columns are exchanged,
+the columns were exchanged.
 """
 
 from dataclasses import replace
@@ -13,14 +14,14 @@ from toolkit.audit.parts.ratios import force_ratio, is_from_scatter, rotation_ra
 from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.sequence import Sequence
 
-# As given a size is off by more than this factor, and exchanged both are within these of what camera and gravity say:
-# far from any unit that has a factor of its own, and as near as sound recordings are.
+# As given a size is wrong by more than the first factor; exchanged, both are right within the second, as in sound
+# recordings.
 LEAST_FACTOR, MOST_FACTOR = 3.0, 1.25
 _OTHER_WAY = [3, 4, 5, 0, 1, 2]
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Exchange the samples' two halves where that alone makes sense of both."""
+    """Exchange linear and angular columns where this alone makes both agree with camera and gravity."""
     sequence = evidence.sequence
     if evidence.intervals is None or not _is_off(evidence):
         return None
@@ -39,7 +40,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _exchanged(sequence: Sequence) -> Sequence:
-    """Return the sequence with both halves of the samples exchanged, and the noise that was estimated from them."""
+    """Return the sequence with linear and angular columns exchanged, and the noise if it was estimated from them."""
     motion, noise = sequence.motion, sequence.noise
     exchanged = replace(sequence, motion=motion.of(motion.t_ns, motion.values[:, _OTHER_WAY]))
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
@@ -67,7 +68,7 @@ def _fits(evidence: Evidence) -> bool:
 
 
 def _sizes(sequence: Sequence) -> str:
-    """Return the median sizes of both halves of the samples, as they are named."""
+    """Return the median sizes of linear and angular columns as text."""
     first, second = (float(np.median(np.linalg.norm(half, axis=1))) for half in np.split(sequence.motion.values, 2, 1))
     unit = "m/s^2" if sequence.motion_kind == "imu" else "m/s"
     return f"{first:.2g} {unit} and {second:.2g} rad/s (medians)"

@@ -1,10 +1,12 @@
-"""A constant bias of the gyro: reported and left to the estimators, unless their prior denies it.
+"""A constant bias of the gyro: reported and left to the estimators, unless the recording's prior excludes it.
 
-Where the vehicle stands, its gyro must read nothing. An IMU's bias is one of the unknowns of its self-calibration, good
-to 0.002 rad/s; another recording without a standstill is compared with the rotation its own tracks show from frame to
-frame, which is good to half a degree a second only. An estimator whose prior has 0 +- 0.0005
-rad/s and that meets a bias of 0.05 believes the prior and loses its way: the prior is then widened by what it lacks.
-Beside odometry that has no prior, estimators begin with a bias of none: what is too much for that is taken off.
+With odometry and a standstill, the bias is the median rate while the vehicle stands. With an IMU it is one of the
+unknowns of the self-calibration, accurate to 0.002 rad/s. Otherwise the gyro is compared with the rotation that the
+tracks show from frame to frame, which is accurate to 0.5 degrees a second only.
+
+An estimator with a prior of 0 +- 0.0005 rad/s diverges at a bias of 0.05 rad/s, so the covariance of such a prior is
+widened by the difference. With odometry and without a prior, estimators start from a bias of zero; a bias that is too
+large for that is subtracted.
 """
 
 from dataclasses import replace
@@ -19,23 +21,23 @@ from toolkit.geometry import Array, BoolArray
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Prior, Sequence
 
-# Measured speed below which the vehicle stands, and the fewest samples of a standstill that is used.
+# Measured speed (m/s) below which the vehicle stands, and the fewest samples of a standstill that are used.
 STANDING_MPS = 0.05
 LEAST_STANDING = 50
-# What a reading is good for (rad/s) beside the standard error of its median: a standing vehicle shakes, and the
-# camera's own rotation is off by up to 0.0045 on KITTI drives whose gyro has no bias. A bias is one beyond so many
-# standard errors with both in them; the constants were chosen on the recordings at hand.
+# Systematic errors (rad/s), added to the standard error of the median: a standing vehicle vibrates, and the camera's
+# own rotation is off by up to 0.0045 on KITTI drives whose gyro has no bias. A bias is reported beyond SIGMAS of the
+# sum. The constants were chosen on the recordings at hand.
 SYSTEMATIC_STANDING = 0.00075
 SYSTEMATIC_CAMERA = 0.00125
-# The same of self-calibrations: on V2_01 they are off by up to 0.0009 rad/s, six of their standard errors.
+# The same for self-calibrations: on V2_01 they are off by up to 0.0009 rad/s, six of their standard errors.
 SYSTEMATIC_FIT = 0.0004
 SIGMAS = 4.0
-# What estimators begin with beside odometry without a prior: a bias of zero, with this standard deviation (rad/s).
+# With odometry and without a prior, estimators start from a bias of zero with this standard deviation (rad/s).
 UNKNOWN_SIGMA_RADPS = 0.02
 
 
 class _Reading(NamedTuple):
-    """What a gyro reads too much (3,) rad/s, its standard error with the systematic one, and where it comes from."""
+    """The bias of a gyro (3,) rad/s, its standard error with the systematic one, and how it was estimated."""
 
     bias_radps: Array
     error_radps: Array
@@ -43,7 +45,7 @@ class _Reading(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Count the axes with a bias beyond doubt; the bias itself is left to the filters."""
+    """Count the axes with a significant bias; it is left to the estimators where they can start with it."""
     reading = _standstill(evidence.sequence) or _fitted(evidence) or _against_camera(evidence)
     if reading is None:
         return evidence.blind
@@ -78,13 +80,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _denied(prior: Prior, bias_radps: Array, error_radps: Array) -> BoolArray:
-    """Say about which axes (3,) a prior has the bias elsewhere, beyond what is chance."""
+    """Say for which axes (3,) a prior excludes the bias, beyond chance."""
     apart = np.abs(bias_radps - prior.bias[3:])
     return np.asarray(apart > SIGMAS * np.hypot(_sigma_radps(prior), error_radps))
 
 
 def _is_too_much(sequence: Sequence, bias_radps: Array, error_radps: Array) -> bool:
-    """Say whether odometry without a prior has a bias beyond chance where none is expected."""
+    """Say whether odometry has a bias that estimators do not expect, beyond chance."""
     least_radps = SIGMAS * np.hypot(UNKNOWN_SIGMA_RADPS, error_radps)
     return sequence.motion_kind == "twist" and bool((np.abs(bias_radps) > least_radps).any())
 
@@ -96,12 +98,12 @@ def _taken_off(sequence: Sequence, bias_radps: Array) -> Sequence:
 
 
 def _sigma_radps(prior: Prior) -> Array:
-    """Return the standard deviations (3,) rad/s that a prior states of the gyro's bias."""
+    """Return the standard deviations (3,) rad/s of the gyro's bias in a prior."""
     return np.sqrt(np.diag(prior.cov)[-3:])
 
 
 def _widened(prior: Prior, bias_radps: Array, error_radps: Array) -> Prior:
-    """Return a prior that allows the bias, about all axes: of one it denies by less it knows no better."""
+    """Return a prior that allows the bias, widened for all axes: one with a smaller difference is known no better."""
     cov = prior.cov.copy()
     cov[-3:, -3:] += np.diag((bias_radps - prior.bias[3:]) ** 2 + error_radps**2)
     return replace(prior, cov=cov, source=f"{prior.source}; its gyro bias widened by the audit")

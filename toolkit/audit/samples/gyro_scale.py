@@ -1,8 +1,8 @@
-"""An axis of the gyro that turns faster or slower than the camera: a channel of another sensitivity.
+"""An axis of the gyro whose rates are larger or smaller than the camera's: a channel with a wrong scale.
 
-The gyro's rates regressed on the camera's have too small a slope, for the camera's have noise, and the inverse of the
-slope of the camera's on the gyro's is too large for the noise of those: the sensitivity is between the two (Frisch,
-"Statistical confluence analysis", 1934). Where the one is above 1 or the other below it, noise is no excuse.
+Noise of the camera's rates makes the slope of the gyro's rates on the camera's too small. Noise of the gyro's rates
+makes the inverse of the slope of the camera's rates on the gyro's too large. The scale lies between the two (Frisch,
+"Statistical confluence analysis", 1934). Where both are above 1, or both below, noise does not explain it.
 """
 
 from typing import NamedTuple
@@ -15,23 +15,24 @@ from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 
-# A sensitivity counts beyond so many standard errors, a jackknife's, and this share. Tracks that creep make 2.3 %
-# beyond them about one axis of kitti00 and 1.6 % of 8 s of a drive, and nothing in twenty others; chosen with them in
-# view.
+# A scale is reported beyond so many standard errors, by a jackknife, and this share. Beyond five standard errors,
+# tracks that drift cause 2.3 % for one axis of kitti00, 1.6 % in 8 s of a drive, and nothing in twenty other sound
+# recordings. Chosen with them in view.
 SIGMAS, SYSTEMATIC = 5.0, 0.05
-# About an axis of which the rates of the two have less in common than this share there is next to no rotation.
+# An axis is judged only if the lower bound is more than this share of the upper one; otherwise there is too little
+# rotation about it.
 LEAST_IN_COMMON = 0.8
 
 
 class _Bounds(NamedTuple):
-    """Between which the sensitivity of an axis is: by the slope on the camera's rates, and by that of these."""
+    """Bounds of the scale of an axis: the slope of its rates on the camera's, and the inverse of the opposite slope."""
 
     least: float
     most: float
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Name the axes about which the gyro's rates are a multiple of the camera's."""
+    """Report the axes whose rates are a multiple of the camera's."""
     intervals = evidence.intervals
     if intervals is None:
         return evidence.blind
@@ -64,7 +65,7 @@ def _rates(evidence: Evidence, intervals: Intervals) -> list[tuple[Array, Array]
 
 
 def _sensitivity(measured: Array, seen: Array) -> Scalar | None:
-    """Return the end of the bounds that is nearer to 1, with its error; None where they enclose it or are far apart."""
+    """Return the bound nearer to 1, with its standard error; None where the bounds enclose 1 or are far apart."""
     bounds = _Bounds(_slope(measured, seen), _inverse_slope(measured, seen))
     if not bounds.least > LEAST_IN_COMMON * bounds.most > 0.0 or bounds.least <= 1.0 <= bounds.most:
         return None
@@ -78,7 +79,7 @@ def _slope(response: Array, regressor: Array) -> float:
 
 
 def _inverse_slope(measured: Array, seen: Array) -> float:
-    """Return one over the slope of what is seen on what is measured, infinite where there is none."""
+    """Return the inverse of the slope of the camera's rates on the measured ones; infinite where it is not positive."""
     found = _slope(seen, measured)
     return 1.0 / found if found > 0.0 else np.inf
 

@@ -1,8 +1,8 @@
-"""Single values no sensor gives: a flipped bit or a failed parse, of which one ruins a whole run.
+"""Single values that no sensor gives, by a flipped bit or a failed parse; one of them can ruin a whole run.
 
-Odometry has a vehicle behind it: one sample that leaves both its neighbours, and comes back, faster than any vehicle
-can is none of its motion, however plausible the value is. Of an IMU one sample that stands alone, with quiet ones on
-either side, is no motion either: what knocks a sensor shows in several samples, or knocks it again.
+A twist that differs from both neighbours by more than a vehicle's velocity can change is not a motion of the vehicle,
+even if its value is possible. With an IMU, a single sample that differs from its neighbours, while those do not differ
+from theirs, is not a motion either: a knock shows in several samples, or happens again.
 """
 
 from dataclasses import replace
@@ -16,23 +16,22 @@ from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
+# Values beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
 MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
-# Beyond what any vehicle's velocity and rate of rotation change by, there and back (m/s^2, rad/s^2): one and a half
-# times gravity, and as much.
+# Rates of change (m/s^2, rad/s^2) of a vehicle's velocity and rate of rotation that no vehicle reaches in both
+# directions within two samples: one and a half times gravity, and the same number.
 MOST_CHANGE = 15.0
-# A single sample of an accelerometer and a gyro that is off its neighbours by more is no knock (m/s^2, rad/s).
+# A single sample of an accelerometer or gyro that differs from its neighbours by more is not a knock (m/s^2, rad/s).
 MOST_STEP = np.repeat([500.0, 10.0], 3)
-# One that stands alone counts from these on: less moves a vehicle by no more than noise does.
+# Least difference of a sample that stands alone (m/s^2, rad/s): a smaller one matters no more than noise.
 LEAST_ALONE = np.repeat([2.0, 0.2], 3)
-# Alone is a sample beside which the steps are less than this share of its own; more than so many in a thousand are the
-# sensor's way, as of legs that strike the ground.
+# A sample stands alone if the steps next to its own are less than this share of its own. If more than this share of the
+# samples, and more than three, stand alone, they are usual for the sensor, as on a walking robot.
 ALONE, MOST_ALONE, FEWEST_ALONE = 0.2, 1e-3, 3
-# Noise may step further where samples come fast: single ones are beyond this many standard deviations of such steps.
-# Sound recordings have 5 of them at most, a hand-held rig's twists (dataset3) 20 and 40, which no vehicle's change
-# exceeds.
+# Noise alone may exceed these limits at a high rate, so a step must also exceed this many standard deviations of the
+# steps. Sound recordings have 5 at most, twists of a hand-held rig (dataset3) 20 and 40, which are below MOST_CHANGE.
 BEYOND_STEPS = 20.0
-# A unit makes all samples too large; single ones are beyond this many times the median.
+# A wrong unit makes all samples too large; a single one exceeds this many times the median.
 BEYOND_MEDIAN = 1e3
 
 
@@ -60,7 +59,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _implausible_samples(sequence: Sequence) -> BoolArray:
-    """Say which motion samples (S,) hold a value that is neither physical nor like the others."""
+    """Say which motion samples (S,) are beyond the limits and far from the others, or differ as no motion does."""
     most_linear = MOST_MPS if sequence.motion_kind == "twist" else MOST_MPS2
     size = np.abs(sequence.motion.values)
     beyond = np.zeros(len(size), dtype=bool)
@@ -72,7 +71,7 @@ def _implausible_samples(sequence: Sequence) -> BoolArray:
 
 
 def _leaps(sequence: Sequence) -> BoolArray:
-    """Say which samples (S,) leave their neighbours on both sides, the same way, as no motion does."""
+    """Say which samples (S,) differ from both neighbours in the same direction by more than a motion can."""
     values, t_s = sequence.motion.values, sequence.motion.t_ns / NS_PER_S
     leaps = np.zeros(len(values), dtype=bool)
     if sequence.motion_kind == "none" or len(values) < 3:
@@ -87,15 +86,15 @@ def _leaps(sequence: Sequence) -> BoolArray:
 
 
 def _there_and_back(step: Array, least: Array) -> BoolArray:
-    """Say of which samples but the ends (S - 2, d) both steps (S - 1, d) are beyond the least, and opposite."""
+    """Say for which inner samples (S - 2, d) both steps (S - 1, d) exceed the least and have opposite signs."""
     far = np.abs(step) > least
     return np.asarray(far[1:] & far[:-1] & (np.sign(step[1:]) * np.sign(step[:-1]) < 0.0))
 
 
 def _alone(step: Array, least: Array) -> BoolArray:
-    """Say which samples (S,) leave their neighbours, by steps (S - 1, d), while those stay where they are.
+    """Say which samples (S,) differ from their neighbours, by steps (S - 1, d), while those do not differ from theirs.
 
-    Of too many none is said to.
+    None where there are too many.
     """
     alone = np.zeros(len(step) + 1, dtype=bool)
     size = np.abs(step)

@@ -1,4 +1,4 @@
-"""Observations and motion samples that hold NaN or infinity; a column that holds nothing else is named."""
+"""Sightings and motion samples that hold NaN or infinity; a column without a finite value is named."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ CHANNELS = {"twist": ("velocity", "rate of rotation"), "imu": ("accelerometer", 
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the rows with a value that is not finite; drop them. That a sighting lacks the right image is no fault."""
+    """Count the rows with a value that is not finite, and drop them; a missing right image is not a fault."""
     sequence = evidence.sequence
     sightings: BoolArray = is_measured(sequence.observations.uv_px)
     samples: BoolArray = np.asarray(np.isfinite(sequence.motion.values).all(axis=1))

@@ -1,9 +1,9 @@
-"""An IMU's stated noise that its own samples are far too quiet for: estimators then hardly use the sensor.
+"""An IMU whose stated noise is far more than its samples can have: estimators then hardly use the sensor.
 
-White noise of a density s makes samples, dt apart, scatter by s / sqrt(dt), and a walk of density w moves them by
-w sqrt(T) within a time T; motion only adds to both. Samples that scatter or move by much less refute the stated noise.
-Too little stated noise shows elsewhere, in residuals; too much makes nothing worse than it looks.
-Source: Woodman, "An introduction to inertial navigation" (2007), section 4.
+White noise of density s gives samples, dt apart, a standard deviation of s / sqrt(dt), and a random walk of density w
+changes them by w sqrt(T) within a time T. Motion adds to both. Samples that scatter or change by much less contradict
+the stated noise. A stated noise that is too small shows in residuals and is not judged here. Source: Woodman, "An
+introduction to inertial navigation" (2007), section 4.
 """
 
 from collections.abc import Iterator
@@ -16,18 +16,20 @@ from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
 
-# White noise is often stated several times too large on purpose, for vibration and errors of scale. Sound recordings at
-# hand have 12 times at most, of our own factor of 8 for EuRoC; chosen with them in view.
+# Limit of the stated white noise over that of the samples. It is often stated several times too large on purpose, for
+# vibration and errors of scale. Sound recordings at hand have 12 at most, of which 8 are the toolkit's own factor for
+# EuRoC; chosen with them in view.
 MOST_WHITE = 40.0
-# Motion is many times what a walk is. Of a true walk, this is chance less than once in ten thousand: chi-square of the
-# twelve changes that three axes have over quarters of a recording.
+# Limit of the stated random walk over the change of the samples, to which motion adds far more than the walk. A true
+# walk exceeds it less than once in ten thousand, by the chi-square of twelve changes (three axes, four quarters of a
+# recording).
 MOST_WALK = 3.0
 LEAST_SAMPLES = 100
 _SENSORS = {"accel": (slice(0, 3), "m/s^2"), "gyro": (slice(3, 6), "rad/s")}
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Hold the scatter of an IMU's samples, and how far they move, against what the stated noise makes of them."""
+    """Compare the scatter of an IMU's samples, and their change over time, with those of the stated noise."""
     motion, noise = evidence.sequence.motion, evidence.sequence.noise
     if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)):
         return None
@@ -49,7 +51,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
-    """Yield each stated density that samples (S, 6) at times (S,) refute: what it makes them do, and what they do."""
+    """Yield a description of each stated density that samples (S, 6) at times (S,) contradict, with both figures."""
     step_s = float(np.median(np.diff(t_s)))
     lag_s = 0.25 * float(t_s[-1] - t_s[0])
     for name, (columns, unit) in _SENSORS.items():
@@ -68,7 +70,7 @@ def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
 
 
 def _moved(t_s: Array, values: Array, lag_s: float) -> float:
-    """Return how much samples (S, 3) change within a time, motion and all: root mean square of all axes."""
+    """Return the change of samples (S, 3) within a time, motion included: the root mean square over all axes."""
     begin = np.flatnonzero(t_s <= t_s[-1] - lag_s)
     end = np.minimum(np.searchsorted(t_s, t_s[begin] + lag_s), t_s.size - 1)
     return float(np.sqrt(np.mean((values[end] - values[begin]) ** 2)))

@@ -1,7 +1,7 @@
-"""An accelerometer or a gyro at the end of its range: what was faster or harder is cut off, and lost.
+"""An accelerometer or a gyro at the end of its range: larger values are cut off and lost.
 
-Cut-off samples pile up at the largest value of an axis, where samples of a sensor in its range grow ever fewer.
-Nothing is repaired, for nobody knows what they were.
+Samples that are cut off accumulate at the largest value of an axis, while those of a sensor within its range become
+fewer towards it. Nothing is repaired, because the true values are unknown.
 """
 
 import numpy as np
@@ -9,15 +9,15 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.geometry import Array, BoolArray
 
-# So many samples at the very end of an axis' values, and so many times as many as at the value next to it: a sensor of
-# coarse steps has several at its largest value, too, but more at the one before.
+# Least number of samples at the largest value of an axis, and the least ratio to the number at the value next to it. A
+# sensor with coarse steps also has several samples at its largest value, but more at the one next to it.
 LEAST_COUNT, LEAST_RATIO = 10, 3.0
 AXES = tuple(f"{sensor} {axis}" for sensor in ("accelerometer", "gyro") for axis in "xyz")
 UNITS = ("m/s^2", "m/s^2", "m/s^2", "rad/s", "rad/s", "rad/s")
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Name the axes whose samples pile up at an end, how many there are, and at which value."""
+    """Report the axes whose samples accumulate at an end of the range, with their number and value."""
     if evidence.sequence.motion_kind != "imu":
         return None
     values = evidence.sequence.motion.values
@@ -38,7 +38,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _at_range_end(column: Array) -> BoolArray:
-    """Say which samples (S,) are at the largest value, if they are too many to be the largest by chance."""
+    """Say which samples (S,) are at the largest value, if they are too many for a sensor within its range."""
     distinct, counts = np.unique(column, return_counts=True)
     if distinct.size < 2 or counts[-1] < max(LEAST_COUNT, LEAST_RATIO * counts[-2]):
         return np.zeros(column.size, dtype=bool)

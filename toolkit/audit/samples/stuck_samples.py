@@ -1,9 +1,10 @@
-"""An accelerometer, a gyro or odometry that repeats one value: a driver that hangs, a sensor that is not connected.
+"""An accelerometer, a gyro or odometry that repeats one value: the driver hangs or the sensor is not connected.
 
-Real samples carry noise, and three axes of it are never equal again and again, nor one axis for a second. Odometry may
-well repeat itself, for a wheel that stands still gives zeros and one that rolls straight ahead whole counts; it counts
-where it moves and turns, and where it says nothing of either all along while the camera does. It comes rarely: how many
-equal samples in a row are no chance is told by how often two are equal in the rest of the recording.
+Real samples have noise: three axes are not equal many times in a row, nor is one axis for a second. Odometry can repeat
+a value without a fault, zeros while the vehicle stands or whole counts of an encoder on a straight line. Its
+repetitions are a fault where it moves and turns at once, or where its velocities or rates are zero throughout while the
+camera moves. The number of equal samples in a row that is beyond chance follows from how often two neighbours are equal
+in the rest of the recording.
 """
 
 import numpy as np
@@ -13,15 +14,16 @@ from toolkit.audit.parts.edits import keep_samples
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 
-# So many equal samples in a row, over so long, are no chance, nor a sensor that is read more often than it measures.
+# Least number and duration (s) of equal samples in a row: beyond chance, and beyond a sensor that is read more often
+# than it measures.
 LEAST_RUN, LEAST_S = 10, 0.1
-# Runs of odometry's samples that are chance less often than this, in the whole recording, count from four on.
+# Level of significance of a run of odometry's samples, for the whole recording, and the least length of a run.
 CHANCE, LEAST_RUN_OF_ODOMETRY = 1e-3, 4
-# Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
+# If more than this share of all samples repeats, the rest is not interpolated: it would not represent the motion.
 MOST_REPEATED = 0.2
-# One axis alone of a coarse sensor at rest may repeat itself for a while.
+# Least duration (s) for a single axis: one axis of a coarse sensor at rest may repeat a value for a while.
 LEAST_OF_AXIS_S = 1.0
-# A camera that is slower may stand, or drive straight ahead, and what it has be noise.
+# Median speed and rate of the camera below which the vehicle may stand, or drive straight ahead.
 STANDING_MPS, STRAIGHT_RADPS = 0.1, 0.01
 IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
@@ -63,7 +65,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
-    """Return from how many equal samples (S, 6) in a row on odometry hangs: for 0.1 s, and by no chance."""
+    """Return how many equal samples (S, 6) of odometry in a row are a fault: 0.1 s of them, and beyond chance."""
     same = (values[1:] == values[:-1]).all(axis=1)
     lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
     longest = int(lengths.max(initial=1)) - 1
@@ -75,7 +77,7 @@ def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
 
 
 def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Symptom | None:
-    """Tell of single axes of an IMU (S, 6) that repeat one value where not all of their sensor does."""
+    """Report single axes of an IMU (S, 6) that repeat one value while the other axes of the sensor do not."""
     least, found = max(LEAST_RUN, round(LEAST_OF_AXIS_S / max(step_s, 1e-6))), list[tuple[str, BoolArray]]()
     for name, columns in IMU_SENSORS.items():
         for axis, column in zip("xyz", values[:, columns].T, strict=True):
@@ -92,7 +94,7 @@ def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Sy
 
 
 def _at_an_end(column: Array) -> BoolArray:
-    """Say which values (S,) are at an end of a range that is too small: the largest or smallest, again and again."""
+    """Say which values (S,) are at an end of the sensor's range: the largest or smallest, reached more than once."""
     at_end = np.zeros(column.size, dtype=bool)
     for end in (column.min(initial=np.inf), column.max(initial=-np.inf)):
         here = column == end
@@ -102,7 +104,7 @@ def _at_an_end(column: Array) -> BoolArray:
 
 
 def _never_moves(evidence: Evidence) -> Symptom | None:
-    """Tell of odometry whose velocities, or rates of rotation, are zero all along while the camera's are not."""
+    """Report odometry whose velocities or rates of rotation are all zero while the camera's are not."""
     camera, values = evidence.camera_motion, evidence.sequence.motion.values
     if not len(values) or camera.known.sum() < LEAST_RUN:
         return None
@@ -127,14 +129,14 @@ def _never_moves(evidence: Evidence) -> Symptom | None:
 
 
 def _in_long_runs(values: Array, least: int) -> BoolArray:
-    """Say which samples (S, d) repeat the one before, within a run of at least so many equal ones."""
+    """Say which samples (S, d) repeat the one before, within a run of at least ``least`` equal ones."""
     if not len(values):
         return np.zeros(0, dtype=bool)
     same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
     begins = np.flatnonzero(~same)
     lengths = np.diff(np.append(begins, same.size))
     long = np.repeat(lengths >= least, lengths)
-    # Outside such runs, too, neighbours are equal more often than not: the sensor is coarse and not stuck.
+    # If more than half of the neighbours outside such runs are equal too, the sensor is coarse and not stuck.
     is_coarse = (~long).any() and same[~long].mean() > 0.5
     return np.asarray(same & long & ~is_coarse)
 

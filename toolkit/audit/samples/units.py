@@ -1,10 +1,10 @@
-"""Times, lengths, speeds, rates of rotation and accelerations in another unit than SI.
+"""Times, lengths, speeds, rates of rotation and accelerations in other units than SI.
 
-What two sources tell of the same motion has a ratio, whatever the axes: that of the speeds of samples and camera, of
-their rates of rotation, of the speeds of the truth and the samples, of the specific force and gravity. A ratio that
-both speeds and rates have is that of the stamps, by which the camera's motion is divided. A ratio that is a unit's, and
-far from one, names the unit; one that is neither is not judged here. The baseline and the extrinsic are lengths
-that a rig cannot have in another unit.
+Two sources of one motion have a ratio that does not depend on axes: of the speeds of samples and camera, of their rates
+of rotation, of the speeds of truth and samples, of specific force and gravity. A ratio far from one that is a unit's
+factor names the unit; other ratios are not judged here. A ratio that speeds and rates have in common is that of the
+stamps, because the camera's motion is divided by time. The baseline and the extrinsic are judged by lengths that no rig
+has.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,16 +33,18 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
-# A unit is named where the ratio is within this factor of it, and this many standard errors from one.
+# A unit is named where the ratio is within this factor of the unit's, and this many standard errors from one.
 WITHIN_FACTOR, SIGMAS = 1.25, 5.0
-# Vision's speed is good to 5 % in sound recordings, which tells km/h from ft/s, a factor of 1.1 apart.
+# Vision's speed is accurate to 5 % in sound recordings, which distinguishes km/h from ft/s, a factor of 1.1 apart.
 WITHIN_FACTOR_OF_SPEED = 1.08
-# Speeds and rates of rotation that are both off by more than the first factor, and alike to the second: the stamps.
+# The stamps are wrong if the ratios of speeds and of rates of rotation are both beyond the first factor, and differ by
+# less than the second.
 LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
-# Between two frames of a vehicle's camera there is this much time (s).
+# Limits of the time (s) between two frames of a vehicle's camera.
 LEAST_FRAME_S, MOST_FRAME_S = 1e-3, 5.0
 IN_A_PART = " in a part of the recording and not in another"
-# Baselines of rigs on vehicles, in the hand or in the air (m), and the farthest that a camera stands from its IMU.
+# Limits of the baselines of rigs on vehicles, hand-held or flying (m), and the largest distance of a camera from its
+# IMU (m).
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
 
 
@@ -78,7 +80,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _stamps(evidence: Evidence) -> _Wrong | None:
-    """Tell of stamps in which time passes faster or slower than for the odometry, in translation and rotation alike."""
+    """Report stamps by which both speeds and rates of rotation of camera and odometry differ by one factor."""
     speed = speed_ratio(evidence.intervals)
     if evidence.intervals is None or speed is None or not speed.value > 0.0:
         return None
@@ -97,7 +99,7 @@ def _stamps(evidence: Evidence) -> _Wrong | None:
 
 
 def _frame_rate(evidence: Evidence) -> _Wrong | None:
-    """Tell of stamps by which frames come as no camera's on a vehicle do."""
+    """Report stamps whose steps between frames are not those of a vehicle's camera."""
     if evidence.sequence.frame_count < 2 or evidence.intervals is None:
         return None
     step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
@@ -172,7 +174,7 @@ def _rotation(evidence: Evidence) -> _Wrong | None:
 
 
 def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
-    """Say whether either half of the recording has a ratio nearer to that of a unit than to one."""
+    """Say whether both halves of the recording have a ratio nearer to a unit's factor than to one."""
     intervals = evidence.intervals
     assert intervals is not None
     first = np.arange(intervals.interval.size) < intervals.interval.size // 2
@@ -191,7 +193,7 @@ def _force(evidence: Evidence) -> _Wrong | None:
 
 
 def _truth(evidence: Evidence) -> _Wrong | None:
-    """Judge the truth by its speed against the samples', or the camera's where those have none."""
+    """Judge the truth by the ratio of its speed to the samples', or to the camera's with an IMU."""
     sequence, intervals = evidence.sequence, evidence.intervals
     truth = sequence.truth
     if truth is None or intervals is None or truth.t_ns.size < 2:
