@@ -2,8 +2,8 @@
 
 The scale is the ratio of the camera's translation to the measured one. Twists measure the velocity directly. An IMU
 measures its change: in the axes of a window's first frame (rotations by the gyro), the displacement of the IMU is the
-integrated specific force plus the contributions of an unknown velocity and an unknown gravity of each window. The scale
-is then determined by accelerations, the lever arm by rotations. Source: Martinelli, "Closed-form solution of
+twice integrated specific force plus the contributions of an unknown velocity and an unknown gravity of each window.
+Accelerations then determine the scale, rotations the lever arm. Source: Martinelli, "Closed-form solution of
 visual-inertial structure from motion" (2014); Qin, Li & Shen, "VINS-Mono" (2018), section V-B, with the position of the
 camera as a further unknown.
 """
@@ -32,16 +32,17 @@ from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# With an IMU: duration of a displacement of the camera, whose noise hardly grows with it, and length of a window.
+# With an IMU: duration (s) of a displacement of the camera, whose noise hardly grows with the duration, and length (s)
+# of a window.
 STRIDE_S, WINDOW_S = 0.25, 6.0
 # Least number of equations for each unknown; with fewer a regression fits the noise.
 LEAST_EQUATIONS = 3.0
 # Standard deviations of the biases of an accelerometer (m/s^2), and of a gyro about its median (rad/s).
 ACCEL_BIAS, GYRO_BIAS = 0.2, 0.01
-# A scale counts that is no chance, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the odometry of
-# cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view. A scale that is known worse is not judged.
+# Limit of the scale beyond chance, and the largest standard error with which it is judged. Sound recordings at hand
+# have up to 0.044 +- 0.007 with the odometry of cars and 0.028 +- 0.006 with an IMU. Chosen with them in view.
 SYSTEMATIC_SCALE, LARGEST_SCALE_ERROR = {"twist": 0.03, "imu": 0.025}, 0.02
-# Unknowns: the scale, the camera's position (3), its turn (3), with an IMU both biases (6).
+# Unknowns: the scale, the camera's position (3), its rotation (3), with an IMU both biases (6).
 _LEVER, TURN, _COMMON = slice(1, 4), slice(4, 7), 13
 
 
@@ -49,7 +50,7 @@ class Regression(NamedTuple):
     """The unknowns (7,) that explain the difference of the velocities, in the order of ``velocity_equations``.
 
     ``formal`` (7, 7) is the covariance if errors of intervals were independent, ``cov`` (7, 7) that of a jackknife over
-    ``stretches`` which are no shorter than slip lasts. ``in_motion`` is the effective number of stretches in which the
+    ``stretches``, each at least as long as slip lasts. ``in_motion`` is the effective number of stretches in which the
     vehicle moved.
     """
 
@@ -63,8 +64,8 @@ class Regression(NamedTuple):
 class Alignment(NamedTuple):
     """Relative excess of the camera's translation, and the correction (3,) m of its position in the IMU frame.
 
-    ``lever_cov_m2`` (3, 3) is the covariance of the correction; the scale exceeds ``scale_by_chance`` by chance less
-    often than ``robust.LEVEL``. ``by_velocities`` is the whole regression beside odometry.
+    ``lever_cov_m2`` (3, 3) is the covariance of the correction. By chance the scale exceeds ``scale_by_chance`` less
+    often than ``robust.LEVEL``. ``by_velocities`` is the whole regression, with odometry.
     """
 
     scale: Scalar
@@ -90,8 +91,9 @@ def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) ->
 def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_s: float) -> Alignment:
     """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
 
-    Noise of the regressor biases the scale. The smaller result of the regression of one velocity on the other and of
-    the inverse regression is taken, or zero where their signs differ (Frisch, "Statistical confluence analysis", 1934).
+    Noise of the regressor biases the scale. Of the regression of one velocity on the other and the inverse regression,
+    the result nearer to zero is taken, or zero where their signs differ (Frisch, "Statistical confluence analysis",
+    1934).
     """
     whole = velocity_regression(intervals, v_mps, T_imu_cam, len(v_mps) * step_s)
     measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
@@ -107,13 +109,13 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_
 
 
 def _by_chance(whole: Regression) -> float:
-    """Return the bound that the first unknown exceeds only by chance, with errors that last as long as slip."""
+    """Return the bound that the scale exceeds only by chance, with errors that last as long as slip."""
     slipping, formal = np.sqrt(whole.cov[:1, 0]), np.sqrt(whole.formal[:1, 0])
     return float(chance_bound(slipping, formal, whole.in_motion, INFLATION["twist"])[0])
 
 
 def velocity_regression(intervals: Intervals, v_mps: Array, T_imu_cam: Array, duration_s: float = np.inf) -> Regression:
-    """Regress the difference of the camera's velocity and the measured one on its causes, with Cauchy weights."""
+    """Regress the difference of the camera's velocity and the measured one on the unknowns, with Cauchy weights."""
     stretches = slip_stretches(duration_s)
     measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
     found, formal = robust_with_formal_cov(measured - seen, jacobian)
@@ -124,7 +126,7 @@ def velocity_regression(intervals: Intervals, v_mps: Array, T_imu_cam: Array, du
 def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> tuple[Array, Array, Array]:
     """Return the camera's velocity (M, 3) by the twists and by the tracks, and d(difference)/d(unknowns) (M, 3, 7).
 
-    Unknowns are the scale, the camera's position and, those of ``TURN``, its turn.
+    Unknowns are the scale, the camera's position and its rotation (``TURN``).
     """
     R_imu_cam, p_imu_cam = T_imu_cam[:3, :3], T_imu_cam[:3, 3]
     w_radps, seen = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
@@ -199,8 +201,10 @@ def _window(
 
 
 class _Path(NamedTuple):
-    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU, in its first axes, as if it had begun at rest in free
-    fall, and the derivatives (n, 3, 3) of the displacement by the biases of the accelerometer and the gyro.
+    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU in its first axes, without initial velocity and
+    gravity.
+
+    Also the derivatives (n, 3, 3) of the displacement by the biases of the accelerometer and the gyro.
     """
 
     R_first_imu: Array
@@ -257,7 +261,7 @@ def _robust_solution(response: Array, jacobian: Array) -> Array:
 
 
 def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:
-    """Solve the same with the information (m,) of a prior about zero; covariance robust to scatter that lasts a block.
+    """Solve the same with the information (m,) of a prior about zero; the covariance allows errors that last a block.
 
     Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
     """
@@ -271,7 +275,7 @@ def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntA
 
 
 def _weighted(response: Array, jacobian: Array, prior: Array) -> tuple[Array, Array, Array]:
-    """Return the solution (m,), its information (m, m) and the weighted gradient (M, m) of every row there."""
+    """Return the solution (m,), its information (m, m) and the weighted gradient (M, m) of every row at it."""
     unknowns = jacobian.shape[2]
     rows, flat = jacobian.reshape(-1, unknowns), response.ravel()
     found = np.linalg.lstsq(rows, flat)[0]

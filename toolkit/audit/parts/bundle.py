@@ -1,10 +1,10 @@
-"""One window of a bundle adjustment of key frames with measured motion, linearised, with unknown calibration.
+"""One window of a bundle adjustment of key frames and measured motion with unknown calibration, linearised.
 
-Unknowns are the poses of the key frames (6 each: turn on the right, position in the axes of the first), beside an IMU
-with their velocities (3) and the gravity of the window (3), and the calibration that all windows share (21). Points are
-eliminated track by track, then the window's own unknowns, which leaves its information on the calibration. Source:
-Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et al.
-(2017), as in `strides`.
+Unknowns are the poses of the key frames (6 each: rotation on the right, position in the axes of the first), with an IMU
+their velocities (3) and the gravity of the window (3), and the calibration that all windows share (21). Points are
+eliminated track by track, then the window's own unknowns; what remains is the window's information on the calibration.
+Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
+al. (2017), as in `strides`.
 """
 
 from dataclasses import replace
@@ -19,11 +19,11 @@ from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
 POSE, COMMON = 6, 21
-# Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
-# in its own axes (rad), its position in the IMU (m), how much later than its stamps it saw (s), and by how much more so
-# in the second half of the recording than in the first (s); the biases of gyro and accelerometer, or beside odometry of
-# the gyro and the turn of the velocities (rad); by how much the columns of the right image are off (px), and the roll
-# of its camera about the optical axis (rad).
+# The common unknowns, in order: logarithms of fx and fy; cx and cy (px); the logarithm of the baseline; the rotation of
+# the camera in its own axes (rad); its position in the IMU frame (m); the delay of the images after their stamps (s);
+# the change of the delay from the first half of the recording to the second (s); the biases of gyro and accelerometer,
+# or with odometry of the gyro and the rotation of the velocities (rad); the shift of the columns of the right image
+# (px); the roll of the right camera about the optical axis (rad).
 FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE, CHANGE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11, 12
 GYRO_BIAS, _BIASES, RIGHT_SHIFT, RIGHT_ROLL = slice(13, 16), slice(13, 19), 19, 20
 # Those on which sightings depend.
@@ -31,7 +31,7 @@ _OF_CAMERA = np.r_[:13, RIGHT_SHIFT, RIGHT_ROLL]
 _CAMERA = len(_OF_CAMERA)
 CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
 LEAST_DEPTH_M = 0.1
-# Information that holds the first pose, and ridges far below any sighting's.
+# Information that fixes the first pose, and a ridge far below the information of a sighting.
 _GAUGE, _RIDGE = 1e10, 1e-9
 
 
@@ -74,9 +74,8 @@ class Window(NamedTuple):
     """A window of n key frames and T points, in the axes of the IMU at the first key frame.
 
     Attitudes (n, 3, 3), positions, velocities and, in the IMU's own axes, rates of rotation (n, 3); gravity (3,), the
-    motion from key frame to key frame, and points (T, 3). N sightings (N, 3) px are sorted by track, with the key frame
-    (N,) and the track (N,) of each. ``later`` is the share of the window that lies in the second half of the recording,
-    less a half.
+    measured motion between key frames, and points (T, 3). N sightings (N, 3) px are sorted by track, with the key frame
+    (N,) and the track (N,) of each. ``later`` is the share of the window in the second half of the recording, less 1/2.
     """
 
     R_first_imu: Array
@@ -93,7 +92,7 @@ class Window(NamedTuple):
 
     @property
     def unknowns(self) -> int:
-        """How many unknowns are the window's own, without its points."""
+        """Number of the window's own unknowns, without its points."""
         return self.strides.state_size * len(self.position) + self.strides.gravity_size
 
     def moved(self, own: Array, points: Array) -> "Window":
@@ -114,8 +113,8 @@ class Window(NamedTuple):
 class Reduced(NamedTuple):
     """A window's information (21, 21) on the calibration, and the gradients (B, 21) of parts with independent errors.
 
-    The parts are the tracks, whose own errors may be correlated, and the strides of a second. ``back`` takes a step of
-    the calibration to the window's own.
+    The parts are the tracks, within which errors may be correlated, and the strides of a second each. ``back`` computes
+    the step of the window's own unknowns from a step of the calibration.
     """
 
     information: Array
@@ -124,9 +123,9 @@ class Reduced(NamedTuple):
 
 
 class _Back(NamedTuple):
-    """Own unknowns (U,) = own - per_common @ step; points (T, 3) likewise of what was eliminated with them.
+    """Own unknowns (U,) = own - per_common @ step; the points (T, 3) follow from what was eliminated with them.
 
-    ``seen`` (E,) are the unknowns that the tracks' equations have.
+    ``seen`` (E,) are the unknowns in the equations of the tracks.
     """
 
     own: Array
@@ -141,7 +140,7 @@ class _Back(NamedTuple):
 
 
 def moved(window: Window, reduced: Reduced, step: Array) -> Window:
-    """Return the window after a step (21,) of the calibration, and its own that belongs to it."""
+    """Return the window after a step (21,) of the calibration and the step of its own unknowns that follows from it."""
     return window.moved(*reduced.back.steps(step))
 
 
@@ -167,7 +166,7 @@ def reduce(window: Window, calibration: Calibration) -> Reduced:
 
 
 def _seen(window: Window) -> IntArray:
-    """Return the unknowns (E,) that sightings depend on: the poses and what is common but for the biases."""
+    """Return the unknowns (E,) that sightings depend on: the poses and the calibration except for the biases."""
     of_poses = window.strides.state_size * np.arange(len(window.position))[:, None] + np.arange(POSE)
     return np.concatenate([of_poses.ravel(), window.unknowns + _OF_CAMERA])
 
@@ -180,7 +179,7 @@ class _Normal(NamedTuple):
 class _Tracks(NamedTuple):
     """Information (E, E) and gradients (T, E) of the tracks, and what of their points was eliminated.
 
-    Its columns are the poses, 6 each, and the 15 of the common unknowns that the camera's sightings depend on.
+    Its columns are the poses, 6 each, and the 15 of the common unknowns on which sightings depend.
     """
 
     information: Array
@@ -199,11 +198,11 @@ class Predicted(NamedTuple):
 
 
 def predicted(window: Window, calibration: Calibration) -> Predicted:
-    """Predict every sighting: the point in the IMU frame, moved on over the camera's delay, then in the camera.
+    """Predict every sighting: the point in the IMU frame, moved on over the camera's delay, then projected.
 
-    A pose moved by [phi, rho] on its right moves a point q in its axes by [q]x phi - rho. The Jacobians neglect that
-    the shift by the delay depends on pose and velocity, and the roll of the right image: for milliseconds and
-    hundredths of a radian both are negligible.
+    If a pose changes by [phi, rho] on its right, a point q in its axes changes by [q]x phi - rho. The Jacobians neglect
+    the dependence of the shift by the delay on pose and velocity, and that on the roll of the right image. For
+    milliseconds and hundredths of a radian both are negligible.
     """
     rig, key, track = calibration.rig, window.key, window.track
     R_imu_first, R_cam_imu = window.R_first_imu[key].swapaxes(1, 2), rig.T_imu_cam[:3, :3].T

@@ -1,7 +1,7 @@
-"""Decides which parts of a self-calibration are wrong by more than chance and than in sound recordings, in words.
+"""Decides which results of a self-calibration are beyond chance and beyond sound recordings, and describes them.
 
-The position of the camera is checked by `lever_arm`. With odometry, whose scale is no better known, the baseline is
-checked by `vision_scale` and the clock by `time_offset`.
+The position of the camera is judged by `lever_arm`. With odometry, whose scale is known no better than vision's, the
+baseline is judged by `vision_scale` and the clock by `time_offset`.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from toolkit.sequence import StereoRig
 
 
 class Limits(NamedTuple):
-    """Limits in standard errors, limits beyond sound recordings, and sizes of undetected errors to be reported.
+    """Limits in standard errors, limits of sound recordings, and sizes of undetected errors that are reported.
 
-    A share of a focal length, px of cx and cy, a turn in rad, a share of the baseline, s of the clock, px and rad of
-    the right image; infinite ones are not judged. Where a fault larger than the last limits would go undetected, that
-    is reported.
+    They are a share of a focal length, px of cx and cy, a rotation in rad, a share of the baseline, s of the clock, px
+    and rad of the right image. An infinite limit means that the quantity is not judged. Where an error larger than a
+    ``hidden`` limit would go undetected, that is reported.
     """
 
     sigmas: float
@@ -38,18 +38,18 @@ class Limits(NamedTuple):
     hidden_right_roll_rad: float
 
 
-# On 80 parts of real recordings beside an IMU, 4 s to whole, four standard errors leave 0.6 % of the focal lengths,
-# 2.4 px of cy (kitti00), 0.003 rad, 0.2 ms and nothing of the rest. On parts of eleven recordings beside odometry, 8
-# s to whole, six leave 3.4 % of fx, 3.0 px of cx, 0.3 px of cy and 0.025 rad: tracks that creep from image to image
-# bend the view, and twists slip. Chosen with these in view, about twice that and more for cy. What hides beside an IMU
-# is said from the size on at which runs are three times as wrong: 2 % of a focal length (8 to 11 times on `flight`), 1
-# degree of a turn (3.4 times on `drive-imu`). What hides of where the camera looks beside odometry, velocities from
-# frame to frame say (`miscalibration`).
-# The right image of 141 parts beside an IMU is off by nothing beyond four standard errors but for a roll of 0.0015 and
-# 0.0018 rad on two (kitti00, 0.0007 rad beyond), that of 75 beside odometry by nothing beyond six. The limits beside an
-# IMU are three times that, and half of a shift of a tenth of a pixel, which makes runs three times as wrong, as a roll
-# of 0.005 rad does. Of what hides there half a pixel is said, with which they are 9 to 27 times as wrong: only long
-# recordings know less.
+# With an IMU, 80 parts of real recordings (4 s to the whole) exceed four standard errors by at most 0.6 % of the focal
+# lengths, 2.4 px of cy (kitti00), 0.003 rad and 0.2 ms, and by nothing in the other quantities. With odometry, parts of
+# eleven recordings (8 s to the whole) exceed six standard errors by at most 3.4 % of fx, 3.0 px of cx, 0.3 px of cy and
+# 0.025 rad, because tracks drift from image to image and twists contain slip. The limits were chosen with these in
+# view, at about twice that and more for cy. With an IMU, undetected errors are reported from the size on that makes
+# errors of estimators three times as large: 2 % of a focal length (8 to 11 times on `flight`), 1 degree of rotation
+# (3.4 times on `drive-imu`). With odometry, `miscalibration` reports undetected rotations of the camera, by the
+# velocities from frame to frame. The right image of 141 parts with an IMU exceeds four standard errors only by a roll,
+# 0.0015 and 0.0018 rad on two parts of kitti00 (0.0007 rad beyond); that of 75 parts with odometry does not exceed six.
+# With an IMU, the limit of the roll is three times that. The limit of the shift is half of a tenth of a pixel; a tenth
+# makes the errors of estimators three times as large, as a roll of 0.005 rad does. An undetected shift is reported from
+# half a pixel on, which makes them 9 to 27 times as large, because only long recordings determine less.
 LIMITS: dict[MotionKind, Limits] = {
     "imu": Limits(
         RIGHT_SIGMAS["imu"], 0.012, (2.0, 5.0), 0.006, 0.015, 0.0008, 0.05, 0.002, 0.02, 10.0, 0.02, 0.5, 0.01
@@ -93,7 +93,8 @@ def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | 
 
 
 def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
-    """Say how large errors of the intrinsics and of the camera's rotation would go undetected, where that is large."""
+    """Describe which errors of the intrinsics and of the camera's rotation would go undetected, where they are
+    large."""
     limits = LIMITS[kind]
     focal = limits.focal + limits.sigmas * found.error[FOCAL]
     centre_px = np.array(limits.centre_px) + limits.sigmas * found.error[CENTRE]
@@ -141,7 +142,7 @@ def _baseline(found: SelfCalibration, limits: Limits) -> list[Wrong]:
         return []
     factor = float(np.exp(share))
     summary = f"a baseline {factor:.3f} +- {factor * error:.3f} times the given one fits"
-    # A shifted image has this effect on far points.
+    # A shift of an image has the same effect on far points.
     return [Wrong(summary, "the baseline, the rectification of the pair")]
 
 
@@ -175,5 +176,5 @@ def _right_image(found: SelfCalibration, limits: Limits) -> list[Wrong]:
 
 
 def _with_systematic(error: Array, limit: Array | float) -> Array:
-    """Return standard errors with what sound recordings have in them, of which the limits are twice the most."""
+    """Return standard errors that include the largest error of sound recordings, half of the limits."""
     return np.hypot(error, 0.5 * np.asarray(limit))

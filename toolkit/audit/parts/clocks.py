@@ -1,14 +1,13 @@
-"""How far two clocks are apart, by the rotation that both see: the camera's clock and the gyro's, or the truth's.
+"""Offset and rate of two clocks by rotations that both stamp: the camera's and the gyro's, or the truth's.
 
-``camera_offset`` is by how much the camera's rotation is later than its stamps. A coarse search over whole steps finds
-the neighbourhood; Gauss-Newton on the shift, with Cauchy weights and about the median (a gyro has a bias), refines it
-to a fraction of a sample. The noise of twists would hide the change of rotation, so the change that the camera sees is
-the instrument there.
+``camera_offset`` is the delay of the camera's rotation after its stamps. A coarse search finds its neighbourhood;
+Gauss-Newton on the shift, with Cauchy weights and about the median (a gyro has a bias), refines it to a fraction of a
+sample. The rates of twists are noisy, so there the change of rotation by the camera is the instrument.
 
-``truth_clock`` does the same with the truth's rates of rotation in the place of a gyro's, and also finds the rate at
-which the clocks part: by Gauss-Newton on offset and rate, from the middle of the recording outwards, because far from
-the middle a wrong rate displaces a turn by more than its duration. Source: Furgale, Rehder & Siegwart, "Unified
-temporal and spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
+``truth_clock`` does the same with the truth's rates of rotation in place of a gyro's, and also estimates the relative
+rate of the clocks. Gauss-Newton on offset and rate proceeds from the middle of the recording outwards, because far from
+the middle a wrong rate shifts a turn by more than its duration. Source: Furgale, Rehder & Siegwart, "Unified temporal
+and spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
 """
 
 from dataclasses import replace
@@ -33,25 +32,25 @@ REFINEMENTS = 5
 # The standard error is that of a jackknife over stretches of the recording (a corner is one event and not ten
 # intervals), times this factor, which was measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
-# The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
+# The unexplained variance must fall below this share of that without an offset, because slow turns may fit by chance.
 MOST_UNEXPLAINED = 0.9
-# The difference of two rates of which one is noise has the sum of their variances; a gyro's noise in a standstill also
-# has a shift with the least difference. The variance must be below this share of the sum, without gross mismatches.
+# The difference of two independent rates has the sum of their variances; a gyro's noise at standstill also has a shift
+# with the smallest difference. The variance must be below this share of the sum, without differences beyond so many
+# spreads.
 MOST_APART, GROSS_SPREADS = 0.8, 6.0
-# An offset counts beyond so many standard errors and so much (s), a rate where it makes as much at both ends. Sound
-# recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+# Limits of an offset of the truth's clock: so many standard errors and this time (s); a rate must cause as much at both
+# ends. Sound recordings have 9 +- 2 ms at most (0027), chosen with them in view.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 # The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
 SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
-# As many intervals at least, of which the truth may not reach some.
+# Least number of intervals of a fit, of which the truth may not cover some.
 FEWEST = LEAST_INTERVALS + 10
 # The slope of the truth's rates is taken over this share of a step of the frames to either side.
 SLOPE_STEP = 0.1
-# Largest rate; beyond it, other stretches of a motion fit as well.
+# Largest rate; beyond it, other parts of a motion fit as well.
 MOST_RATE = 0.1
-# The offset changes between the halves beyond so many standard errors of the difference, and what sound recordings at
-# hand have beyond them (s): the halves of drives 14 ms at most, those of recordings beside an IMU 3 ms. Chosen with
-# them in view.
+# Limits of the change of the offset between the halves: so many standard errors, and beyond them what sound recordings
+# at hand have (s): 14 ms at most on drives, 3 ms with an IMU. Chosen with them in view.
 CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 # The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
 # k plus s times sample k + 1.
@@ -97,9 +96,10 @@ def _slope(instrument: Array, change: Array, residual: Array) -> float:
 
 
 def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
-    """Return how the camera's rotation changes about each interval (M, 3) rad/s^2, and where that is known (M,).
+    """Return the camera's angular acceleration at each interval (M, 3) rad/s^2, and where it is known (M,).
 
-    From the neighbouring intervals: it follows the gyro's change and not its noise, nor the interval's own.
+    It is computed from the neighbouring intervals, so it is independent of the noise of the gyro and of the interval's
+    own.
     """
     seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
     seen[intervals.interval + 1], known[intervals.interval + 1] = w_imu, True
@@ -111,7 +111,7 @@ def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tupl
 def _gyro_at(
     gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
 ) -> tuple[Array, BoolArray]:
-    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them it reaches (..., M).
+    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them its samples cover (..., M).
 
     The intervals are shifted by the offsets (...) s.
     """
@@ -123,9 +123,9 @@ def _gyro_at(
 
 
 def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
-    """Return the spread of the differences (C, M, 3) over the intervals that are reached (C, M), squared (C,).
+    """Return the squared spread (C,) of the differences (C, M, 3) over the intervals that are covered (C, M).
 
-    NaN where those are few.
+    NaN where these are fewer than LEAST_INTERVALS.
     """
     reached = inside.sum(axis=-1)
     apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
@@ -134,7 +134,8 @@ def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
 
 
 def _medians(values: Array, reached: IntArray) -> Array:
-    """Return the medians (C, d, 1) of values (C, d, M), of which so many (C,) are no NaN: those come last in order."""
+    """Return the medians (C, d, 1) of values (C, d, M) without NaN; ``reached`` (C,) counts the values that are not
+    NaN."""
     ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
     middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
     return np.asarray(0.5 * (middle[0] + middle[1]))
@@ -150,7 +151,7 @@ def _share_apart(w_imu: Array, mean: Array) -> float:
 
 
 def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
-    """Return by how much (s) the camera's offset changes between the halves; None where a half shows none."""
+    """Return the change (s) of the camera's offset from the first half to the second; None if one is undetermined."""
     w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
     early = np.arange(len(w_imu)) < len(w_imu) // 2
     first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
@@ -160,7 +161,7 @@ def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
 
 
 def least_change_s(sequence: Sequence, error_s: float) -> float:
-    """Return the least difference (s) of the halves' offsets, known to a standard error, that is none of chance."""
+    """Return the limit (s) of a change of the offset with this standard error (s)."""
     return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
 
 
@@ -170,7 +171,7 @@ def is_stamped_at_frames(sequence: Sequence) -> bool:
 
 
 class TruthClock(NamedTuple):
-    """How much later than by their stamps (s) the frames are by the truth's clock, and by what share faster that runs.
+    """Delay (s) of the frames after their stamps by the truth's clock, and by what share faster that clock runs.
 
     Each is None where it is undetermined. ``half_s`` is half of the recording's duration.
     """
@@ -188,15 +189,18 @@ class TruthClock(NamedTuple):
 
     @property
     def unseen_s(self) -> float:
-        """Undetected difference (s) of the clocks, at most."""
+        """The largest difference (s) of the clocks that may go undetected."""
         if self.offset is None or self.rate is None:
             return np.inf
         return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
 
 
 class BesideTruth(NamedTuple):
-    """The camera's rates of rotation in the IMU's axes (M, 3) rad/s over M intervals, and the recording in which the
-    truth's rates stand for a gyro's."""
+    """The camera's rates of rotation (M, 3) rad/s in the IMU's axes over M intervals, and the truth's as those of a
+    gyro.
+
+    ``sequence`` is the recording with the truth's rates of rotation in place of its motion samples.
+    """
 
     sequence: Sequence
     seen: Intervals
@@ -204,7 +208,7 @@ class BesideTruth(NamedTuple):
 
     @classmethod
     def of(cls, sequence: Sequence, camera: CameraMotion, truth: Truth) -> Self | None:
-        """Put both side by side; None where there is no sequence of finite poses in the order of time."""
+        """Return both; None unless the truth has finite poses in the order of time and there are motion samples."""
         step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
         in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
         if sequence.motion_kind == "none" or not in_order:
@@ -232,8 +236,8 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
 def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
     """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
 
-    ``offset_s`` is, nearly, how much later than by its stamp the middle frame is by the truth's clock. The standard
-    error is that of a jackknife over stretches of the recording.
+    ``offset_s`` is an approximation of the delay (s) of the middle frame by the truth's clock. The standard error is
+    that of a jackknife over stretches of the recording.
     """
     clocks = _Clocks.of(beside)
     try:
@@ -254,7 +258,7 @@ class _Linearised(NamedTuple):
 
 
 class _Clocks(NamedTuple):
-    """The integral of the truth's rates, stamps of the frames (K,), and what the camera sees of M intervals.
+    """The integral of the truth's rates, stamps of the frames (K,), and the camera's rates (M, 3) over M intervals.
 
     ``since_s`` (K,) is the time since the middle of the frames.
     """
@@ -281,9 +285,9 @@ class _Clocks(NamedTuple):
         return self.truth.means(self.frames_t_ns + np.rint(shift_s * NS_PER_S).astype(np.int64))[self.interval]
 
     def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
-        """Return the equations of those of the rows that the truth reaches, where these are enough.
+        """Return the equations of the rows that the truth covers; None where these are too few.
 
-        A fast clock shows less rotation in a second, as a wrong focal length does, so this effect is not used for the
+        A fast clock lowers all rates of rotation, as a wrong focal length does, so this effect is not used for the
         rate.
         """
         shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
@@ -298,7 +302,7 @@ class _Clocks(NamedTuple):
         return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
 
     def fitted(self, offset_s: float) -> tuple[Array, "_Linearised"] | None:
-        """Return offset and rate (2,) and the equations there; None where they do not fit what the camera sees."""
+        """Return offset and rate (2,) and the equations at them; None where they do not fit the camera's rotation."""
         found, count, at = np.array([offset_s, 0.0]), self.interval.size, None
         for share, steps in zip(SHARES, STEPS, strict=True):
             aside = min(round(0.5 * (1.0 - share) * count), max(count - FEWEST, 0) // 2)
@@ -313,9 +317,9 @@ class _Clocks(NamedTuple):
         return (found, at) if at is not None and is_one else None
 
     def fits(self, found: Array, offset_s: float) -> bool:
-        """Say whether the rate explains residuals that the offset does not, if it displaces the ends by a step or more.
+        """Say whether the rate lowers the residuals of the offset alone, where it shifts the ends by a step or more.
 
-        With a smaller displacement, other turns cannot fit by chance.
+        With a smaller shift, other turns cannot fit by chance, and the result is True.
         """
         if abs(found[1]) * self.since_s[-1] < self.step_s:
             return True

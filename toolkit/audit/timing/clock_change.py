@@ -1,9 +1,9 @@
-"""Clocks of frames and motion samples that do not keep pace, or one of which was set during the recording.
+"""Clocks of frames and motion samples that run at different rates, or one of which was set during the recording.
 
-The offset between the camera and the samples is the same in either half of the recording where the clocks keep pace,
-whatever interval a sample stands for. No constant shift mends what is not. Beside an IMU it is that by which tracks and
-samples fit together best, with a calibration that both halves share; where none is found, and beside odometry, it is
-that of the rotations.
+With clocks of one rate, the offset between camera and samples is the same in both halves of the recording, whatever
+interval a sample describes. If it changes, no constant shift is right. With an IMU the change is an unknown of the
+self-calibration, whose other unknowns both halves share. With odometry, and where no calibration is found, it is the
+difference of the offsets that the rotations have in both halves.
 """
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
@@ -13,7 +13,7 @@ from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import self_calibration
 
-# Where a change must be larger than this (s) to be seen, nothing is said.
+# Where only a change larger than this (s) would be found, the finding is undecided and says so.
 LARGEST_S = 0.1
 
 
@@ -43,9 +43,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _fitted(evidence: Evidence, intervals: Intervals) -> Scalar | None:
-    """Return the change by which tracks and IMU fit together; None where no calibration is found in both halves.
+    """Return the change (s) by the self-calibration; None where it has no windows in both halves.
 
-    Rotations of half a short recording may agree best at a shift that is none: their error is that about the shift.
+    Rotations of half a short recording may agree best at a wrong shift, about which their standard error is too small.
     """
     found = evidence.self_calibration
     if found is not None and found.windows == 1:

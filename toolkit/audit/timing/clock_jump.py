@@ -1,8 +1,8 @@
-"""A clock that is set on the way: stamps of frames and samples leap, or stay, together, and the vehicle does not.
+"""A clock that is set during the recording: stamps of frames and samples jump together, and the vehicle does not.
 
-Where both were lost for a while the vehicle has moved on, as far as the stamps say; where the clock was set it has
-moved by one usual step, whatever they say. Which of the two it is the tracks tell: how far the camera went in that
-interval, in steps of those beside it. A clock that goes back by more than a step is seen by its stamps (`time_order`).
+If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, it has moved
+by one usual step. The distance that the camera moves in that interval, by the tracks and in units of the intervals
+around it, decides between the two. A clock that goes back by more than a step shows in its stamps (`time_order`).
 """
 
 from collections.abc import Iterator
@@ -20,24 +20,28 @@ from toolkit.models.camera_motion import camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# A step of the frames counts that is off the usual one by this share of it, by so long (s), and by so many of the
-# scatter of all steps. One of the samples beside it is off by the same, to half of a usual step and a quarter.
+# A step of the frames is unusual if it differs from the usual one by this share of it, by this time (s), and by so many
+# times the scatter of all steps. A step of the samples near it must differ by the same, to half of their usual step or
+# a quarter of the difference.
 LEAST_SHARE, LEAST_S, SCATTERS = 0.25, 0.01, 10.0
 ALIKE_STEPS, ALIKE = 0.5, 0.25
-# How far the camera goes in a step is told by so many on either side, known no better than to 3 %: acceleration.
+# So many intervals on either side show how far the camera moves in a step, at least so many together; acceleration
+# limits the accuracy to this share.
 AROUND, FEWEST_AROUND, SYSTEMATIC = 4, 5, 0.03
-# It went one step within so many standard errors, or as many steps as the stamps say; both are so many apart at least.
+# The camera moved one step, or as many as the stamps say, to within so many standard errors; the two must be at least
+# so many standard errors apart.
 WITHIN, APART = 3.0, 6.0
-# A camera that goes less (m), or turns less (rad), in a usual step tells nothing.
+# A camera that moves less (m), or rotates less (rad), in a usual step is not used.
 LEAST_M, LEAST_RAD = 0.01, 0.005
-# With more steps that are off the stamps are of another kind, and none of them is a jump.
+# With more unusual steps than this, none of them is taken as a jump: the stamps are uneven for another reason.
 MOST = 10
 
 
 class _Step(NamedTuple):
-    """The frame and the sample after which both streams have another step, by how much (s), and how often a usual one.
+    """The frame and the sample after which both streams have an unusual step.
 
-    ``gone`` is how many usual steps the camera went; None where that does not tell whether the clock was set.
+    ``by_s`` is its excess over the usual step, ``stamped`` the step of the frames in usual steps. ``gone`` is how many
+    usual steps the camera moved; None where that does not show whether the clock was set.
     """
 
     frame: int
@@ -48,7 +52,7 @@ class _Step(NamedTuple):
 
     @property
     def is_jump(self) -> bool:
-        """Whether the camera went one step, and not what the stamps say."""
+        """Whether the camera moved by one usual step, and not by as many as the stamps say."""
         if self.gone is None:
             return False
         near, far = abs(self.gone.value - 1.0), abs(self.gone.value - self.stamped)
@@ -56,7 +60,7 @@ class _Step(NamedTuple):
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Name the times at which the clock was set; keep the longest stretch between them."""
+    """Report the times at which the clock was set; keep the longest stretch between them."""
     sequence = evidence.sequence
     steps = list(_steps_alike(sequence))
     jumps = [step for step in steps if step.is_jump]
@@ -85,7 +89,7 @@ def _at_s(sequence: Sequence, step: _Step) -> float:
 
 
 def _steps_alike(sequence: Sequence) -> Iterator[_Step]:
-    """Yield the steps of the frames that are off the usual one, and those of the samples beside them likewise."""
+    """Yield the unusual steps of the frames at which the samples have a step with the same excess."""
     frames_t_ns, samples_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
     if min(frames_t_ns.size, samples_t_ns.size) < 2 * AROUND or NOT_A_TIME in (frames_t_ns.min(), samples_t_ns.min()):
         return
@@ -110,7 +114,7 @@ def _steps_alike(sequence: Sequence) -> Iterator[_Step]:
 
 
 def _gone(sequence: Sequence, frame: int, stamped: float) -> Scalar | None:
-    """Return how many usual steps the camera goes, or turns, after a frame, if that tells one from those stamped."""
+    """Return how many usual steps the camera moves or rotates after a frame, if that decides the question."""
     for steps in _steps_gone(sequence, frame):
         error = float(np.hypot(steps.error, SYSTEMATIC))
         decided = abs(steps.value - 1.0) < WITHIN * error or abs(steps.value - stamped) < WITHIN * error
@@ -120,9 +124,9 @@ def _gone(sequence: Sequence, frame: int, stamped: float) -> Scalar | None:
 
 
 def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
-    """Yield how far the camera goes, and how far it turns, after a frame in units of what it does around it.
+    """Yield how far the camera moves, and how far it rotates, after a frame, in units of the intervals around it.
 
-    What stands, turns little or is not known says nothing.
+    Nothing is yielded where the camera stands, hardly rotates, or its motion is not known.
     """
     kept = np.arange(max(frame - AROUND, 0), min(frame + AROUND + 2, sequence.frame_count))
     camera = camera_motion(replace(keep_frames(sequence, kept), frames_t_ns=NS_PER_S * np.arange(kept.size)))
@@ -138,9 +142,9 @@ def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
 
 
 def _is_noise(moved: Array, beside: IntArray, here: int) -> bool:
-    """Say whether motions (n, 3) beside one at ``here`` have no direction in common, as noise of what stands has none.
+    """Say whether motions (n, 3) around the one at ``here`` have no common direction, as noise at standstill.
 
-    That is where the lines through them come no farther from zero than so many of their standard errors.
+    That is so where the line through them, at ``here``, is within APART standard errors of zero.
     """
     line = np.stack([np.ones(beside.size), beside - here], axis=1)
     found, *_ = np.linalg.lstsq(line, moved[beside])
@@ -150,7 +154,7 @@ def _is_noise(moved: Array, beside: IntArray, here: int) -> bool:
 
 
 def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
-    """Return a size (n,) at one interval over the line through those beside it, and its standard error."""
+    """Return the size (n,) at one interval over the line through those around it, with its standard error."""
     line = np.polynomial.Polynomial.fit(beside - here, size[beside], 1)
     expected = float(line(0.0))
     scatter = float(np.sqrt(np.sum((size[beside] - line(beside - here)) ** 2) / (beside.size - 2)))
@@ -158,7 +162,7 @@ def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
 
 
 def _longest_stretch(sequence: Sequence, jumps: list[_Step]) -> Sequence:
-    """Return the longest stretch, in frames, between two jumps, with its samples; the first of equals."""
+    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
     frame_part = np.searchsorted([jump.frame for jump in jumps], np.arange(sequence.frame_count), side="left")
     sample_part = np.searchsorted([jump.sample for jump in jumps], np.arange(sequence.motion.t_ns.size), side="left")
     part = int(np.argmax(np.bincount(frame_part)))

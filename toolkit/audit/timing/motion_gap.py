@@ -1,8 +1,9 @@
-"""Short holes in the motion samples: bridged, with as much noise as such a bridge has in the rest of the recording.
+"""Short gaps in the motion samples: interpolated, with the noise that interpolation has in the rest of the recording.
 
-A hole of a few samples up to a second is filled by straight lines between the samples at its ends. How wrong that is
-the recording itself shows: bridges of the same length are laid over stretches that were measured, and the integral of
-their error gives the noise they need. Where it is the same in every hole, the state after one is as uncertain as told.
+A gap shorter than `time_gap` reports is filled on straight lines between the samples at its ends. The recording itself
+shows the error of that: stretches of the same length that were measured are interpolated in the same way, and the noise
+in the gap is raised until it covers the integral of their error. The uncertainty of the state after a gap is then right
+if the motion in it is like that of the rest.
 """
 
 from dataclasses import replace
@@ -17,13 +18,13 @@ from toolkit.measured_motion import ImuNoise, MotionNoise, MotionSamples, NoSamp
 from toolkit.resampling import NS_PER_S, Bridges
 from toolkit.sequence import Sequence
 
-# Bridges laid over measured stretches: with fewer than this the recording is too short to tell, and the whole spread of
-# the samples counts as their error.
+# Least number of measured stretches that are interpolated. With fewer, the variance of the samples is taken as the
+# error of the interpolation.
 LEAST_TRIALS = 5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the holes between the first frame and the last; fill them and raise the noise there."""
+    """Count the gaps between the first frame and the last; fill them and raise the noise there."""
     sequence = evidence.sequence
     if not is_comparable(sequence):
         return None
@@ -50,9 +51,9 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _holes(sequence: Sequence) -> tuple[IntArray, float]:
-    """Return the samples after which there is a hole, where frames are, and the usual step (ns).
+    """Return the samples after which there is a gap, between the first frame and the last, and the usual step (ns).
 
-    A twist may be the mean of the whole interval to the next one: between those only a frame inside shows a hole.
+    A twist may be the mean over the whole interval to the next one, so a gap between twists needs a frame inside it.
     """
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
     step_ns = np.diff(t_ns)
@@ -66,7 +67,7 @@ def _holes(sequence: Sequence) -> tuple[IntArray, float]:
 
 
 def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
-    """Return the factors (2,) on the noise of a bridge over so many steps: of linear and of angular samples."""
+    """Return the factors (2,) on the noise, linear and angular, of an interpolation over so many steps."""
     values, step_s = sequence.motion.values, usual_ns / NS_PER_S
     trials = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
     if trials.size >= LEAST_TRIALS:
@@ -83,7 +84,7 @@ def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
 
 
 def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray:
-    """Return the first samples of the stretches of so many steps without a hole."""
+    """Return the first samples of the stretches of so many steps without a gap."""
     if t_ns.size <= steps:
         return np.empty(0, dtype=np.int64)
     holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
@@ -91,7 +92,7 @@ def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray
 
 
 def _stated(noise: MotionNoise) -> Array:
-    """Return the stated densities (2,) of linear and angular samples, the least of their axes."""
+    """Return the stated densities (2,) of linear and angular samples, the smallest over the axes."""
     if isinstance(noise, TwistNoise):
         return np.array([noise.velocity_noise_density.min(), noise.gyro_noise_density.min()])
     assert isinstance(noise, ImuNoise)
@@ -99,7 +100,7 @@ def _stated(noise: MotionNoise) -> Array:
 
 
 def _filled(motion: MotionSamples, rows: IntArray, usual_ns: float) -> MotionSamples:
-    """Return the samples with others put in the holes after ``rows``, on straight lines, at the usual steps."""
+    """Return the samples with interpolated ones in the gaps after ``rows``, at the usual steps."""
     ends = [(int(motion.t_ns[row]), int(motion.t_ns[row + 1])) for row in rows]
     inner = [np.linspace(begin, end, round((end - begin) / usual_ns) + 1)[1:-1] for begin, end in ends]
     t_ns = np.sort(np.concatenate([motion.t_ns, *(np.rint(stamps).astype(np.int64) for stamps in inner)]))

@@ -6,12 +6,12 @@ from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.edits import keep_frames
 from toolkit.resampling import NS_PER_S
 
-# Between fewer frames nothing moves.
+# With fewer frames there is no interval.
 LEAST_FRAMES = 2
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the frames no motion sample reaches and cut them off."""
+    """Count the frames outside the time of the motion samples and cut them off."""
     sequence = evidence.sequence
     frames_t_ns, motion_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
     if motion_t_ns.size == 0:

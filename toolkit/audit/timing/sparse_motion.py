@@ -1,4 +1,4 @@
-"""Motion samples that come more rarely than frames: what happens between two of them nothing has measured."""
+"""Motion samples that come more rarely than frames: the motion between two of them was not measured."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from toolkit.audit.parts.intervals import is_comparable
 from toolkit.audit.parts.stamps import GAP_RATIO
 from toolkit.resampling import NS_PER_S
 
-# A vehicle turns and stops within so long (s); samples that come more rarely, and so much more rarely than frames, are
-# no motion.
+# A vehicle turns and stops within this time (s). Samples with a longer step, and with so many frames in one step, do
+# not represent its motion.
 MOST_STEP_S, MOST_RATIO = 2.0, 20.0
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Compare the usual step of the samples with that of the frames; more of those in one is what a hole would be."""
+    """Compare the usual step of the samples with that of the frames; the limit is the ratio that makes a gap."""
     sequence = evidence.sequence
     if sequence.motion.t_ns.size < 2 or sequence.frame_count < 2 or not is_comparable(sequence):
         return None

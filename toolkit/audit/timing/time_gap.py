@@ -1,8 +1,8 @@
-"""Holes in time: in the motion samples, where the motion is not measured, and in the frames.
+"""Gaps in time: in the motion samples, where the motion is not measured, and in the frames.
 
-A hole in the frames alone is information, for the motion samples bridge it. A hole in the motion samples is a
-fault: whatever is put there is invented, and no noise model covers it. The longest stretch without such a
-hole is kept; stitching the rest on would need a pose nobody measured.
+A gap in the frames alone is reported as information, because the motion samples cover it. A long gap in the motion
+samples is a fault: no measurement says how the vehicle moved, and no noise model covers interpolation over it. The
+longest stretch without such a gap is kept. The relative pose of the other stretches was not measured.
 """
 
 import numpy as np
@@ -14,12 +14,12 @@ from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Motion samples may be further apart than a usual gap (a dropped sample of a fast IMU) and still be interpolated.
+# Shorter gaps (s) in the motion samples, such as a dropped sample of a fast IMU, are interpolated (`motion_gap`).
 MOTION_GAP_S = 1.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Find holes in the motion samples (keep the longest stretch between them) or, failing that, in the frames."""
+    """Find gaps in the motion samples and keep the longest stretch between them; else find gaps in the frames."""
     sequence = evidence.sequence
     holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
     # Only what lies between the first and the last frame matters.

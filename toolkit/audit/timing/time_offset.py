@@ -1,12 +1,12 @@
 """Frames stamped by another clock than the motion samples, or with a constant delay of the camera.
 
-The camera's rotation, from its tracks alone, is the mean of the gyro over each interval, shifted by the offset
-(`parts.clocks`).
+The camera's rotation over an interval, from its tracks alone, equals the mean of the gyro over that interval, shifted
+by the offset (`parts.clocks`).
 
-A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains. Where it
-is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit. An
-offset that half of the recording has, or that grows, is none to be shifted by: that is a change of the clock. Nor is
-one that the velocities of a twist speak against: then the rates of rotation alone are late, and the camera is not.
+For twists stamped at the frames, `twist_lag` sets the pairing, and only an offset that no pairing explains is reported
+here. For twists stamped between the frames, the frames are shifted to where the samples, as they are paired, fit.
+Frames are not shifted by an offset that only half of the recording has, or that grows: that is a change of the clock.
+They are not shifted either where the velocities of the twists then fit worse: the rates of rotation alone are late.
 """
 
 from dataclasses import replace
@@ -22,25 +22,29 @@ from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# An offset is one beyond so many standard errors and beyond what is no fault: a sample of an IMU may stand for the
-# interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
-# which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
+# An offset is reported beyond so many standard errors and beyond what is no fault. A sample of an IMU may describe the
+# interval before or after its stamp, 5 ms at 100 Hz. A twist may describe the interval before or after its stamp, whose
+# middle is half an interval away, and may be one interval late: an indoor recording that is taken as sound is late by
+# 0.8.
 SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
-# Beside an IMU no sound recording at hand is farther beyond than 3.1 standard errors; from so many on it is said.
+# With an IMU, sound recordings at hand have 3.1 standard errors at most; from this many on the finding is undecided and
+# says so.
 DOUBTFUL_SIGMAS = 3.2
-# Between frames nothing of that can be told from the clock, and what the shift mends is either.
+# The same limit, in intervals, for twists stamped between the frames. There a pairing has the same effect as an offset
+# of the clock, and the shift corrects both.
 LEAST_OFF_FRAMES = 0.25
-# The velocities speak against a shift that explains them worse by so many standard errors. The halves and thirds of the
-# indoor recording whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a
-# simulated one, -0.1 at most. Chosen between these.
+# A shift is rejected if the velocities fit worse by so many standard errors. Halves and thirds of the indoor recording
+# whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a simulated one have
+# -0.1 at most. Chosen between these.
 AGAINST_SHIFT = 2.5
-# A self-calibration finds offsets (s) no larger than this.
+# Offsets (s) up to this are taken from the self-calibration.
 NEAR_S = 0.025
-# With a larger standard error (s) than these no offset is ruled out; one that is beyond chance is believed up to twice
-# as much, but where a twist leaves open which interval it describes.
+# With a larger standard error (s), an offset is not excluded and the finding is undecided. One beyond chance is
+# accepted up to twice the standard error, except for twists stamped at the frames, whose interval is open.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
-# Twists stand a constant time beside the frames where nine in ten do so to this share of their step. Clocks that drift,
-# and rates that differ, have no such constant. What is within so many standard errors the tracks do not exclude.
+# The time from a sample to the next frame is constant if this share of the frames has it to within this share of a
+# step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within so many
+# standard errors.
 CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 
 
@@ -79,7 +83,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) -> float:
-    """Return by how many standard errors a twist's velocities fit the camera's worse once the frames are shifted."""
+    """Return by how many standard errors the twists' velocities fit the camera's worse after the frames are shifted."""
     before, after = evidence.intervals, evidence.after(shifted).intervals
     if before is None or after is None or before.v_mps is None or after.v_mps is None:
         return 0.0
@@ -94,7 +98,7 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
 
 
 def _changing(detail: str, change: Scalar) -> Symptom:
-    """Tell of an offset that no constant shift mends, for half of the recording has another one."""
+    """Report an offset that differs between the halves, so that no constant shift is right."""
     parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms"
     return Symptom.warning(
         count=1,
@@ -104,9 +108,9 @@ def _changing(detail: str, change: Scalar) -> Symptom:
 
 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
-    """Return the offset by which tracks and IMU fit together, where that of the rotations is near or fits nothing.
+    """Return the self-calibration's offset, unless that of the rotations is large and a self-calibration confirms it.
 
-    Rotations err more, and of a camera that is turned they make an offset of up to a tenth of a second.
+    Offsets by rotations have larger errors, and a wrong rotation of the extrinsic causes offsets of up to 0.1 s.
     """
     fitted = evidence.self_calibration
     if found is None or fitted is None:
@@ -119,7 +123,7 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
 
 
 def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
-    """Say how well an offset is known that is no more than chance, where that is badly."""
+    """Return the standard error of an offset that is within chance, where it is large."""
     if found.error <= _largest_error_s(sequence):
         return _doubtful(sequence, found)
     known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
@@ -127,7 +131,7 @@ def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
 
 
 def _doubtful(sequence: Sequence, found: Scalar) -> Undecided | None:
-    """Say of an IMU's recording that its offset is between what chance makes and what is told."""
+    """Return, with an IMU, an offset that is beyond chance and below the limit of a finding."""
     if isinstance(sequence.motion, TwistSamples) or abs(found.value) < max(LEAST_S, DOUBTFUL_SIGMAS * found.error):
         return None
     late = "late" if found.value < 0.0 else "early"
@@ -142,7 +146,7 @@ def _largest_error_s(sequence: Sequence) -> float:
 
 
 def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
-    """Tell of twists that come as often as frames and a constant time beside them, if the tracks allow a late clock."""
+    """Report twists at the rate and a constant time from the frames, if the tracks allow an offset of that time."""
     if not isinstance(sequence.motion, TwistSamples) or (late_s := _constant_phase_s(sequence)) is None:
         return None
     step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
@@ -162,7 +166,7 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
 
 
 def _constant_phase_s(sequence: Sequence) -> float | None:
-    """Return how long (s) after a sample frames are stamped, where that is constant, not nothing, at equal rates."""
+    """Return the time (s) from a sample to the next frame, where rates are equal and it is constant and not zero."""
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
     step_ns, tolerance = float(np.median(np.diff(t_ns))), CONSTANT_STEPS * float(np.median(np.diff(t_ns)))
     since_ns = frames_t_ns - t_ns[np.clip(np.searchsorted(t_ns, frames_t_ns, side="right") - 1, 0, t_ns.size - 1)]
@@ -174,7 +178,7 @@ def _constant_phase_s(sequence: Sequence) -> float | None:
 
 
 def _expected(sequence: Sequence) -> tuple[float, float]:
-    """Return the offset (s) that a right pairing of twists shows, and the largest that is no fault."""
+    """Return the offset (s) that the pairing of twists implies, and the largest difference that is no fault."""
     if not isinstance(sequence.motion, TwistSamples):
         return 0.0, LEAST_S
     step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
@@ -185,7 +189,7 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
 
 
 def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
-    """Return the sequence with its frames on the motion's clock, without those that its samples do not reach."""
+    """Return the sequence with its frames on the samples' clock, without frames outside the time of the samples."""
     shifted = replace(sequence, frames_t_ns=sequence.frames_t_ns + round(offset_s * NS_PER_S))
     motion_t_ns = sequence.motion.t_ns
     inside = (shifted.frames_t_ns >= motion_t_ns[0]) & (shifted.frames_t_ns <= motion_t_ns[-1])

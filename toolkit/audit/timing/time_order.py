@@ -1,4 +1,4 @@
-"""Stamps of frames or motion samples that repeat, run backwards, jump back, or are no time at all."""
+"""Stamps of frames or motion samples that repeat, run backwards, jump back, or are no time."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# A step forward that is so many times the usual one takes time back to where it was; a clock that jumped goes on with
-# fewer than two. So many stamps must follow, lest one that is out of place at the very end passes for a jump.
+# A forward step of so many usual ones means that earlier stamps were out of order; after a jump, all steps are smaller.
+# So many stamps must follow a jump, so that a single stamp out of order at the end is not taken for one.
 LEAP, FEWEST_AFTER = 1.9, 3
 
-# With more of the stamps late than this the order itself is wrong, not some of the stamps.
+# If more than this share of the stamps is late, the whole order is wrong, and sorting is no repair.
 MOST_LATE = 0.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the stamps that are not after all the stamps before them; sort, first of equals kept.
+    """Count the stamps that are not after all stamps before them; sort them and keep the first of equal ones.
 
-    A clock that jumps back goes on from there, and sorting would interleave two times: one side of it is kept.
+    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is kept.
     """
     sequence = evidence.sequence
     frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
@@ -55,7 +55,7 @@ def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
 
 
 def _share_back(t_ns: IntArray) -> float:
-    """Return the share of the steps that lead back in time, or nowhere."""
+    """Return the share of the steps that are negative or zero."""
     return float(np.mean(np.diff(t_ns) <= 0)) if t_ns.size > 1 else 0.0
 
 
@@ -74,9 +74,9 @@ def _sorted(sequence: Sequence) -> Sequence:
 
 
 def _jumps(t_ns: IntArray) -> IntArray:
-    """Return the rows after which the clock has jumped back: time goes on from there at its usual step.
+    """Return the rows after which the clock has jumped back and goes on at its usual step.
 
-    After a stamp, or a block of stamps, that is merely out of place, time leaps forward to where it was.
+    After a stamp, or a block of stamps, that is merely out of order, time jumps forward to where it was.
     """
     step_ns = np.diff(t_ns)
     if t_ns.size < 3 or (t_ns == NOT_A_TIME).any():
@@ -87,7 +87,7 @@ def _jumps(t_ns: IntArray) -> IntArray:
 
 
 def _jump_lengths_s(t_ns: IntArray) -> list[float]:
-    """Return how far back each jump is (s) from where the next stamp was due."""
+    """Return the length (s) of each jump, from the expected next stamp back to the actual one."""
     step_ns = np.diff(t_ns)
     due_ns = np.median(np.abs(step_ns)) if step_ns.size else 0.0
     return [float(due_ns - step_ns[row]) / NS_PER_S for row in _jumps(t_ns).tolist()]
@@ -103,7 +103,7 @@ def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
 
 
 def _between_jumps(sequence: Sequence) -> Sequence:
-    """Return the longest stretch, in frames, whose frames and samples lie between two jumps; the first of equals."""
+    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
     frames_t_ns, samples_t_ns = _streams(sequence)
     frame_part = _parts(frames_t_ns)
     sample_part = _parts(samples_t_ns)
@@ -116,7 +116,7 @@ def _between_jumps(sequence: Sequence) -> Sequence:
 
 
 def _parts(t_ns: IntArray) -> IntArray:
-    """Number the stamps (N,) by the jumps before them."""
+    """Return for each stamp (N,) the number of jumps before it."""
     part = np.zeros(t_ns.size, dtype=np.int64)
     part[_jumps(t_ns) + 1] = 1
     return np.cumsum(part)
@@ -129,7 +129,7 @@ def _late(t_ns: IntArray) -> int:
 
 
 def _in_order(t_ns: IntArray) -> IntArray:
-    """Return the rows that sort the stamps, without repeats (the first wins) and without invalid ones."""
+    """Return the rows that sort the stamps, without invalid ones, and of repeated ones only the first."""
     _, first_row = np.unique(t_ns, return_index=True)
     rows: IntArray = first_row[t_ns[first_row] != NOT_A_TIME]
     return rows

@@ -1,10 +1,9 @@
-"""Twist samples that describe another interval than the one they are paired with.
+"""Twist samples that describe another interval than their pairing says.
 
-With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
-0 where the sample at the start describes the interval, 1 where that at the end does, 1/2 for their mean. Fitting
-it by least squares favours 1/2 on noisy samples, for a mean has half the noise; the change of the neighbouring
-camera rotations serves as an instrument, which follows the change of the samples and is independent of their
-noise, so the estimate does not depend on the noise.
+With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is 0 where
+the sample at the start describes the interval, 1 where that at the end does, and 1/2 for their mean. Least squares are
+biased towards 1/2 on noisy samples, because a mean of two has half the variance. The change of the neighbouring camera
+rotations is therefore used as an instrument: it follows the change of the samples and is independent of their noise.
 """
 
 from dataclasses import replace
@@ -19,13 +18,13 @@ from toolkit.geometry import BoolArray, IntArray
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
 
-# The lag must be known to this and differ from the present pairing's by so many standard errors.
+# Largest standard error of the lag, in intervals, and how many of them it must differ by from the present pairing's.
 LARGEST_ERROR = 0.1
 SIGMAS = 5.0
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Measure the lag of the angular velocities; pair the samples by the nearest of start, mean and end."""
+    """Estimate the lag of the angular velocities; pair the samples by the nearest of start, mean and end."""
     sequence, intervals = evidence.sequence, evidence.intervals
     if not isinstance(sequence.motion, TwistSamples):
         return None
@@ -69,7 +68,7 @@ def _lag(sequence: Sequence, intervals: Intervals) -> Scalar | None:
 
 
 def _samples_at_frames(sequence: Sequence) -> tuple[IntArray, BoolArray]:
-    """Return the sample at or after each frame (K,), and which intervals (K - 1,) have just one sample at each end."""
+    """Return the sample at or after each frame (K,), and which intervals (K - 1,) have samples at both ends only."""
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
     sample = np.searchsorted(t_ns, frames_t_ns)
     at_frame = t_ns[sample] == frames_t_ns

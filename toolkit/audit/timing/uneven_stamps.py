@@ -1,8 +1,8 @@
-"""Frames whose stamps come unevenly while the images do not: transfer times, a busy computer, every other one late.
+"""Frames with uneven stamps of evenly taken images: transfer times, a busy computer, every other stamp late.
 
-How far a camera goes and turns from one image to the next is in proportion to the time between them. Beside what it
-does in the intervals around, an interval that is stamped longer has to show more motion; where it shows as much as any
-other, the stamps do not tell when the images were taken. The tracks alone decide that.
+The motion of a camera from one image to the next is proportional to the time between them. An interval that is longer
+by its stamps must show more motion than the intervals around it. Where it shows as much as these, the stamps are not
+the times of the images. Only the tracks are used.
 """
 
 import numpy as np
@@ -14,21 +14,21 @@ from toolkit.geometry import Array, BoolArray
 from toolkit.jackknife import jackknife_error
 from toolkit.resampling import NS_PER_S
 
-# Steps whose root mean square off the usual one is less than this share of it harm nobody. Those of real drives are off
-# by 1.3 % at most, which their cameras do not follow either; chosen with them in view.
+# Least root mean square of the steps' deviation, as a share of the usual step. Real drives have 1.3 % at most, which
+# their cameras do not follow either; chosen with them in view.
 LEAST_SHARE = 0.03
-# The share of the steps' unevenness that the motion follows is 1 where stamps are right. It counts below a half by so
-# many standard errors, of a jackknife.
+# The motion follows a share of 1 of the deviations if the stamps are right. The stamps are reported if the share is
+# below the second number by so many standard errors, of a jackknife.
 SIGMAS, MOST_FOLLOWED = 5.0, 0.5
-# Two steps together are as long as ever where every other frame is late. Of those of a recording that has lost frames,
-# at most half of them, the shortest quarter has none missing.
+# The usual step is half of this quantile of two steps together, which are even where every other frame is late. The
+# shortest quarter misses no frame, in a recording that has lost half of its frames at most.
 UNHURT = 0.25
-# The intervals beside one that show how the camera moves there.
+# Offsets of the intervals around one that show how the camera moves there.
 BESIDE = (-2, -1, 1, 2)
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Hold the unevenness of the frames' steps against that of the camera's."""
+    """Regress the variation of the camera's motion on that of the frames' steps."""
     sequence, camera = evidence.sequence, evidence.camera_motion
     if evidence.spoilt_by or not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
         return None
@@ -52,7 +52,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _even_steps_s(step_s: Array) -> Array:
-    """Return what the steps (K - 1,) are if images come evenly: multiples of a usual one, where frames were lost."""
+    """Return the steps (K - 1,) of evenly taken images: multiples of the usual step, for frames may be lost."""
     usual_s = 0.5 * float(np.quantile(step_s[1:] + step_s[:-1], UNHURT))
     for _ in range(2):
         steps = np.maximum(np.round(step_s / usual_s), 1.0)
@@ -61,11 +61,11 @@ def _even_steps_s(step_s: Array) -> Array:
 
 
 def _followed(rates: Array, step_s: Array, even_s: Array, known: BoolArray) -> Scalar | None:
-    """Return the share of the steps' unevenness that is in the camera's motion, from its rates (K - 1, 6).
+    """Return the share of the variation of the steps that the camera's motion follows, from its rates (K - 1, 6).
 
-    ``even_s`` (K - 1,) are the steps without it.
+    ``even_s`` (K - 1,) are the steps without variation.
 
-    None where too few intervals are known with those beside them.
+    None where the motion is known in too few intervals and those around them.
     """
     rows = np.arange(-BESIDE[0], step_s.size - BESIDE[-1])
     beside = rows[:, None] + np.array(BESIDE)

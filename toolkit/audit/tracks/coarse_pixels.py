@@ -1,8 +1,8 @@
-"""Sightings that were rounded: to whole pixels or a simple part of one, or as half-precision numbers are.
+"""Sightings that were rounded to whole pixels, to a simple part of one, or to half-precision numbers.
 
-Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals", 1948),
-and more to what is far: a disparity of a few pixels has few steps. A half-precision number above 512 px has steps of
-half a pixel, above 1024 px of a whole one.
+Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals", 1948).
+The depths of far points suffer most, because a disparity of a few pixels has few steps. Half-precision numbers have
+steps of half a pixel above 512 px, and of a whole one above 1024 px.
 """
 
 import numpy as np
@@ -10,17 +10,17 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.geometry import Array
 
-# Steps (px) that are looked for; of what is finer nothing is said, for it adds less than 0.03 px.
+# Steps (px) that are tried. Smaller ones are not reported, because they add errors of less than 0.03 px.
 STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
-# With fewer sightings a few round ones may be chance. Of sound recordings an eighth are half-precision numbers at most.
-# Of so many first ones a smaller share will do, to look at the rest.
+# Least number of sightings, and least share of rounded ones among the first so many (to look at the rest) and among
+# all. In sound recordings at most an eighth of the coordinates are half-precision numbers by chance.
 LEAST, SOME, NEARLY_ALL = 100, 0.9, 0.999
-# Rounding counts as a warning from this share of the stated standard deviation on.
+# Rounding is a warning from this share of the stated standard deviation on.
 MOST_SHARE = 0.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Tell the steps of the coordinates, and what they add to the stated noise."""
+    """Report the steps of the coordinates, and what they add to the stated noise."""
     rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
     seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
     if len(seen_px) < LEAST:
@@ -40,7 +40,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _step_px(uv_px: Array) -> tuple[float | None, str]:
-    """Return the step (px) of coordinates (N, 2), and in words whose it is; None where there is none that counts."""
+    """Return the step (px) of coordinates (N, 2), and its description; None where there is none."""
     some_px = uv_px[:LEAST]  # most recordings are refuted by them
     for step_px in STEPS_PX:
         if _share_round(some_px, step_px) > SOME and _share_round(uv_px, step_px) > NEARLY_ALL:

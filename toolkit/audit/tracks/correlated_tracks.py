@@ -1,9 +1,9 @@
-"""Tracks whose sightings do not err each by itself: a corner that drifts, or a stereo match that is off for good.
+"""Tracks with correlated errors: the tracked corner drifts, or a stereo match is wrong along the whole track.
 
-Between three sightings of a track lie two one-step residuals about the camera's own motion. Where sightings err by
-themselves, the second's error is in both with opposite signs, and their correlation is -1/2. Where errors are a random
-walk, what is new in each is its own, and it is 0; a wrong disparity makes wrong depths, whose residuals are alike. It
-is white noise that estimators are told unless a setting or the recording says otherwise.
+Three sightings of a track give two one-step residuals about the camera's own motion. If the errors of sightings are
+independent, the error of the second sighting is in both residuals with opposite signs, and their correlation is -1/2.
+If the errors are a random walk, the residuals are independent and the correlation is 0. A wrong disparity gives a wrong
+depth and residuals of the same sign. Estimators assume white noise unless a setting or the recording says otherwise.
 """
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
@@ -12,7 +12,7 @@ from toolkit.audit.parts.one_step import CORRELATION_SIGMAS, MOST_CORRELATION
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Tell the correlation of neighbouring one-step residuals where it is not that of independent errors."""
+    """Report the correlation of neighbouring one-step residuals where it is not that of independent errors."""
     sequence = evidence.sequence
     if evidence.spoilt_by or sequence.rig.track_noise is not None:
         return None

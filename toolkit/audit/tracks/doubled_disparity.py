@@ -1,8 +1,8 @@
 """Tracks whose disparity doubles from their first sighting to their second, and stays doubled.
 
-A tracker that adds the disparity to a guess that holds it already does that to every track it has just detected.
-To an estimator such points are half as far away, so the camera moves half as fast. No motion does the same: it
-would have to halve the depth of near and far points alike, in one interval, and then stop.
+A tracker that adds the disparity to an initial guess which already contains it doubles the disparity of every newly
+detected track. Such points appear at half of their depth, so the camera seems to move at half of its speed. No motion
+causes this: it would have to halve the depths of near and far points alike in one interval, and then stop.
 """
 
 from dataclasses import replace
@@ -17,14 +17,16 @@ from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import Observations
 
-# What counts as doubled is nearer to twice than to once or four times; noise and the motion itself do the rest.
+# A disparity is doubled if its ratio is nearer to two than to one or four, to allow for noise and for the motion.
 LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
-# Share of the tracks detected in a frame. Measured: 0.96 to 1 where they are doubled, at most 0.22 in any other
-# frame of the real recordings and 0.40 in simulated ones, where few and far points begin a track.
+# Least share and number of doubled tracks among those detected in a frame. Measured: 0.96 to 1 where they are doubled,
+# at most 0.22 in any other frame of the real recordings and 0.40 in simulated ones, where few and far points begin a
+# track.
 LEAST_SHARE, LEAST_TRACKS = 0.8, 6
-# What the inverse of the ratio is at infinity, halfway between that of doubled tracks, a half, and that of any motion.
+# Largest inverse of the ratio at infinite depth: halfway between that of doubled tracks, a half, and of any motion,
+# one.
 MOST_AT_INFINITY = 0.75
-# Share of them that must be seen a third time, or that they stay so is not known.
+# Least share of them that is seen a third time, to know that the disparity stays doubled.
 LEAST_SEEN_AGAIN = 0.5
 
 
@@ -51,7 +53,7 @@ def check(evidence: Evidence) -> Symptom | None:
 class _Beginnings(NamedTuple):
     """Tracks (T,), frame and disparity (px) of their first sighting, and ratios, second to first and third to second.
 
-    Only tracks whose first ratio is known; a second ratio that is not is NaN.
+    Only tracks whose first ratio is known are contained; an unknown second ratio is NaN.
     """
 
     track_id: IntArray
@@ -72,7 +74,7 @@ def _beginnings(observations: Observations) -> _Beginnings:
     track_id, frame = observations.track_id[order], observations.frame[order]
     disparity = disparity_px(observations.uv_px)[order]
     follows = (np.diff(track_id) == 0) & (np.diff(frame) == 1) & (disparity[:-1] > LEAST_DISPARITY_PX)
-    # From row n to row n + 1. Two rows more, for the last sighting may be a track's only one.
+    # From row n to row n + 1; two more rows, because the last sighting may be the only one of its track.
     ratio = np.full(track_id.size + 1, np.nan)
     np.divide(disparity[1:], disparity[:-1], out=ratio[: follows.size], where=follows)
     first = np.flatnonzero(np.diff(track_id, prepend=-1))
@@ -85,7 +87,7 @@ def _doubles(ratio: Array) -> BoolArray:
 
 
 def _is_doubled(begun: _Beginnings) -> bool:
-    """Say whether nearly all of the tracks double once and stay so."""
+    """Say whether nearly all of the tracks double once and keep the doubled disparity."""
     doubled, again = _doubles(begun.first_ratio), np.isfinite(begun.second_ratio)
     if doubled.size < LEAST_TRACKS or doubled.mean() < LEAST_SHARE or again.mean() < LEAST_SEEN_AGAIN:
         return False
@@ -94,10 +96,10 @@ def _is_doubled(begun: _Beginnings) -> bool:
 
 
 def _far_ones_double(begun: _Beginnings) -> bool:
-    """Say whether the tracks double wherever they are, as no motion has it: it leaves those at infinity as they are.
+    """Say whether the disparity of far tracks doubles as well; a motion does not change it at infinity.
 
-    By a camera that comes t nearer, the inverse of the ratio is 1 - t d / (f b), a line in the disparity d; the line
-    through the medians of either half, of those farther and those nearer, tells it where d is none.
+    If the camera moves forward by t, the inverse of the ratio is 1 - t d / (f b), a straight line in the disparity d.
+    The line through the medians of the farther and the nearer half of the tracks is extrapolated to d = 0.
     """
     order = np.argsort(begun.first_px)
     (far_px, far), (near_px, near) = (
@@ -120,6 +122,6 @@ FAULT = Fault(
     "doubled-disparity",
     "tracks whose disparity doubles from their first sighting to the second",
     check,
-    # A track through a stale frame, or one that was lost, is no longer the one that was detected.
+    # A track through a stale frame or an absence may continue at another point, and must have been split before.
     after=("time-order", "returning-tracks", "stale-frames", "swapped-coordinates"),
 )

@@ -1,8 +1,8 @@
-"""An image that jumps and stays: a camera knocked in its mount, a crop that changed, a stabiliser.
+"""An image that is displaced from some time on: a knock of the camera, another crop, a stabiliser.
 
-For one interval the camera seems to rotate by an angle that no gyro has seen. A slip of the tracks does so too, and is
-over after it. With odometry the camera's velocity must be turned by the same angle from there on; beside an IMU, whose
-gyro has little noise, one interval that stands alone is enough.
+For one interval the camera seems to rotate by an angle that the gyro did not measure. A slip of the tracks causes the
+same, but does not last. With odometry the direction of the camera's velocity must change by the same angle from then
+on. With an IMU, whose gyro has little noise, a single such interval is enough.
 """
 
 import numpy as np
@@ -13,19 +13,20 @@ from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, median_error
 from toolkit.geometry import Array
 from toolkit.resampling import NS_PER_S
 
-# The interval counts beyond so many standard deviations of all, and this angle (rad): sound recordings beside an IMU
-# have single ones of up to 9 and 0.007, and drives of up to 21 and 0.021, without a turn that stays.
+# An interval is a candidate beyond so many standard deviations of all and beyond this angle (rad). Single intervals of
+# sound recordings have up to 9 and 0.007 with an IMU, and up to 21 and 0.021 on drives, without a lasting rotation.
 SIGMAS, LEAST_RAD = 12.0, 0.008
-# It stands alone: those beside it are less than this share of it.
+# The intervals before and after it must be less than this share of it.
 ALONE = 0.5
-# The turn that stays, over so many intervals before and after, is this share of the jump, and four standard errors from
-# none. Real drives have shares of 1.26 to 1.43 where a jump was planted; three slips of 03 have 0.0, 0.4 and 2.1.
+# The lasting rotation, over so many intervals before and after, must be within these shares of the jump, and so many
+# standard errors from zero. Real drives have shares of 1.26 to 1.43 where a jump was planted; three slips of the tracks
+# in 03 have 0.0, 0.4 and 2.1.
 AROUND, STAYS_SIGMAS, SHARE = 60, 4.0, (0.5, 1.75)
 LEAST_AROUND = 10
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Name the times at which the camera's axes turn and stay so."""
+    """Report the times at which the camera's axes rotate and stay rotated."""
     if evidence.intervals is None:
         return evidence.blind
     sequence, intervals = evidence.sequence, evidence.intervals
@@ -52,7 +53,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _stays(intervals: Intervals, T_imu_cam: Array, k: int, turn_rad: Array) -> bool:
-    """Say whether the camera's velocity is turned by that angle after interval ``k``; an IMU has none to tell."""
+    """Say whether the camera's velocity is rotated by that angle after interval ``k``; True with an IMU."""
     if intervals.v_mps is None:
         return True
     share = _share_that_stays(intervals, intervals.v_mps, T_imu_cam, k, turn_rad)
@@ -60,7 +61,7 @@ def _stays(intervals: Intervals, T_imu_cam: Array, k: int, turn_rad: Array) -> b
 
 
 def _share_that_stays(intervals: Intervals, v_mps: Array, T_imu_cam: Array, k: int, turn_rad: Array) -> Scalar | None:
-    """Return how much of a turn the camera's velocity, over the measured one's size, shows after k and not before."""
+    """Return the share of a rotation by which the camera's velocity is rotated after interval k and not before."""
     w_imu, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
     deviation = v_mps + np.cross(w_imu, T_imu_cam[:3, 3]) - seen
     expected = np.cross(turn_rad, seen)  # of a camera that is turned against its extrinsic from there on

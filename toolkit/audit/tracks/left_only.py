@@ -1,11 +1,11 @@
-"""Sightings by the left image alone: no fault, for they are used as they are, but who reads a result should know."""
+"""Sightings by the left image alone: they are used as they are, and reported as information."""
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.sequence import is_left_only
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the sightings without the right image; warn where there are no others, for then nothing has a depth."""
+    """Count the sightings without the right image; warn where there are no others, so that no point has a depth."""
     uv_px = evidence.sequence.observations.uv_px
     count = int(is_left_only(uv_px).sum())
     if count == 0:

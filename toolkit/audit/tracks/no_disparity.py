@@ -7,7 +7,7 @@ from toolkit.models.stereo import disparity_px
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the sightings with uL - uR <= 0 and drop them; their tracks go on."""
+    """Count the sightings with uL - uR <= 0 and drop them; their tracks continue."""
     observations = evidence.sequence.observations
     bad = disparity_px(observations.uv_px) <= 0.0
     count = int(bad.sum())
@@ -25,6 +25,6 @@ FAULT = Fault(
     "no-disparity",
     "stereo sightings with a disparity uL - uR <= 0",
     check,
-    # A dropped sighting would look like a track that went and came back.
+    # A dropped sighting would look like a track that was absent and returned.
     after=("stale-frames", "returning-tracks", "swapped-coordinates"),
 )

@@ -1,11 +1,11 @@
-"""A recording whose frames show nothing at all, though nothing says that it was made without a camera."""
+"""A recording without any sighting that does not state that it was made without a camera."""
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.sequence import NO_FEATURES
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the frames where there is no sighting in any of them, unless the recording says that it has none."""
+    """Count the frames if none has a sighting, unless the recording states that it has none."""
     sequence = evidence.sequence
     if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
         return None

@@ -1,7 +1,7 @@
-"""Track ids that are absent for some frames and then come back.
+"""Track ids that are absent for some frames and then return.
 
-If the tracker recognised the point, an estimator that uses the id closes a loop without detecting one; if it re-used
-the id, two different points are estimated as one.
+If the tracker recognised the point, an estimator that uses the id closes a loop without knowing it. If the tracker used
+the id again for another point, an estimator takes two points for one.
 """
 
 from dataclasses import replace

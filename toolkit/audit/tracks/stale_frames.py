@@ -1,8 +1,8 @@
 """Frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves.
 
-From such a frame on each track follows a different scene point: its steps before and after agree with the
-motion, the step into the stale frame is zero. A standing camera repeats pixels too, and that is no fault: the
-image must have been moving just before and just after or, at the ends of a recording, the samples must say so.
+From such a frame on, each track follows a different scene point: its steps before and after agree with the motion,
+while the step into the stale frame is zero. A standing camera also repeats pixels, which is no fault. Therefore the
+image must move just before and just after or, at the ends of a recording, the samples must show motion.
 """
 
 from dataclasses import replace
@@ -25,7 +25,8 @@ LEAST_TRACKS = 4
 # Upper quartile of the pixel steps above which the camera moves (far points hardly move). Measured: at least 0.96 px
 # beside a stale frame, at most 0.05 px with the vehicle parked.
 MOVING_PX = 0.5
-# By the samples it moves where they turn the image by more from frame to frame, which no gyro's bias does, or drive.
+# The samples show motion where they rotate the image by more than this (px) from frame to frame, which no gyro bias
+# does, or where odometry is faster than this (m/s).
 TURNING_PX, DRIVING_MPS = 2.0, 1.0
 
 
@@ -53,7 +54,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _moving_by_samples(sequence: Sequence) -> BoolArray:
-    """Say of each interval (K - 1,) whether the samples turn the image by pixels, or move the vehicle fast."""
+    """Say for each interval (K - 1,) whether, by the samples, the image rotates by pixels or the vehicle drives."""
     if sequence.motion_kind == "none" or not is_comparable(sequence):
         return np.zeros(max(sequence.frame_count - 1, 0), dtype=bool)
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
@@ -65,13 +66,13 @@ def _moving_by_samples(sequence: Sequence) -> BoolArray:
 
 
 def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array, moving_by_samples: BoolArray) -> BoolArray:
-    """Say of each interval whether its tracks stand still between moving ones, or at an end while the samples move."""
+    """Say for each interval whether its tracks repeat while those around it, or at an end the samples, show motion."""
     survivors = np.bincount(pairs.interval, minlength=intervals)
     repeats = np.bincount(pairs.interval[step_px == 0.0], minlength=intervals)
     frozen = (repeats >= LEAST_SHARE * survivors) & (survivors >= LEAST_TRACKS)
     moving = _typical_step_px(intervals, pairs, step_px) > MOVING_PX
-    # The nearest interval that is not frozen, on either side; past the ends there is none. Where hardly a track goes
-    # on, as where a long freeze ends, nothing shows either.
+    # The nearest interval on either side that is not frozen; beyond the ends there is none. Intervals with hardly any
+    # surviving track, as at the end of a long freeze, are passed over as well.
     index, shows_nothing = np.arange(intervals), frozen | (survivors < LEAST_TRACKS)
     before = np.maximum.accumulate(np.where(shows_nothing, -1, index))
     after = np.minimum.accumulate(np.where(shows_nothing, intervals, index)[::-1])[::-1]
@@ -106,6 +107,6 @@ FAULT = Fault(
     "stale-frames",
     "frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves",
     check,
-    # Dropped sightings would hide that a track went through a stale frame.
+    # Dropped sightings would hide that a track passes through a stale frame.
     after=("time-order", "returning-tracks"),
 )

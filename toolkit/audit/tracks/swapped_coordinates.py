@@ -23,14 +23,15 @@ from toolkit.models.camera_motion import CameraMotion, neighbours
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import Sequence, StereoRig, is_left_only
 
-# Share of the disparities that is not positive from which their order is doubted: a repair by dropping would block.
+# From this share of disparities that are not positive on, the order of the coordinates is tested: dropping so many
+# sightings would block.
 SUSPECT_SHARE = 0.2
-# Of the right order at most this share is not positive: 1 % where it was measured.
+# Under the right order at most this share is not positive: 1 % where it was measured.
 SOUND_SHARE = 0.05
-# Rows of a pair differ by their noise: within so many standard deviations of the rig's for half of the sightings.
+# Rows of a pair differ by noise alone: half of the differences are within so many standard deviations of a pixel.
 ROW_SIGMAS = 5.0
-# Share of the sightings in tracks of exchanged rows that counts: no sound recording at hand has any. Most of the tracks
-# like rows must be so, or the camera's motion, or what they are, is not known.
+# Least share of the sightings in tracks with exchanged rows, of which sound recordings at hand have none; and least
+# share of these among the sightings in tracks without disparity, or else the camera's motion may be wrong.
 LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
 # A track may have rows in the place of uL and uR if the mean of its disparities is within so many standard errors of
 # zero. Its distance from the epipolar lines is judged from so many pairs of neighbouring sightings on.
@@ -71,7 +72,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
-    """Tell of tracks that follow the camera's own motion, which the others show, with u and v exchanged alone."""
+    """Report tracks that follow the camera's own motion, known from the others, only with u and v exchanged."""
     sequence = evidence.sequence
     candidates = _like_rows(sequence)
     if (
@@ -95,9 +96,9 @@ def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
 
 
 def _exchanged_rows(sequence: Sequence, camera: CameraMotion) -> BoolArray:
-    """Say of each sighting (N,) whether its track, without disparity, follows the camera's motion only if exchanged.
+    """Say for each sighting (N,) whether its track, without disparity, follows the camera's motion only if exchanged.
 
-    Its median distance from the epipolar lines is then less than half of what it is as given.
+    Its median distance from the epipolar lines is then less than half of that as given.
     """
     candidates = _like_rows(sequence)
     pairs = neighbours(sequence.observations)
@@ -119,7 +120,7 @@ def _exchanged_rows(sequence: Sequence, camera: CameraMotion) -> BoolArray:
 
 
 def _like_rows(sequence: Sequence) -> BoolArray:
-    """Say of each sighting (N,) whether the disparities of its track are zero but for the noise of rows."""
+    """Say for each sighting (N,) whether the disparities of its track are zero except for the noise of rows."""
     disparity = disparity_px(sequence.observations.uv_px)
     _, member, counts = np.unique(sequence.observations.track_id, return_inverse=True, return_counts=True)
     mean = np.bincount(member, weights=disparity) / counts
@@ -130,7 +131,7 @@ def _like_rows(sequence: Sequence) -> BoolArray:
 
 
 def _off_line_px(before_px: Array, after_px: Array, T_after_before: Array, rig: StereoRig) -> Array:
-    """Return how far (P,) px pixels (P, 2) in a frame are from where those before, at any depth, would come to lie."""
+    """Return the distances (P,) px of pixels (P, 2) from the epipolar lines of those in the frame before."""
     focal_px, centre_px = np.array([rig.fx_px, rig.fy_px]), np.array([rig.cx_px, rig.cy_px])
     ray = np.concatenate([(before_px - centre_px) / focal_px, np.ones((len(before_px), 1))], axis=1)
     turned = (T_after_before[:, :3, :3] @ ray[:, :, None])[..., 0]
@@ -142,14 +143,14 @@ def _off_line_px(before_px: Array, after_px: Array, T_after_before: Array, rig: 
 
 
 def _median_of_each(group: IntArray, values: Array) -> Array:
-    """Return the median of values (P,) over each group, in the order of the groups' numbers."""
+    """Return the median of the values (P,) of each group, in the order of the groups' numbers."""
     order = np.lexsort((values, group))
     _, first, counts = np.unique(group[order], return_index=True, return_counts=True)
     return np.asarray(values[order][first + (counts - 1) // 2])
 
 
 def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
-    """Tell of sightings without any disparity: missing ones written as zeros, or one image in the place of both."""
+    """Report sightings without disparity: missing ones written as zeros, or one image in the columns of both."""
     observations = sequence.observations
     uv_px = observations.uv_px
     filler, missing = _filler(uv_px)
@@ -176,7 +177,7 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
 
 
 def _filler(uv_px: Array) -> tuple[float, BoolArray]:
-    """Return the value that most sightings (N, 3) with three equal coordinates have, and which of them (N,) do."""
+    """Return the most frequent value among sightings (N, 3) with equal coordinates, and which of them (N,) have it."""
     alike = (uv_px == uv_px[:, :1]).all(axis=1)
     if not alike.any():
         return np.nan, alike
@@ -186,16 +187,16 @@ def _filler(uv_px: Array) -> tuple[float, BoolArray]:
 
 
 def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
-    """Return the recording with its coordinates in every other order, and with the tracks behind the camera turned."""
+    """Return the recording in every other order of coordinates, and with left and right exchanged behind the camera."""
     uv_px = sequence.observations.uv_px
     orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
-    # What lacks the right image has nothing to be exchanged with.
+    # A sighting without the right image has nothing to be exchanged with.
     sequence = replace(sequence, observations=sequence.observations.select(~is_left_only(uv_px)))
     uv_px = sequence.observations.uv_px
     whole = [(_order_name(order), uv_px[:, list(order)]) for order in orders]
     observations = sequence.observations
     parts = {"whole tracks": _behind(uv_px, observations.track_id), "whole frames": _behind(uv_px, observations.frame)}
-    # The exchange is of the kind that leaves the fewest points behind the camera.
+    # Of tracks and frames, the grouping is taken under which the exchange leaves the fewest points behind the camera.
     kind = min(parts, key=lambda kind: int(np.sum(parts[kind] != (disparity_px(uv_px) <= 0.0))))
     behind = parts[kind]
     if behind.mean() < 1.0 - SUSPECT_SHARE:
@@ -205,7 +206,7 @@ def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
 
 
 def _behind(uv_px: Array, group: IntArray) -> BoolArray:
-    """Say of each sighting (N,) whether most of its group, a track or a frame, has a disparity <= 0."""
+    """Say for each sighting (N,) whether most of its group, a track or a frame, has a disparity <= 0."""
     _, member = np.unique(group, return_inverse=True)
     behind = np.bincount(member, weights=disparity_px(uv_px) <= 0.0) / np.bincount(member)
     return np.asarray(behind[member] > 0.5)

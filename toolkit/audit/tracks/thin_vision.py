@@ -1,4 +1,4 @@
-"""Times at which the tracks are too few to tell how the camera moves: darkness, a bare wall, a lost tracker."""
+"""Times at which the tracks are too few to determine the camera's motion: darkness, a bare wall, a lost tracker."""
 
 import numpy as np
 
@@ -7,18 +7,18 @@ from toolkit.audit.parts.intervals import is_comparable
 from toolkit.geometry import BoolArray
 from toolkit.resampling import NS_PER_S
 
-# A span counts from this length on: what is shorter every estimator bridges by the motion samples.
+# Least length (s) of a span: every estimator bridges shorter ones by the motion samples.
 LEAST_S = 0.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Name the spans in which the camera's own motion is not determined."""
+    """Report the spans in which the camera's own motion is not determined."""
     sequence = evidence.sequence
     if evidence.spoilt_by or not len(sequence.observations) or not is_comparable(sequence):
         return None
     known = evidence.camera_motion.known
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
-    # A single interval that long is a hole in the frames, which time-gap names.
+    # A single interval of that length is a gap in the frames, which time-gap reports.
     spans = [run for run in _runs(~known) if run[1] - run[0] > 1 and frame_s[run[1]] - frame_s[run[0]] >= LEAST_S]
     if not spans:
         return None
@@ -37,7 +37,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _runs(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return begin and end of every run of marked entries (n,), the end behind its last."""
+    """Return begin and end of every run of marked entries (n,), the end being the index after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

@@ -1,13 +1,16 @@
-"""Tracks that scatter otherwise than the stated noise of a sighting explains: mismatches, or a noise stated wrongly.
+"""Tracks whose scatter contradicts the stated noise of a sighting: mismatches, or a wrong stated noise.
 
-About the camera's own best motion a point triangulated in one frame, of noise R, and projected into the next misses its
-sighting there by J R J^T + R, whatever the motion samples say. The upper quartile of that distance is chi-square's with
-three degrees of freedom where R is right; the few grossest do not move it. Every estimator is told R and trusts it.
+A point triangulated in one frame, moved by the camera's own best motion and projected into the next, has a residual of
+covariance J R J^T + R there, where R is the covariance of a sighting. The motion samples are not used. If R is right,
+the squared Mahalanobis distances have the upper quartile of the chi-square distribution with three degrees of freedom,
+which a few gross errors do not change. Every estimator uses R.
 
-Where a real tracker's noise is assumed, and less than that, mismatches hide beneath it: those are told by their size.
+Where R is assumed and a real tracker is more accurate, mismatches do not raise the upper quartile. They are found by
+their number of gross residuals.
 
-Tracks that scatter far less refute the stated noise as well, unless their errors go together from frame to frame: what
-lasts along a track is not in its steps. Where each sighting errs by itself (``correlated_tracks``), that is certain.
+A scatter far below the stated noise contradicts it too, unless errors are correlated from frame to frame, because an
+error that lasts along a track is not in its steps. If the errors are independent (``correlated_tracks``), the
+conclusion is certain.
 """
 
 from dataclasses import replace
@@ -22,32 +25,35 @@ from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 
-# Standard deviations over the stated ones. 21 sound simulated recordings have 0.98 to 1.00 and real ones, whose noise
-# is assumed, at most 0.62; a tenth of mismatches makes 1.04 to 1.07, three tenths 1.20 to 1.46.
+# Limit of the ratio of the standard deviation to the stated one. 21 sound simulated recordings have 0.98 to 1.00 and
+# real ones, whose noise is assumed, at most 0.62. A tenth of mismatches gives 1.04 to 1.07, three tenths 1.20 to 1.46.
 MOST_SCATTER, SIGMAS = 1.05, 5.0
-# Distances that a quarter of the sightings exceed, and one in a thousand.
+# Squared distances that a quarter of the sightings exceed, and one in a thousand (chi-square, 3 degrees of freedom).
 UPPER_QUARTILE, FAR_CHI2 = 4.108, 16.27
-# Beyond this, 32 standard deviations, a sighting is of another point. Sound real recordings have 0.6 % of them at most,
-# of moving objects and repeated frames; the limit was chosen with them in view.
+# Beyond this squared distance, 32 standard deviations, a sighting is of another point. Sound real recordings have at
+# most 0.6 % of these, on moving objects and in repeated frames; the limit of their share was chosen with them in view.
 GROSS_CHI2, MOST_GROSS = 1000.0, 0.02
-# Where the nearer half is as the stated noise has it, or a fifth of mismatches makes it, so is the tail, but for
-# mismatches: a tenth of tracks that slide makes 2.1 to 5.6 % of far distances, sound simulations 0.06 to 0.12 %.
+# Median of the squared distances, and the ratios by it that agree with the stated noise, also with a fifth of
+# mismatches. The tail must then agree as well, unless there are mismatches: a tenth of sliding tracks gives 2.1 to 5.6
+# % of far distances, sound simulations have 0.06 to 0.12 %.
 MEDIAN_CHI2, USUAL_SCATTER = 2.366, (0.95, 1.12)
 MOST_FAR, FAR_SIGMAS = 0.008, 3.0
-# Tracks whose sightings err each by themselves refute a noise this many times too large: with few of them the steps are
-# a little small, for the camera's motion is fitted to them, and what is told small on purpose is seldom told by half.
+# Independent errors contradict a noise that is stated this many times too large. With few tracks the scatter is a
+# little too small, because the camera's motion is fitted to them; and a noise overstated on purpose is often less than
+# that.
 MOST_OVERSTATED = 1.5
-# Where errors go together their steps are smaller than they are. The toolkit's own tracker is told 7 times as much as
-# its steps scatter by on EuRoC's images, simulated tracks like it as well, which this limit was chosen beside.
+# The same limit for correlated errors, whose steps scatter less than the errors. The noise stated of the toolkit's own
+# tracker is 7 times the scatter of its steps on EuRoC's images, and so is that of simulated tracks like it. Chosen with
+# these in view.
 MOST_OVERSTATED_CORRELATED = 10.0
-# Of a standard deviation: with less, tracks are exact, as of a simulation without noise.
+# Ratio of standard deviations below which tracks are exact, as in a simulation without noise.
 _NO_ERROR = 1e-5
-# Where the noise alone is wrong, the nearer half is off as far as the upper quartile is.
+# If the stated noise alone is wrong, the ratios by the median and by the upper quartile agree to within these factors.
 SAME_RATIO = (0.9, 1.1)
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Hold the scatter of the tracks about the camera's own motion against the stated noise."""
+    """Compare the scatter of the tracks about the camera's own motion with the stated noise."""
     if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return evidence.blind
     steps = evidence.one_step
@@ -67,9 +73,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | None:
-    """Tell of tracks that scatter far less than the stated noise makes them, and whether that noise alone explains it.
+    """Report tracks that scatter far less than the stated noise, and whether that noise alone explains it.
 
-    The camera's motion takes six of an interval's 3 n residuals, by which they are smaller than their noise.
+    Six parameters of the camera's motion are fitted to the 3 n residuals of an interval, which lowers their scatter.
     """
     _, interval, pairs = np.unique(
         evidence.sequence.observations.frame[evidence.one_step.after], return_inverse=True, return_counts=True
@@ -90,7 +96,7 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     symptom = _symptom(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
     if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
         return symptom
-    # Nobody stated this noise: it is what is assumed of a tracker whose recording says nothing.
+    # This noise was not stated: it is the one assumed where a recording states none.
     assumed = (
         f"{symptom.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px states it"
     )
@@ -111,7 +117,7 @@ def _symptom(detail: str, treatment: str) -> Symptom:
 
 
 def _tail(chi2: Array) -> Symptom | None:
-    """Tell of gross distances (P,), or of far ones beyond chance where the nearer half is as the noise has it."""
+    """Report too many gross distances (P,), or too many far ones where the median agrees with the noise."""
     gross, error = _gross_share(chi2), jackknife_error(_gross_share, chi2)
     if gross > MOST_GROSS + SIGMAS * error:
         return _mismatched(f"{gross:.1%} +- {error:.1%}", f"{np.sqrt(GROSS_CHI2):.0f} times what the noise explains")
@@ -130,12 +136,12 @@ def _mismatched(share: str, than: str) -> Symptom:
 
 
 def _scatter(chi2: Array) -> float:
-    """Return the standard deviation over the stated one that the upper quartile of squared distances (P,) shows."""
+    """Return the ratio of the standard deviation to the stated one, by the upper quartile of squared distances (P,)."""
     return float(np.sqrt(np.quantile(chi2, 0.75) / UPPER_QUARTILE))
 
 
 def _nearer_scatter(chi2: Array) -> float:
-    """Return the same as the nearer half of them shows it."""
+    """Return the same ratio by the median of the squared distances (P,)."""
     return float(np.sqrt(np.median(chi2) / MEDIAN_CHI2))
 
 

@@ -1,8 +1,8 @@
 """Rows of the left and the right image that may differ, in a file that has one for both.
 
-A pair that is not rectified has its right image's rows off the left one's. Files with both rows are refused when they
-are read where these differ, and in images the front end matches along the rows alone; where one row is all there is,
-nothing is left to compare, and what the wrong row bends looks like a principal point that is off.
+In a pair that is not rectified, the rows of the right image differ from those of the left one. Files with both rows are
+refused at reading where these differ, and the front end matches images along rows only. In a file with a single row for
+both there is nothing to compare, and the effect of wrong rows looks like a wrong principal point.
 """
 
 from toolkit.audit.fault import Evidence, Fault, Undecided
@@ -10,7 +10,7 @@ from toolkit.sequence import ONE_ROW_FOR_BOTH, is_left_only
 
 
 def check(evidence: Evidence) -> Undecided | None:
-    """Say that the rows cannot be compared where the recording has one for both images."""
+    """Report that the rows cannot be compared where the recording has one row for both images."""
     sequence = evidence.sequence
     if ONE_ROW_FOR_BOTH not in sequence.provenance.facts or is_left_only(sequence.observations.uv_px).all():
         return None

@@ -1,5 +1,5 @@
-"""Faults of what a run is compared with: the truth and the direction of gravity.
+"""Faults of the truth, with which runs are compared, and of the direction of gravity in its world.
 
-Read ``truth_mismatch`` (a truth of another recording or frame), ``truth_clock`` (by a clock of another pace) and
-``gravity_direction`` (a first orientation that gravity contradicts).
+Read ``truth_mismatch`` (a truth of another motion, frame or unit), ``truth_clock`` (stamps by a clock of another rate)
+and ``gravity_direction`` (the truth's world against the IMU).
 """

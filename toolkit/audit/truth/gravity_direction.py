@@ -1,8 +1,9 @@
-"""Gravity that points elsewhere in the world than an IMU shows beside the truth's attitudes: z down for z up, say.
+"""Gravity in another direction of the truth's world than IMU and truth show, for example z down for z up.
 
-Over a recording the specific force, turned into the world by the truth, is the mean acceleration less gravity. Who
-begins at the truth with gravity upside down falls at twice its rate. The truth is believed where it turns as the gyro
-does; without one gravity has no direction but that in which the first frame is levelled.
+The mean of the specific force over a recording, rotated into the world by the truth, is the mean acceleration less
+gravity. An estimator that starts at the truth with gravity upside down accelerates at twice its size. The truth is used
+where its rates of rotation agree with the gyro's. Without a truth there is nothing to compare: the first frame is
+levelled by the samples.
 """
 
 from dataclasses import replace
@@ -16,18 +17,18 @@ from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, Truth
 
-# Sound recordings are within a degree; 1 m/s^2 of mean acceleration that the truth does not tell is six. A world's axis
-# that is nearer than the second is taken for gravity's.
+# Least angle between both directions: sound recordings are within a degree, and 1 m/s^2 of mean acceleration that the
+# truth does not show makes six. An axis of the world nearer than the second angle is taken as the direction of gravity.
 LEAST_DEG, NEAR_AXIS_DEG = 30.0, 15.0
-# So long (s) a recording must be for its mean acceleration to be small, and so often the truth is read in a second.
+# Least length (s) of a recording, for its mean acceleration to be small, and the rate at which the truth is read.
 LEAST_S, READ_HZ = 2.0, 20.0
-# The truth turns as the gyro does where no more than this share of the rates of rotation, squared, is left.
+# The rotations of truth and gyro agree if their squared difference is no more than this share of the squared rates.
 MOST_LEFT = 0.25
 STANDARD_MPS2 = 9.81
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare the direction of gravity that is given with that of the samples."""
+    """Compare the given direction of gravity with that of the samples."""
     sequence, truth = evidence.sequence, evidence.sequence.truth
     if not isinstance(sequence.motion, ImuSamples) or truth is None or evidence.spoilt_by:
         return None
@@ -55,7 +56,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _measured(sequence: Sequence, truth: Truth) -> Array | None:
-    """Return gravity (3,) m/s^2 in the truth's world; None where the truth is short, or turns otherwise."""
+    """Return gravity (3,) m/s^2 in the truth's world; None where the truth is short, or rotates otherwise."""
     in_order = truth.t_ns.size >= 2 and (np.diff(truth.t_ns) > 0).all() and np.isfinite(truth.T_world_imu).all()
     begin_ns = max(int(truth.t_ns[0]), int(sequence.motion.t_ns[0])) if truth.t_ns.size else 0
     end_ns = min(int(truth.t_ns[-1]), int(sequence.motion.t_ns[-1])) if truth.t_ns.size else 0

@@ -1,17 +1,18 @@
-"""A truth by a clock that runs faster or slower than the frames': right in the middle, and ever farther off beyond.
+"""A truth stamped by a clock that runs faster or slower than the frames', so that the clocks differ more and more.
 
-What the camera and the truth turn by tells the pace, as it tells an offset (`truth_mismatch`). Positions do not: where
-a vehicle goes evenly, a clock that is fast looks like a truth that is too long.
+The rate is estimated from the rotations of camera and truth, like an offset (`truth_mismatch`). Positions are not used:
+at constant speed a fast clock looks like a wrong scale of the truth.
 """
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 
-# Where the clocks must be farther apart than this (s) to show, it is said: half a metre of a drive.
+# Where only a difference of the clocks larger than this (s), half a metre of a drive, would be found, the finding is
+# undecided.
 LARGEST_S = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Tell the pace of the truth's clock beside that of the frames."""
+    """Report the rate of the truth's clock relative to that of the frames."""
     if evidence.spoilt_by or evidence.sequence.truth is None:
         return None
     clock = evidence.truth_clock

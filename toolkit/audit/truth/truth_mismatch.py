@@ -1,9 +1,9 @@
-"""A truth that moves otherwise than vision: it is of another motion, or vision's scale is wrong.
+"""A truth whose motion differs from the camera's: it is of another motion, or vision's scale is wrong.
 
-Over windows of time the camera's own displacement and turn, chained from frame to frame, are held against those of the
-truth. Vision's steps are too long or too short where the baseline or the focal length is wrong, or the truth is in
-another unit; they go elsewhere where the truth is another recording's, runs backwards or is in other axes. Where it is
-of this motion, the camera turns as it does, but for an offset of its clock.
+Displacements and rotations of the camera over windows of time, chained from frame to frame, are compared with those of
+the truth. Vision's steps have another length where the baseline or the focal length is wrong, or the truth is in
+another unit. They have another direction where the truth is of another recording, runs backwards or is in other axes.
+If the rotations agree at shifted times, the truth's clock has an offset.
 """
 
 from collections.abc import Iterator
@@ -32,19 +32,22 @@ from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
 
-# Motions that have nothing to do with each other differ by more than they are large; a truth that errs, by far less.
+# Least difference, as a share of the larger motion: unrelated motions differ by more than their size, a truth with
+# errors by far less.
 MOST_OFF = 0.5
-# A vehicle that fills the view turns vision alone, but not for a third of the time.
+# Rotations are compared if the truth has them in at least this share of the windows. A vehicle that fills the view lets
+# vision rotate wrongly, but not for so long.
 LEAST_TURNING = 1.0 / 3.0
-# From one true pose to the next: so far (m) and so many times the usual speed (m/s) is no motion.
+# Limits of a step between true poses: a distance (m), a multiple of the usual speed, and a speed (m/s).
 LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
-# So many times as far as counts as a motion the camera drives while the truth stands; for half of the time no vehicle
-# fills the view, and no truth that was measured repeats a pose exactly while it does.
+# The camera drives if it moves by so many times LEAST_MOVED_M in a window. The truth must stand in this share of the
+# windows, longer than another vehicle fills the view; a measured truth does not repeat a pose exactly.
 DRIVES, MOST_STANDING = 5.0, 0.5
-# Root mean squares, as shares of the motion: a truth that is so far off is tried in other readings, and taken to
-# be of one where it is so many times nearer then. In sound recordings at hand it never is.
+# From this root mean square difference on, as a share of the motion, other readings of the truth are tried. One is
+# reported if it makes the difference so many times smaller, which no sound recording at hand has.
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
-# Lengths (m) that a truth is written in by mistake; millimetres and centimetres are converted (`units`).
+# Units of length (m) that a truth may be in and that are only named; millimetres and centimetres are converted
+# (`units`).
 LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
@@ -53,7 +56,7 @@ _AXES = "write the truth in the axes it is read in: the world's, z upwards, and 
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Hold the camera's own motion against the truth's, in direction and in size."""
+    """Compare the camera's own motion with the truth's, in direction and in size."""
     truth = evidence.sequence.truth
     if truth is None or truth.t_ns.size < 2 or evidence.spoilt_by or not is_comparable(evidence.sequence):
         return None
@@ -63,7 +66,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _broken(truth: Truth) -> Symptom | None:
-    """Tell of poses that are not finite, or between which nothing can have moved: a reset, a flipped bit."""
+    """Report poses that are not finite, and steps that no vehicle makes: a reset, a flipped bit."""
     finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
     if not finite.all():
         return _symptom(
@@ -114,7 +117,7 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
 
 
 def _doubtful(scale: Compared) -> Undecided | None:
-    """Say of a scale that it is more than chance and no more than sound recordings have."""
+    """Return a scale that is beyond chance and within the limit of sound recordings, as undecided."""
     if abs(scale.value - 1.0) <= scale.by_chance:
         return None
     return Undecided(
@@ -124,7 +127,7 @@ def _doubtful(scale: Compared) -> Undecided | None:
 
 
 def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
-    """Tell of a truth that stands in more than chance of the windows while the camera drives, or in most of them."""
+    """Report a truth that stands in half of the windows while the camera drives, or repeats a pose exactly."""
     drives_m = np.linalg.norm(both.displaced_m[0], axis=1)
     frozen = (both.displaced_m[1] == 0.0).all(axis=1) & (both.turned_rad[1] == 0.0).all(axis=1)
     apart = ~moved & (drives_m > DRIVES * LEAST_MOVED_M)
@@ -140,9 +143,9 @@ def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
 
 
 def _looking_one_way(truth: Truth, both: Windows) -> Symptom | None:
-    """Tell of a truth whose orientations are all one, as where none was written, in windows in which the camera turns.
+    """Report a truth whose orientations are all equal, as if none was written, while the camera rotates.
 
-    A truth that was measured repeats no orientation exactly, so that noise of the camera alone has to be less.
+    A measured truth does not repeat an orientation exactly, so the camera's rotation only has to exceed its noise.
     """
     turns_rad = np.linalg.norm(both.turned_rad[0], axis=1)
     turns = turns_rad > LEAST_TURNED_RAD
@@ -156,7 +159,7 @@ def _looking_one_way(truth: Truth, both: Windows) -> Symptom | None:
 
 
 def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom | None:
-    """Tell of a truth that moves as the camera does backwards, or in other axes, and not as given, as ``both`` are."""
+    """Report a truth that agrees with the camera if read backwards or in other axes, and not as given (``both``)."""
     given = _apart(both)
     if not given > LEAST_APART:
         return None
@@ -171,14 +174,14 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
 
 
 def _readings(T_world_imu: Array) -> Iterator[tuple[str, str, Array]]:
-    """Yield what a truth may be in the place of what it is: in words, what to do about it, and the poses."""
+    """Yield other readings of a truth: a description, what to do about it, and the poses."""
     yield "whose poses run backwards", "write them in the order of their stamps", T_world_imu[::-1]
     for exchange in exchanges():
         yield f"with {exchange.description}", _AXES, exchange.reread(T_world_imu)
 
 
 def _apart(both: Windows) -> float:
-    """Return how far the two of windows are apart, as a share of what the truth moves and turns: root mean squares."""
+    """Return the root mean square difference over windows, as a share of the truth's displacements and rotations."""
     squared = [
         np.mean((x[0] - x[1]) ** 2) / max(float(np.mean(x[1] ** 2)), least**2)
         for x, least in ((both.displaced_m, LEAST_MOVED_M), (both.turned_rad, LEAST_TURNED_RAD))
@@ -187,7 +190,7 @@ def _apart(both: Windows) -> float:
 
 
 def _by_another_clock(evidence: Evidence) -> Symptom | None:
-    """Tell of a truth that turns as the camera does at other times, unless by a clock of another pace."""
+    """Report an offset of the truth's clock, unless the clock has another rate (`truth_clock`)."""
     clock = evidence.truth_clock
     if clock is None or clock.offset is None or clock.runs_otherwise:
         return None
