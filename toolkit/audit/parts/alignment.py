@@ -201,8 +201,7 @@ def _window(
 
 
 class _Path(NamedTuple):
-    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU in its first axes, without initial velocity and
-    gravity.
+    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU in its first axes, from rest and without gravity.
 
     Also the derivatives (n, 3, 3) of the displacement by the biases of the accelerometer and the gyro.
     """

@@ -93,8 +93,7 @@ def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | 
 
 
 def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
-    """Describe which errors of the intrinsics and of the camera's rotation would go undetected, where they are
-    large."""
+    """Describe which errors of the intrinsics and the camera's rotation would go undetected, if they are large."""
     limits = LIMITS[kind]
     focal = limits.focal + limits.sigmas * found.error[FOCAL]
     centre_px = np.array(limits.centre_px) + limits.sigmas * found.error[CENTRE]

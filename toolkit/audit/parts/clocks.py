@@ -134,8 +134,7 @@ def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
 
 
 def _medians(values: Array, reached: IntArray) -> Array:
-    """Return the medians (C, d, 1) of values (C, d, M) without NaN; ``reached`` (C,) counts the values that are not
-    NaN."""
+    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, so many in each row (C,)."""
     ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
     middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
     return np.asarray(0.5 * (middle[0] + middle[1]))
@@ -196,8 +195,7 @@ class TruthClock(NamedTuple):
 
 
 class BesideTruth(NamedTuple):
-    """The camera's rates of rotation (M, 3) rad/s in the IMU's axes over M intervals, and the truth's as those of a
-    gyro.
+    """Rates of rotation (M, 3) rad/s of the camera, in the IMU's axes over M intervals, and of the truth.
 
     ``sequence`` is the recording with the truth's rates of rotation in place of its motion samples.
     """

@@ -1,4 +1,4 @@
-"""Edits of a sequence: some of its frames or motion samples, and new tracks where an id no longer follows one point."""
+"""Edits of a sequence: a selection of frames or motion samples, and new ids where a track follows another point."""
 
 from dataclasses import replace
 
@@ -9,9 +9,9 @@ from toolkit.sequence import Observations, Sequence
 
 
 def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
-    """Return the sequence with the frames ``kept`` (M,), in that order; the sightings of the others go.
+    """Return the sequence with the frames ``kept`` (M,), in that order, without the sightings of the others.
 
-    A prior is the state at the first frame: it goes where that frame is another one.
+    A prior is the state at the first frame: it is dropped where the first frame changes.
     """
     new_index = np.full(sequence.frame_count, -1)
     new_index[kept] = np.arange(kept.size)
@@ -39,7 +39,7 @@ def by_track(observations: Observations) -> IntArray:
 
 
 def split(observations: Observations, starts: BoolArray) -> IntArray:
-    """Return track ids (N,) in which every row of ``starts`` (N,), and its track from there on, is a new track.
+    """Return track ids (N,) in which a new track begins at every row of the mask ``starts`` (N,).
 
     The first part of each track keeps its id; new ids follow the largest one there is.
     """

@@ -1,12 +1,12 @@
-"""The camera's position and its small rotation against the given extrinsic, from camera and motion samples.
+"""Position and small rotation of the camera against the given extrinsic, and how significant they are.
 
-Position: which of two places the camera is at, by the turns of the vehicle. The regression of `alignment` measures it,
-in which the scale and the rotation of the camera may also be a little off, as they are in real recordings. To its
-scatter the error is added that sound recordings have.
+Position: which of two positions the camera has, by the turns of the vehicle. The regression of `alignment` estimates
+it, with the scale and the rotation of the camera as further unknowns. The systematic error of sound recordings is added
+to the covariance.
 
-Rotation: by velocities where there are any, else by rates of rotation. Unknowns that are not known better are solved
-for with it: beside velocities the scale and the position of the camera (`alignment`), beside rates the gyro's bias.
-Slip lasts for seconds and is one event: the standard error is that of a jackknife over stretches no shorter than that.
+Rotation: by velocities with odometry, by rates of rotation with an IMU. The regression by velocities has the scale and
+the position of the camera as further unknowns (`alignment`), that by rates the gyro's bias. Slip lasts for seconds, so
+the standard error is that of a jackknife over stretches that are no shorter.
 """
 
 from typing import NamedTuple
@@ -21,29 +21,30 @@ from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measured_motion import MotionKind
 from toolkit.sequence import Sequence
 
-# Logarithms of the odds at which the other position is accepted (1000 to 1), and at which it is excluded (20 to 1
-# against it): the position in a file is right more often than not.
+# Logarithms of the odds at which the other position is accepted (1000 to 1) and excluded (20 to 1 against it). They
+# differ because the position in a file is right more often than not.
 LOG_ODDS, LOG_ODDS_AGAINST = float(np.log(1000.0)), float(np.log(20.0))
 # The other position is excluded where the measured one is this many standard deviations away.
 MOST_SIGMAS = 4.0
-# What sound odometry has, chosen with the recordings at hand in view: velocities of another point along the way of
-# travel (m; 0.4 to 0.9 in ten cars), and velocities that are off by a share for as long as a turn lasts, as the limits
-# of `miscalibration` and `vision-scale` have it. A share of the velocity is that share of the turn's radius.
+# Standard deviations of the systematic error of sound odometry, chosen with the recordings at hand in view: the
+# distance along the direction of travel to the point whose velocities are given (m; 0.4 to 0.9 in ten cars), and a
+# relative error of the velocity that lasts as long as a turn, which looks like this share of the turn's radius. The
+# share agrees with SYSTEMATIC_RAD and SYSTEMATIC_SCALE.
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
-# The same of sound recordings beside an IMU (m): 0.06 at most.
+# The same of sound recordings with an IMU (m), which have 0.06 at most.
 BESIDE_IMU_M = 0.05
 # Limits beyond the standard errors for a rotation (rad) estimated by velocities, which slip and pitch of cars bias, and
 # by rates of rotation. Chosen with the sound recordings at hand in view.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
-# Axes about which the error of the rotation is this many times that of the best axis are not judged: a velocity does
-# not determine the rotation about its own direction, and slip would bias it.
+# Axes whose standard error is more than this many times that of the best axis are not judged: velocities do not
+# determine the rotation about their own direction, and slip would bias it.
 MOST_ERROR_RATIO = 4.0
-# Least bound by chance (rad); without noise it would be zero.
+# Least bound (rad); without noise it would be zero.
 LEAST_BOUND_RAD = 5e-6
 
 
 def way_gone(sequence: Sequence, intervals: Intervals, found: Alignment, way_m: Array) -> Scalar:
-    """Return the camera's position along a vector (3,) m from the given one: 0 is its start, 1 its end."""
+    """Return where the camera is along a vector (3,) m from the given position: 0 is its start, 1 its end."""
     return share_of_way(found.lever_m, found.lever_cov_m2 + _systematic_cov_m2(sequence, intervals), way_m)
 
 
@@ -91,9 +92,9 @@ def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:
 
 
 class Turn(NamedTuple):
-    """Small rotations (m,) rad about m axes that can be judged, their standard errors (m,) rad, and bounds by chance.
+    """Small rotations (m,) rad about m axes that can be judged, their standard errors (m,) rad, and bounds (m,) rad.
 
-    They exceed ``by_chance_rad`` (m,) by chance less often than ``robust.LEVEL``.
+    By chance a rotation exceeds ``by_chance_rad`` less often than ``robust.LEVEL``.
     """
 
     rad: Array
@@ -102,18 +103,18 @@ class Turn(NamedTuple):
 
 
 def angle_of(turn: Turn) -> Scalar:
-    """Return the angle of a turn about the axes that can be judged."""
+    """Return the angle of a rotation about the axes that can be judged."""
     angle = float(np.linalg.norm(turn.rad))
     return Scalar(angle, float(np.linalg.norm(turn.rad * turn.error_rad)) / max(angle, 1e-12))
 
 
 def turn_by_velocities(whole: Regression) -> Turn:
-    """Return the turn that brings the camera's velocities onto those of odometry."""
+    """Return the rotation that aligns the camera's velocities with those of odometry."""
     return _tested(whole.found[TURN], whole.formal[TURN, TURN], whole.cov[TURN, TURN], whole.in_motion, "twist")
 
 
 def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
-    """Return the turn that brings the camera's rotations onto those of the gyro."""
+    """Return the rotation that aligns the camera's rates of rotation with those of the gyro."""
     seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
     bias = np.tile(np.eye(3), (len(seen), 1, 1))
     response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
@@ -123,9 +124,9 @@ def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
 
 
 def _tested(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
-    """Return the turn (3,) about axes that can be judged: those of its formal covariance (3, 3).
+    """Return the rotation (3,) about those principal axes of its formal covariance (3, 3) that can be judged.
 
-    The jackknife covariance (3, 3) of a few stretches is too uncertain to choose the axes.
+    The jackknife covariance ``cov`` (3, 3) of a few stretches is too uncertain to choose the axes.
     """
     variance, axes = np.linalg.eigh(formal)
     error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), variance))

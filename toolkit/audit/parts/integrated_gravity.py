@@ -1,4 +1,4 @@
-"""The velocity that gravity alone gives a camera beside an IMU: its own velocity less the integrated specific force."""
+"""The camera's velocity less the integrated specific force of an IMU, which changes by gravity alone."""
 
 from typing import NamedTuple
 

@@ -15,7 +15,8 @@ from toolkit.sequence import Sequence, check_runnable
 LEAST_INTERVALS = 30
 # Longest step (s) in the integration of an IMU's samples, with the orientation in its middle.
 STEP_S = 0.02
-# Largest bias of a gyro with odometry, 11 degrees a second; more is another fault, such as wrong axes.
+# Largest bias (rad/s) of a gyro with odometry, 11 degrees per second; a larger difference is another fault, such as
+# wrong axes.
 MOST_BIAS_RADPS = 0.2
 
 
@@ -40,7 +41,7 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Return both motions; None where too few intervals are known, or no motion was measured."""
+    """Return both motions over the known intervals; None if these are too few or no motion was measured."""
     rows = np.flatnonzero(camera.known)
     if isinstance(sequence.motion, NoSamples) or rows.size < LEAST_INTERVALS:
         return None
@@ -50,7 +51,7 @@ def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
 
 
 def is_comparable(sequence: Sequence) -> bool:
-    """Say whether time increases, values are finite and the samples span the frames, as every comparison needs."""
+    """Say whether time increases, values are finite and the samples span the frames, which every comparison needs."""
     try:
         check_runnable(sequence)
     except DataError:
@@ -59,9 +60,9 @@ def is_comparable(sequence: Sequence) -> bool:
 
 
 class Integral(NamedTuple):
-    """Samples (S, d) at stamps (S,), joined by straight lines and level beyond the ends, and their integral up to each.
+    """Samples (S, d) at stamps (S,), linear between them and constant beyond the ends, and their integral up to each.
 
-    After it is made once, means over intervals cost time only in their number.
+    Once it is computed, the time for means over intervals depends on their number only.
     """
 
     t_ns: IntArray
@@ -89,15 +90,15 @@ class Integral(NamedTuple):
 
 
 def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Array:
-    """Return the mean (K - 1, d) over each interval between frames of samples (S, d) joined by straight lines."""
+    """Return the mean (K - 1, d) over each interval between frames of linearly interpolated samples (S, d)."""
     return Integral.of(t_ns, values).means(frames_t_ns)
 
 
 def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Return stamps (n,) that divide each interval between stamps (K,) into equal parts, and the index (K,) of those.
+    """Return stamps (n,) that divide each interval between stamps (K,) into equal parts, and the rows (K,) of these.
 
-    Over a part, STEP_S at most, an IMU's force and rate of rotation are taken as constant. Over the interval between
-    two frames they are not: vibration of several hertz would bias a scale by 8 %.
+    Over a part, no longer than STEP_S, an IMU's specific force and rate of rotation are taken as constant. Taken as
+    constant between two frames, vibration of several hertz would bias a scale by 8 %.
     """
     parts = max(1, int(np.ceil(np.median(np.diff(t_ns)) / NS_PER_S / STEP_S)))
     index = np.arange(len(t_ns)) * parts
@@ -106,7 +107,7 @@ def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
-    """Return the camera's motion (K - 1, 4, 4) as the samples have it through an extrinsic, less a gyro's bias."""
+    """Return the camera's motion (K - 1, 4, 4) by the motion samples and an extrinsic, less the gyro's bias."""
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     w_radps, v_mps = mean[:, 3:], mean[:, :3]
     R_imu_cam = T_imu_cam[:3, :3]
@@ -121,6 +122,6 @@ def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array
 
 
 def moved_by(camera: CameraMotion, sequence: Sequence) -> Array:
-    """Return the motion (K - 1, 4, 4) of a camera over every interval."""
+    """Return the camera's motion (K - 1, 4, 4) over every interval, from its velocities."""
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     return se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1))

@@ -1,8 +1,8 @@
 """Residuals of a point that is triangulated from one sighting of a track and projected into the next frame.
 
 The point is moved by the camera's own motion (``one_step``, ``own_one_step_px``) or by the measured motion
-(``median_one_step_px``). ``agreement`` compares both; every repaired calibration is judged by it. ``step_correlation``
-is the correlation of neighbouring residuals of a track, by the camera's own motion.
+(``median_one_step_px``). ``agreement`` compares the medians of both; it is the test of a repaired calibration.
+``step_correlation`` is the correlation of neighbouring residuals of a track under the camera's own motion.
 """
 
 from typing import NamedTuple
@@ -23,9 +23,10 @@ from toolkit.sequence import Sequence
 # Median one-step residual (px) beyond which samples and tracks disagree. Sound recordings have 0.3 to 3.1 px, the
 # largest where the samples' own noise explains it.
 MOST_PX = 3.0
-# So many times what the tracks' own scatter and the stated noise of the samples explain is allowed in any case.
+# The limit is no less than this many times what the tracks' own scatter and the stated noise of the samples explain.
 TIMES_EXPLAINED = 2.0
-# Residuals beyond so many robust standard deviations are left out: mismatches and what moves are no noise.
+# Residuals beyond so many robust standard deviations, of mismatches and moving objects, are left out of the
+# correlation, which needs so many pairs.
 USUAL = 3.0
 LEAST_TRIPLES = 300
 # Limit of the correlation of neighbouring residuals. Errors with a white part and a random walk along the track have
@@ -33,16 +34,16 @@ LEAST_TRIPLES = 300
 # is more than 2. Simulated white tracks have -0.40 to -0.48, because the camera's motion is fitted to them, and real
 # ones 0.1 to 0.9. The correlation must be beyond the limit by so many standard errors.
 MOST_CORRELATION, CORRELATION_SIGMAS = -0.25, 5.0
-# Of a standard deviation: with less, tracks are without errors.
+# Least standard deviation of whitened residuals; below it, tracks are exact.
 _NO_ERROR = 1e-6
 
 
 class OneStep(NamedTuple):
-    """P neighbouring sightings of a track, in time: their rows (P,), the second's residual (P, 3) px, and its noise.
+    """P pairs of successive sightings of a track: their rows (P,), the second's residual (P, 3) px, and its covariance.
 
-    A point triangulated from the first, whose noise is R, and projected into the second's frame misses the sighting
-    there by ``cov_px2`` (P, 3, 3) = J R J^T + R if both err by themselves. ``jacobian`` (P, 3, 3) is J, how far the
-    second's prediction moves with the first.
+    The point is triangulated from the first sighting, of covariance R, and projected into the second's frame. If the
+    errors of both are independent, the residual has the covariance ``cov_px2`` (P, 3, 3) = J R J^T + R. ``jacobian``
+    (P, 3, 3) is J, the derivative of the second's prediction by the first sighting.
     """
 
     before: IntArray
@@ -71,22 +72,22 @@ def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Arra
     """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
 
     Points triangulated in one frame are moved by the motion samples through the extrinsic ``T_imu_cam`` and projected
-    into the next. A gyro has a bias: rates of rotation are taken about their median difference from the camera's, but
-    beside odometry for more than ``MOST_BIAS_RADPS``. An IMU measures no velocity: there the camera's own is taken.
-    Only intervals whose camera motion is known.
+    into the next. The gyro's bias, the median difference of its rates from the camera's, is subtracted, with odometry
+    only if it is no more than ``MOST_BIAS_RADPS``. An IMU measures no velocity, so the camera's own is used. Only
+    intervals whose camera motion is known are used.
     """
     return _median(_one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))[1])
 
 
 def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
-    """Return the median of the same residuals in each known interval that has any (M,), in pixels."""
+    """Return the median of the same residuals (M,) px in each known interval that has any."""
     interval, each_px = _one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))
     first = np.flatnonzero(np.diff(interval, prepend=-1))
     return np.array([_median(part) for part in np.split(each_px, first[1:])]) if interval.size else np.empty(0)
 
 
 def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
-    """Return the same median where the points are moved by a motion of the camera, for example its own."""
+    """Return the same median (px) where the points are moved by a motion of the camera, for example its own."""
     return _median(_one_step_px(sequence, camera, moved_by(camera, sequence))[1])
 
 
@@ -105,7 +106,7 @@ def _median(values: Array) -> float:
 
 
 class Agreement(NamedTuple):
-    """Median one-step residuals (px): under the measured motion, under the camera's own, and what is allowed."""
+    """Median one-step residuals (px): under the measured motion, under the camera's own, and the limit of both."""
 
     residual_px: float
     own_px: float
@@ -120,7 +121,7 @@ def agreement(sequence: Sequence, camera: CameraMotion) -> Agreement:
 
 
 def _explained_px(sequence: Sequence, own_px: float) -> float:
-    """Return the residual that the tracks' own scatter and the stated noise over a usual interval explain together."""
+    """Return the residual (px) that the tracks' scatter and the stated noise over a usual interval explain."""
     noise, focal_px = sequence.noise, sequence.rig.fx_px
     root_dt = np.sqrt(np.median(np.diff(sequence.frames_t_ns)) / NS_PER_S)
     turned_px = moved_px = 0.0
@@ -134,7 +135,7 @@ def _explained_px(sequence: Sequence, own_px: float) -> float:
 
 
 def step_correlation(sequence: Sequence, steps: OneStep) -> Scalar | None:
-    """Return the correlation of neighbouring one-step residuals and its standard error; None of too few, or of none."""
+    """Return the correlation of neighbouring one-step residuals; None with too few of them, or if all are zero."""
     first, second = _neighbouring_residuals(sequence, steps)
     if len(first) < LEAST_TRIPLES or not (first.any() and second.any()):
         return None
@@ -147,7 +148,7 @@ def errors_are_independent(correlation: Scalar | None) -> bool:
 
 
 def _neighbouring_residuals(sequence: Sequence, steps: OneStep) -> tuple[Array, Array]:
-    """Return whitened residuals (T, 3), the usual ones, of the two steps between three sightings of a track."""
+    """Return whitened residuals (T, 3), without outliers, of the two steps between three sightings of a track."""
     whitened = np.linalg.solve(np.linalg.cholesky(steps.cov_px2), steps.residual_px[:, :, None])[..., 0]
     sigma = MAD_TO_SIGMA * np.median(np.abs(whitened), axis=0)
     scaled = whitened / np.maximum(sigma, _NO_ERROR)

@@ -13,22 +13,22 @@ from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Largest ratios, of speeds and rates of rotation and of specific force, for which a scale that is a little off can
-# account; beyond them the sources disagree (`disagreement`). Sound recordings have ratios of speeds of 0.96 to 1.02.
+# Largest ratios, of speeds and rates of rotation and of specific force, that an error of a scale explains; beyond them
+# there is a `disagreement`. Sound recordings have ratios of speeds of 0.96 to 1.02.
 MOST_RATIO, MOST_FORCE_RATIO = 1.25, 1.5
-# Factors of units. Of mg and cm/s^2, 2 % apart, gravity tells neither.
+# Factors of units. Those of mg and cm/s^2 differ by 2 %, too little to name one of them.
 SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
 RATES = {"deg/s": 180.0 / np.pi}
 FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665, "cm/s^2": 100.0, "mm/s^2": 1000.0}
-# Noise that is this share of the samples' own scatter, or more, was estimated from them and is in their unit.
+# A stated noise of this share of the samples' own scatter, or more, was estimated from them and is in their unit.
 FROM_SCATTER = 0.5
 
 
 def rotation_ratio(intervals: Intervals) -> Scalar:
-    """Return the ratio of the samples' rates of rotation to the camera's, in whatever axes, and its standard error.
+    """Return the ratio of the samples' rates of rotation to the camera's, independent of their axes.
 
-    The scale of the similarity between the rates about their medians (Umeyama 1991, eqs. 39-42); the noise of the
-    samples does not shift it.
+    It is the scale of the similarity between the rates less their medians (Umeyama 1991, eqs. 39-42), which the noise
+    of the samples does not bias.
     """
     measured, seen = (w - np.median(w, axis=0) for w in (intervals.w_radps, intervals.w_cam_radps))
     left, singular, right = np.linalg.svd(measured.T @ seen)
@@ -49,7 +49,7 @@ def speed_ratio(intervals: Intervals | None) -> Scalar | None:
 
 
 def ratio_of_speeds(one: Array, other: Array) -> Scalar | None:
-    """Return the median ratio of the norms of (M, 3) and (M, 3), over the faster half, where noise counts least."""
+    """Return the median ratio of the norms of velocities (M, 3), over the faster half, where noise matters least."""
     speed = np.linalg.norm(other, axis=1)
     fast = (speed > 0.0) & (speed >= np.median(speed)) if speed.size else np.zeros(0, dtype=bool)
     if fast.sum() < 2:
@@ -59,7 +59,7 @@ def ratio_of_speeds(one: Array, other: Array) -> Scalar | None:
 
 
 def force_ratio(sequence: Sequence) -> Scalar | None:
-    """Return the ratio of specific forces to gravity, about which the median of their norms lies; None for twists."""
+    """Return the median ratio of the norm of the specific force to gravity; None for twists."""
     if not isinstance(sequence.motion, ImuSamples) or not sequence.motion.t_ns.size:
         return None
     ratio = np.linalg.norm(sequence.motion.accel_mps2, axis=1)[:, None] / np.linalg.norm(sequence.gravity_world)
@@ -67,6 +67,6 @@ def force_ratio(sequence: Sequence) -> Scalar | None:
 
 
 def is_from_scatter(density: Array, values: Array, t_ns: IntArray) -> bool:
-    """Say whether a density (3,) of white noise is what a loader makes of the scatter of the samples (S, 3)."""
+    """Say whether a density (3,) of white noise looks as if estimated from the scatter of the samples (S, 3)."""
     root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
     return bool((density > FROM_SCATTER * white_sigma(values) * root_dt).all())

@@ -19,11 +19,11 @@ LEAST_STRETCHES = 2
 LEVEL = 1e-3
 # How long slip lasts (s); chosen with the parts of the recordings at hand in view.
 SLIP_S = 1.5
-# Errors that last for seconds, such as slip, make estimates scatter more than independent errors of intervals: by these
-# factors, with the weight of this many stretches. 248 parts of ten drives have 2.0 on the median and 4.6 in nine of ten
-# at most, 03 alone 3.3 and 5.0; 258 parts beside an IMU 1.0 and 1.3. Chosen with them in view.
+# Errors that last for seconds, such as slip, increase the scatter of estimates over that of independent errors by these
+# factors; a factor has the weight of this many stretches. 248 parts of ten drives have 2.0 (median) and 4.6 (90 %
+# quantile), 03 alone 3.3 and 5.0; 258 parts with an IMU have 1.0 and 1.3. Chosen with them in view.
 INFLATION, INFLATION_STRETCHES = {"twist": 3.0, "imu": 1.5}, 8.0
-# What the camera's own rotation (rad/s) and velocity (m/s) of one interval are good for.
+# Accuracy of the camera's own rate of rotation (rad/s) and velocity (m/s) over one interval.
 LEAST_SPREAD_W = 0.003
 LEAST_SPREAD_V = 0.05
 
@@ -43,7 +43,7 @@ def spread(residuals: Array) -> Array:
 
 
 def cauchy(residuals: Array, least_spread: float) -> Array:
-    """Return log(1 + r^2) (C, M) of residuals (C, M, 3) about their medians, in spreads of the best candidate."""
+    """Return log(1 + r^2) (C, M) for residuals (C, M, 3) about their medians, r in spreads of the best candidate."""
     centred = residuals - np.median(residuals, axis=1, keepdims=True)
     spreads = np.stack([spread(r) for r in residuals])
     best = spreads[np.argmin(np.sum(spreads**2, axis=1))]
@@ -52,19 +52,19 @@ def cauchy(residuals: Array, least_spread: float) -> Array:
 
 
 def mean_in_sigmas(difference: Array) -> float:
-    """Return the mean of differences (M,) in standard errors of that mean."""
+    """Return the mean of differences (M,) in its own standard errors."""
     error = float(np.std(difference)) / math.sqrt(difference.size)
     return float(np.mean(difference)) / max(error, 1e-12)
 
 
 def median(values: Array) -> Array:
-    """Return the median (...) of values (N, ...), NaN where one is NaN or N is 0: of a few, in a fifth of NumPy's time.
+    """Return the median (...) of values (N, ...), NaN where one is NaN or N is 0.
 
-    An audit takes some thousand of them.
+    An audit computes some thousands of medians of few values, and this takes a fifth of NumPy's time.
     """
     if len(values) == 0:
         return np.full(values.shape[1:], np.nan)
-    # With an odd number the middle value is used twice. NaN comes last in the order.
+    # With an odd number the middle value is used twice. NaN is sorted to the end.
     lower, upper, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
     ordered = np.partition(values, (lower, upper, last), axis=0)
     middle: Array = np.where(np.isnan(ordered[last]), np.nan, 0.5 * (ordered[lower] + ordered[upper]))
@@ -78,14 +78,14 @@ def median_error(residuals: Array) -> Array:
 
 
 def slip_stretches(duration_s: float) -> int:
-    """Return how many stretches no shorter than slip lasts there are in a recording of that length."""
+    """Return how many stretches, each at least SLIP_S long, there are in a recording of this length."""
     return int(np.clip(duration_s / SLIP_S, LEAST_STRETCHES, STRETCHES))
 
 
 def in_motion(moved: Array, stretches: int) -> float:
-    """Return how many of the stretches there are by the ways (or angles) gone in them: (sum w)^2 / sum w^2 (Kish).
+    """Return the effective number of stretches, weighted by the distance or angle moved: (sum w)^2 / sum w^2 (Kish).
 
-    ``moved`` (M, 3) is the velocity, or the rate of rotation; a stretch in which a vehicle stands does not count.
+    ``moved`` (M, 3) is the velocity, or the rate of rotation; a stretch at standstill has no weight.
     """
     stretch = np.arange(len(moved)) * stretches // len(moved)
     gone = np.bincount(stretch, np.linalg.norm(moved, axis=1), stretches)
@@ -103,11 +103,11 @@ def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
 def chance_bound(error: Array, formal: Array, stretches: float, usual: float) -> Array:
     """Return the bounds (m,) that estimates exceed by chance less often than ``LEVEL``.
 
-    ``error`` (m,) is a jackknife's over so many stretches and ``formal`` (m,) the standard error if every interval
-    erred by itself. A few stretches determine their own scatter badly. So a second bound is computed from their
-    inflation of the formal error pooled with the ``usual`` inflation, and the smaller bound is returned. Source: Smyth,
-    "Linear models and empirical Bayes methods for assessing differential expression in microarray experiments" (2004),
-    section 3.
+    ``error`` (m,) is the standard error of a jackknife over so many stretches, and ``formal`` (m,) that if errors of
+    intervals were independent. A few stretches determine their own scatter badly. Therefore a second bound is computed,
+    in which the inflation of the formal error is pooled with the ``usual`` inflation, and the smaller bound is
+    returned. Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
+    microarray experiments" (2004), section 3.
     """
     own_dof = max(stretches - 1.0, 0.0)
     inflation = np.maximum(error / np.maximum(formal, 1e-12), 1.0)
@@ -120,9 +120,9 @@ def chance_bound(error: Array, formal: Array, stretches: float, usual: float) ->
 def slope(instrument: Array, regressor: Array, response: Array) -> Scalar:
     """Estimate s in response = s * regressor + noise, all (M, d), with Cauchy weights.
 
-    ``instrument`` follows the regressor but not its noise nor the response's; where the regressor has no
-    noise to speak of it is its own instrument (Wooldridge, "Econometric Analysis of Cross Section and Panel
-    Data", 2010, chapter 5). The error is the heteroscedasticity-robust one (White 1980).
+    ``instrument`` is correlated with the regressor and independent of the noise of regressor and response. A regressor
+    with negligible noise is its own instrument (Wooldridge, "Econometric Analysis of Cross Section and Panel Data",
+    2010, chapter 5). The error is the heteroscedasticity-robust one (White 1980).
     """
     scale = np.maximum(spread(response), 1e-9)
     z, x, y = instrument / scale, regressor / scale, response / scale

@@ -1,7 +1,7 @@
-"""Self-calibration: windows of key frames are adjusted to tracks and measured motion with unknown calibration.
+"""Self-calibration: an adjustment of windows of key frames to tracks and measured motion, with unknown calibration.
 
-From frame to frame the noise of the tracks hides small errors of a focal length, a clock or a rotation; points that are
-followed over a second, with the integrated IMU or odometry, show them. See `bundle` for the equations.
+From frame to frame, the noise of the tracks hides small errors of a focal length, a clock or a rotation. Points
+followed over a second, together with the integrated IMU or odometry, show them. `bundle` has the equations.
 """
 
 from typing import NamedTuple
@@ -31,40 +31,42 @@ from toolkit.models.stereo import disparity_px, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, is_left_only
 
-# Key frames are so far apart, in windows about so long: one, or an even number, of which none has a clock that is set
-# halfway within.
+# Time (s) between key frames, approximate length (s) of a window, and least number of key frames of one. There is one
+# window or an even number, so that no window contains the middle of the recording, where the clock may change.
 STRIDE_S, WINDOW_S, FEWEST_KEYS = 0.2, 4.0, 4
-# Tracks that are used: the longest of those seen in so many key frames.
+# Least number of key frames in which a track is seen, least disparity (px) of a sighting, least number of tracks of a
+# window. The longest tracks are used.
 FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, FEWEST_TRACKS = 3, 2.0, 20
 
 
 class Effort(NamedTuple):
-    """How many windows, tracks of a window and iterations there are at most."""
+    """The largest numbers of windows, of tracks in a window, and of iterations."""
 
     windows: int
     tracks: int
     iterations: int
 
 
-# Of longer recordings the windows are spread evenly beside an IMU, whose clock may change, and are those of the most
-# rotation beside odometry: cars go straight ahead for long. There tracks that creep leave no use for more of them.
+# In long recordings, the windows are spread evenly with an IMU, whose clock may change. With odometry those with the
+# most rotation are used, because cars drive straight ahead for long; more windows would not help, because errors of
+# drifting tracks dominate.
 MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 100, 14)}
-# Converged where the change is less than this share of the standard errors.
+# Converged where the step is less than this share of the standard errors.
 SETTLED = 0.4
 # A step of more than this many prior standard deviations diverges.
 STRAYED = 10.0
-# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. What is
-# beyond them is no solution.
+# Prior standard deviations of the corrections: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. A result
+# beyond them is not accepted.
 OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3, 5.0, 0.1], [2, 2, 1, 3, 3, 1, 1, 3, 3, 1, 1])
-# The first of the unknowns are those of a rectified pair; what the right image is off by is held at nothing, and
-# estimated only where one step from the settled calibration has it beyond so many standard errors: few recordings need
-# it, and all others would know their focal length and baseline less well.
+# The first unknowns are those of a rectified pair. The errors of the right image are fixed at zero, and estimated only
+# where one step from the converged calibration has them beyond so many standard errors. Few recordings need them; in
+# all others they would make focal length and baseline less certain.
 _RECTIFIED, RIGHT = RIGHT_SHIFT, slice(RIGHT_SHIFT, COMMON)
 RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}
-# Beside odometry: the place is that of the camera and of the point whose velocities are given (m), a twist may stand
-# for the interval before its stamp or after it (s), and for the bias of an accelerometer there is a turn of the
-# velocities (rad), as of cars that slip and pitch. A place that nothing tells, and a turn up to the last number, are no
-# failure.
+# Prior standard deviations with odometry: the position includes that of the point whose velocities are given (m), a
+# twist may describe the interval before or after its stamp (s), and a rotation of the velocities by slip and pitch of
+# cars (rad) replaces the bias of an accelerometer. A result is accepted up to the last two numbers, because the data
+# may not determine the position.
 POINT_M, PAIRING_S, SLIP_RAD, MOST_POINT_M, MOST_SLIP_RAD = 2.0, 0.06, 0.02, 10.0, 0.1
 
 
@@ -78,10 +80,10 @@ NEAR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(MOST_P
 
 
 class SelfCalibration(NamedTuple):
-    """The corrections of the calibration's unknowns (21,), or the values of its biases, and the covariance.
+    """Corrections of the calibration, or values of the biases, (21,) in the order of `bundle`, and their covariance.
 
-    `bundle` has their order. They rest on so many ``windows``; one says nothing of a change of the clock. Of a pair
-    that looks rectified the right image's are zero, with the covariance that they have beside the others.
+    ``windows`` is the number of windows; with one, a change of the clock is not determined. For a pair that looks
+    rectified, the corrections of the right image are zero, with the covariance that they have if all are estimated.
     """
 
     value: Array
@@ -97,9 +99,9 @@ class SelfCalibration(NamedTuple):
 def self_calibration(
     sequence: Sequence, camera: CameraMotion, intervals: Intervals, fewest_windows: int = 1
 ) -> SelfCalibration | None:
-    """Find the calibration by tracks and the measured motion.
+    """Estimate the calibration from tracks and measured motion.
 
-    None where no window has enough tracks, or no calibration near the given one fits.
+    None where no window has enough tracks, or the adjustment finds no calibration near the given one.
     """
     w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
     windows = _windows(sequence, camera, w_bias, fewest_windows)
@@ -119,7 +121,7 @@ def self_calibration(
 
 
 class _At(NamedTuple):
-    """Where an adjustment is linearised: the windows, the calibration, and what that was moved by (21,)."""
+    """Where an adjustment is linearised: the windows, the calibration, and its corrections so far (21,)."""
 
     windows: list[Window]
     calibration: Calibration
@@ -127,7 +129,7 @@ class _At(NamedTuple):
 
 
 class _Adjusted(NamedTuple):
-    """Where an adjustment ends: whether it settled, where it was linearised last, its last step (21,), the windows."""
+    """The end of an adjustment: whether it converged, the last linearisation, its step (21,) and its windows."""
 
     settled: bool
     at: _At
@@ -136,18 +138,19 @@ class _Adjusted(NamedTuple):
 
     @property
     def value(self) -> Array:
-        """What the calibration is off by (21,)."""
+        """The corrections of the calibration (21,)."""
         return self.at.moved_by + self.step
 
 
 def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
     """Return the adjustment and its covariance (21, 21).
 
-    It is that of a rectified pair, unless a step of all unknowns from where that settled wants the right image's.
+    A rectified pair is assumed unless, after convergence, one step of all unknowns has a significant correction of the
+    right image.
     """
     rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
     right = _step(rectified.all_reduced, rectified.at.moved_by, prior)[RIGHT]
-    # Windows of a pair that is not rectified fit different calibrations: their scatter is not by chance.
+    # Windows of a pair that is not rectified fit different calibrations, so their scatter is not included.
     by_parts, _ = _cov_of_parts(rectified.all_reduced, prior, COMMON)
     if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(by_parts)[RIGHT])).any():
         found = _adjusted(rectified.at, kind, COMMON)
@@ -159,7 +162,7 @@ def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
 
 
 def _adjusted(at: _At, kind: MotionKind, free: int) -> _Adjusted:
-    """Adjust the first unknowns, so many, by Gauss-Newton."""
+    """Adjust the first ``free`` unknowns by Gauss-Newton."""
     prior = PRIOR[kind]
     for _ in range(MOST[kind].iterations):
         all_reduced = [reduce(window, at.calibration) for window in at.windows]
@@ -175,9 +178,9 @@ def _adjusted(at: _At, kind: MotionKind, free: int) -> _Adjusted:
 
 
 def _step(all_reduced: list[Reduced], value: Array, prior: Array, free: int = COMMON) -> Array:
-    """Return the step (21,) of the calibration that all windows want together, and the prior about zero.
+    """Return the step (21,) of the calibration from all windows and the prior about zero.
 
-    Only the first unknowns, so many, are free.
+    Only the first ``free`` unknowns are estimated.
     """
     gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / prior**2
     step = np.zeros(COMMON)
@@ -190,9 +193,9 @@ def _information(all_reduced: list[Reduced], prior: Array) -> Array:
 
 
 def _cov(all_reduced: list[Reduced], prior: Array, free: int = COMMON) -> Array:
-    """Return the covariance of the first unknowns, so many, robust also to errors that stay the same in a window.
+    """Return the covariance of the first ``free`` unknowns, which also allows errors that are constant in a window.
 
-    Windows, of which there are two to six, count only where they scatter more than is chance.
+    The scatter of the windows, of which there are two to six, is used only where it is beyond chance.
     """
     cov, inverse = _cov_of_parts(all_reduced, prior, free)
     by_window = np.array([reduced.gradients[:, :free].sum(axis=0) for reduced in all_reduced]) @ inverse
@@ -205,10 +208,10 @@ def _cov(all_reduced: list[Reduced], prior: Array, free: int = COMMON) -> Array:
 
 
 def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[Array, Array]:
-    """Return the covariance robust to errors that stay the same along a track or for a second, and the usual one.
+    """Return the covariance that allows errors constant along a track or for a second, and the usual one.
 
-    It is no less than that of errors that are all independent, for few parts can look too calm. Source: Liang & Zeger,
-    "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
+    It is no less than that of independent errors, because a few parts may scatter too little by chance. Source: Liang &
+    Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
     """
     inverse = np.linalg.inv(_information(all_reduced, prior)[:free, :free])
     gradients = np.concatenate([reduced.gradients[:, :free] for reduced in all_reduced])
@@ -217,7 +220,7 @@ def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[
 
 
 def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[Window]:
-    """Return the windows that can be begun and have tracks enough."""
+    """Return the windows in which the motion is known and there are enough tracks."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     stride = max(1, round(STRIDE_S / step_s))
     keys = np.arange(0, sequence.frame_count, stride)
@@ -233,7 +236,7 @@ def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: in
 
 
 def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
-    """Return which of the spans of frames are taken, in the order of time."""
+    """Return the indices of the spans of frames that are used, in the order of time."""
     count, most = len(spans), MOST[sequence.motion_kind].windows
     if sequence.motion_kind == "imu" or count <= most:
         return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
@@ -244,7 +247,7 @@ def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
 
 
 def _roughly_moved(sequence: Sequence, camera: CameraMotion) -> tuple[Array, BoolArray]:
-    """Return how the camera moved over each interval (K - 1, 4, 4), and whether it is known; odometry fills gaps."""
+    """Return initial motions of the camera (K - 1, 4, 4), and whether they are known; odometry fills gaps."""
     T_before_after, known = moved_by(camera, sequence), camera.known
     if sequence.motion_kind != "twist":
         return T_before_after, known
@@ -253,7 +256,7 @@ def _roughly_moved(sequence: Sequence, camera: CameraMotion) -> tuple[Array, Boo
 
 
 def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: Array) -> Window | None:
-    """Return a window of frames (n,), begun where the camera's own motion puts them; None with too few tracks."""
+    """Return a window of frames (n,), initialised by the camera's own motion; None with too few tracks."""
     sighting, key, track = _long_tracks(sequence, keys)
     if track.size == 0 or track[-1] + 1 < FEWEST_TRACKS:
         return None
@@ -274,7 +277,7 @@ def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: A
 
 
 def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the rows (N,) of the longest tracks' sightings in key frames, sorted by track, with key and track (N,)."""
+    """Return rows (N,) of the longest tracks' sightings in key frames, sorted by track, and key and track (N,)."""
     seen = sequence.observations
     begin, end = np.searchsorted(seen.frame, [keys[0], keys[-1] + 1])
     key_of = np.full(keys[-1] - keys[0] + 1, -1)
@@ -290,7 +293,7 @@ def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray
 
 
 def _usable(uv_px: Array) -> BoolArray:
-    """Say which sightings (N, 3) were seen by both cameras and are near enough."""
+    """Say which sightings (N, 3) are of both cameras and near enough."""
     both = ~is_left_only(uv_px)
     both[both] = disparity_px(uv_px[both]) > LEAST_DISPARITY_PX
     return np.asarray(both & np.isfinite(uv_px).all(axis=1))
@@ -299,7 +302,7 @@ def _usable(uv_px: Array) -> BoolArray:
 def _velocities(T_first_imu: Array, strides: ImuStrides | TwistStrides) -> tuple[Array, Array]:
     """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4), by linear least squares over an IMU's strides.
 
-    Beside odometry they are those of the strides around, and nothing.
+    With odometry the velocities are means of the neighbouring strides', and gravity is zero.
     """
     n, dt_s = len(T_first_imu), strides.dt_s
     R_first_a, position = T_first_imu[:-1, :3, :3], T_first_imu[:, :3, 3]

@@ -1,9 +1,9 @@
 """The measured motion integrated over strides of several frames, its residuals at states at their ends, and its noise.
 
-Of an IMU the samples are preintegrated; odometry's twists are chained, with an unknown turn of their velocities. The
-derivatives by the biases are differences of the integrals: all are linear to what biases are off by.
-Source: Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry"
-(2017), section VI.
+The samples of an IMU are preintegrated; twists are chained, with an unknown rotation of their velocities. The
+derivatives by the biases are difference quotients; for biases of usual size the integrals are linear in them. Source:
+Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry" (2017),
+section VI.
 """
 
 from functools import reduce
@@ -17,19 +17,19 @@ from toolkit.measured_motion import ImuNoise, TwistMotion, TwistNoise, motions_b
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Of the biases (rad/s, and m/s^2 or rad), for derivatives.
+# Difference of a bias (rad/s, and m/s^2 or rad) for the difference quotients.
 _DIFFERENCE = 1e-4
-# What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
-# ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
+# Error of a gyro in addition to its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s),
+# because real gyros filter vibration. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
 GYRO_ERROR = 0.1
 
 
 class ImuStrides(NamedTuple):
-    """The strides (m,) between m + 1 frames: durations (m,) s, turns (m, 3, 3), and changes (m, 3) of the velocity and
-    the position in the axes of their begin, as if the IMU began at rest in free fall.
+    """An IMU's samples integrated over the strides between m + 1 frames, of durations (m,) s.
 
-    The derivatives (m, 3, 6) are those of the turn's logarithm and of the changes by the biases of gyro and
-    accelerometer, in that order. ``whitener`` (m, 9, 9) makes the errors independent and of variance 1.
+    Rotations (m, 3, 3), and changes (m, 3) of velocity and position in the axes at the begin of a stride, from rest and
+    without gravity. The derivatives (m, 3, 6) are those of the rotation's logarithm and of the changes by the biases of
+    gyro and accelerometer, in that order. ``whitener`` (m, 9, 9) makes the errors independent and of variance 1.
     """
 
     dt_s: Array
@@ -43,16 +43,16 @@ class ImuStrides(NamedTuple):
 
     @property
     def state_size(self) -> int:
-        """How many unknowns of a state the equations depend on: turn, position and velocity."""
+        """Number of a state's unknowns in the equations: rotation, position and velocity."""
         return 9
 
     @property
     def gravity_size(self) -> int:
-        """How many unknowns of gravity they depend on."""
+        """Number of unknowns of gravity in the equations."""
         return 3
 
     def biased(self, bias: Array) -> "ImuStrides":
-        """Return what the strides are where the biases (6,) are these."""
+        """Return the strides with these biases (6,)."""
         return self._replace(
             R_a_b=self.R_a_b @ so3_exp(self.d_turn @ bias),
             faster=self.faster + self.d_faster @ bias,
@@ -62,7 +62,7 @@ class ImuStrides(NamedTuple):
     def equations(
         self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
     ) -> tuple[Array, Array]:
-        """Return what states lack (m, 9), turn, velocity and position, and its change (m, 9, 27) by the unknowns.
+        """Return the residuals (m, 9), rotation, velocity and position, and their Jacobian (m, 9, 27) by the unknowns.
 
         States are m + 1 attitudes (m + 1, 3, 3), positions and velocities (m + 1, 3) in the axes of the first, with
         gravity (3,). Unknowns are the states at both ends (9 each), gravity and the biases (6,).
@@ -86,10 +86,10 @@ class ImuStrides(NamedTuple):
 
 
 class TwistStrides(NamedTuple):
-    """The same of odometry: durations (m,) s, turns (m, 3, 3) and ways gone (m, 3) m in the axes of their begin.
+    """The same of odometry: durations (m,) s, rotations (m, 3, 3) and displacements (m, 3) m in the axes at the begin.
 
-    The derivatives (m, 3, 6) are by the bias of the gyro and a turn (rad) of the measured velocities, which a vehicle
-    that slips or pitches has; ``whitener`` (m, 6, 6).
+    The derivatives (m, 3, 6) are by the bias of the gyro and by a rotation (rad) of the measured velocities, which slip
+    and pitch of a vehicle cause; ``whitener`` (m, 6, 6).
     """
 
     dt_s: Array
@@ -101,18 +101,18 @@ class TwistStrides(NamedTuple):
 
     @property
     def state_size(self) -> int:
-        """How many unknowns of a state the equations depend on: turn and position."""
+        """Number of a state's unknowns in the equations: rotation and position."""
         return 6
 
     @property
     def gravity_size(self) -> int:
-        """How many unknowns of gravity they depend on: none."""
+        """Number of unknowns of gravity in the equations: none."""
         return 0
 
     def equations(
         self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
     ) -> tuple[Array, Array]:
-        """Return what states lack (m, 6), turn and position, and its change (m, 6, 18) by the unknowns.
+        """Return the residuals (m, 6), rotation and position, and their Jacobian (m, 6, 18) by the unknowns.
 
         Unknowns are the poses at both ends (6 each) and the biases (6,).
         """
@@ -155,9 +155,9 @@ def imu_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> ImuS
 
 
 def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
-    """Return what makes the errors (m, 9) of an IMU's strides white: samples' noise, integrated twice.
+    """Return the whitener (m, 9, 9) of the errors of an IMU's strides: the samples' noise, integrated twice.
 
-    Of a position, what the velocity's error does not explain has the variance of the density times dt^3 / 12.
+    The part of a position's error that is independent of the velocity's has the variance density^2 dt^3 / 12.
     """
     noise = sequence.noise
     assert isinstance(noise, ImuNoise)
@@ -190,7 +190,7 @@ def twist_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> Tw
 
 
 def _twist_whitener(sequence: Sequence, dt_s: Array) -> Array:
-    """Return what makes the errors (m, 6) of odometry's strides white: the stated noise of its twists."""
+    """Return the whitener (m, 6, 6) of the errors of odometry's strides: the stated noise of its twists."""
     noise = sequence.noise
     assert isinstance(noise, TwistNoise)
     density = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density])

@@ -1,7 +1,7 @@
 """Displacements and rotations over windows of time, by the stereo tracks alone and by a trajectory.
 
-Both are chained from frame to frame, in the axes of the camera at the start of each window. Their difference is the
-median over the windows, with its standard error and a bound by chance.
+Both are chained from frame to frame, in the axes of the camera at the start of each window. Their difference is a
+median over the windows, with its standard error and the bound that it exceeds only by chance.
 """
 
 from itertools import pairwise
@@ -17,23 +17,23 @@ from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, Truth
 
-# Long enough that the noise of single frames is small, short enough that five seconds have ten windows.
+# Length (s) of a window: long enough for the noise of single frames to be small, and five seconds have ten of them.
 WINDOW_S = 0.5
 LEAST_WINDOWS = 4
-# What is chance less often than this, by Student's t of as many windows, counts ...
+# Level of significance, by Student's t of as many windows, ...
 LEVEL = 1e-3
-# ... beyond what sound recordings at hand have; chosen with them in view.
+# ... and limit of sound recordings at hand, beyond chance; chosen with them in view.
 SYSTEMATIC = 0.06
-# The difference is a scale where scaling removes most of it; while a vehicle stands there is only noise.
+# The difference is one of scale if scaling leaves less than this share of it.
 MOST_SCALED_OFF = 0.25
 # Least motion of a window (m, rad): the noise of a truth moves even a standing vehicle.
 LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
 
 
 def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
-    """Return the ratio of a trajectory's steps to the camera's, where they differ by this factor alone.
+    """Return the ratio of a trajectory's steps to the camera's, where both differ by this factor alone.
 
-    None where the ratio may be 1 by chance or as in sound recordings, or the tracks do not determine it.
+    None where a ratio of 1 is within chance or the limit of sound recordings, or the tracks do not determine it.
     """
     camera = camera_motion(sequence)
     if not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
@@ -49,15 +49,17 @@ def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
 
 
 class Windows(NamedTuple):
-    """What the camera and the truth (2, ...) move (2, M, 3) m and turn (2, M, 3) rad by over M windows, in the axes
-    that the camera has where each begins."""
+    """Displacements (2, M, 3) m and rotations (2, M, 3) rad of the camera and the truth over M windows.
+
+    Both are in the axes of the camera at the begin of each window.
+    """
 
     displaced_m: Array
     turned_rad: Array
 
 
 def windows(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Windows:
-    """Return both over windows in which every interval of the camera is known and the truth has poses close by."""
+    """Return both over the windows in which all intervals of the camera are known and the truth has poses nearby."""
     t_ns = sequence.frames_t_ns
     window_ns = max(round(WINDOW_S * NS_PER_S), int(np.median(np.diff(t_ns))))
     edges = np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, window_ns))
@@ -76,22 +78,22 @@ def windows(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Windows:
 
 
 def _has_truth(truth: Truth, t_ns: IntArray, apart_ns: int) -> BoolArray:
-    """Say of stamps (N,) whether they lie within the truth's and between two of them that are no farther apart."""
+    """Say which stamps (N,) lie between two stamps of the truth that are no farther apart than ``apart_ns``."""
     after = np.clip(np.searchsorted(truth.t_ns, t_ns, side="left"), 1, truth.t_ns.size - 1)
     close = truth.t_ns[after] - truth.t_ns[after - 1] <= apart_ns
     return np.asarray(close & (t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1]))
 
 
 def moving(both: Array, least: float) -> BoolArray:
-    """Say in which windows (M,) the truth does enough, of what camera and truth do (2, M, 3).
+    """Say in which windows (M,) the truth moves by more than ``least``, of both motions (2, M, 3).
 
-    Windows in which the truth stands are left out: if the camera seems to move there, a vehicle may fill the view.
+    Windows in which the truth stands are left out: the camera may seem to move there because a vehicle fills the view.
     """
     return np.asarray(np.linalg.norm(both[1], axis=1) > least)
 
 
 class Compared(NamedTuple):
-    """A median over windows with its standard error, and the distance that is exceeded only by chance."""
+    """A median over windows, its standard error, and the bound of the difference that it exceeds only by chance."""
 
     value: float
     error: float
@@ -99,19 +101,21 @@ class Compared(NamedTuple):
 
 
 def compared(each: Array) -> Compared:
-    """Return the median of what windows (M,) show; of few windows neither its error by the median nor the mean's is
-    sure, so the larger one counts."""
+    """Return the median over windows (M,).
+
+    With few windows neither the error of the median nor that of the mean is certain, so the larger one is used.
+    """
     error = max(float(median_error(each[:, None])[0]), float(np.std(each)) / np.sqrt(each.size))
     return Compared(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
 
 
 def off_by(both: Array) -> Compared:
-    """Return the share by which the two of (2, M, 3) differ, of the larger."""
+    """Return the difference of both motions (2, M, 3), as a share of the larger."""
     return compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
 
 
 def longer(seen: Array, true: Array) -> tuple[Compared, bool]:
-    """Return the ratio of displacements (M, 3) along the true ones, and whether it is all by which they differ."""
+    """Return the ratio of displacements (M, 3) along the true ones, and whether scaling removes the difference."""
     scale = _ratio(seen, true)
     return scale, scale.value > 0.0 and off_by(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
 
