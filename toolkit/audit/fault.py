@@ -102,7 +102,7 @@ class Evidence:
 
     @cached_property
     def blind(self) -> Undecided:
-        """Why the motion samples cannot be compared with the camera, where ``intervals`` is None."""
+        """The reason why samples and camera cannot be compared, where ``intervals`` is None."""
         if self.spoilt_by:
             return Undecided(f"{self.spoilt_by} must be mended before the tracks show anything")
         if not is_comparable(self.sequence):

@@ -160,7 +160,7 @@ def _stretches(deviation: Deviation) -> _Stretches:
     begin = np.flatnonzero(t_s + STRETCH_S <= t_s[-1:] + 1e-9)
     end = np.searchsorted(t_s, t_s[begin] + STRETCH_S)
     enough = end - begin >= LEAST_IN_STRETCH
-    if deviation.telescopes:  # from end to end without a gap
+    if deviation.telescopes:  # its mean needs an uninterrupted stretch
         step_s = np.diff(t_s, append=t_s[-1:])
         gaps = np.concatenate([[0], np.cumsum(step_s > 1.5 * np.median(step_s))])
         enough &= gaps[np.maximum(end - 1, 0)] == gaps[begin]

@@ -33,7 +33,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return _unseen(evidence, least if known else np.inf)
     scale, error = found.scale
     if kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO:
-        return None  # a disagreement, and told as such
+        return None  # reported as a disagreement
     measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
     if kind == "imu":
         measured, causes = "IMU's", ": check K and the baseline"

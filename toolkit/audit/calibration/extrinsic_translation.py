@@ -20,7 +20,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     if evidence.intervals.v_mps is None or evidence.alignment is None:
-        return None  # no velocity to weigh: lever-arm measures the position itself
+        return None  # without velocities lever-arm estimates the position
     rig = evidence.sequence.rig
     rotation, given = rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3]
     candidate = -rotation.T @ given
@@ -51,5 +51,5 @@ FAULT = Fault(
     "extrinsic-translation",
     "an extrinsic whose translation is that of its inverse",
     check,
-    after=("mixed-axes", "motion-gap"),  # in the wrong axes no lever arm fits
+    after=("mixed-axes", "motion-gap"),  # in the wrong axes no position fits
 )

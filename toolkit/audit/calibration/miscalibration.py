@@ -80,7 +80,7 @@ def _calibration(evidence: Evidence, intervals: Intervals) -> _Calibration:
 
 def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> _Calibration:
     if found is not None:
-        doubt = doubtful(found, rig, kind) if kind == "imu" else None  # beside odometry that is `steady_difference`
+        doubt = doubtful(found, rig, kind) if kind == "imu" else None  # with odometry `steady_difference` reports it
         return _Calibration(wrong(found, rig, kind), "; ".join(filter(None, (doubt, hidden(found, kind)))) or None)
     unseen = f"no tracks are seen for long enough beside the {BESIDE[kind]}"
     return _Calibration([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")

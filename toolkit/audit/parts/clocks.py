@@ -244,7 +244,7 @@ def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
             return None
         found, at = fitted
         return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
-    except np.linalg.LinAlgError:  # the truth turns in one stretch at most
+    except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
         return None
 
 

@@ -50,7 +50,7 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     found = evidence.agreement
     if found.residual_px > found.limit_px:
-        return None  # the gyro is not the camera's, and a disagreement is told
+        return None  # gyro and camera differ, which `disagreement` reports
     changes = _changes(evidence, intervals)
     if len(changes.velocity) < LEAST_STRIDES:
         return None

@@ -77,7 +77,7 @@ def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
     weight = read[:, 1] ** -2.0
     mean = float(weight @ read[:, 0] / weight.sum())
     error = float(weight.sum() ** -0.5)
-    if len(parts) > 1:  # what their scatter shows beyond their own errors is that of bias and tilt
+    if len(parts) > 1:  # bias and tilt make them scatter more than their own errors
         chi2 = float(weight @ (read[:, 0] - mean) ** 2) / (len(parts) - 1)
         error *= max(np.sqrt(chi2), 1.0)
     return Scalar(mean, error)

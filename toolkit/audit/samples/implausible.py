@@ -98,7 +98,7 @@ def _alone(step: Array, least: Array) -> BoolArray:
     """
     alone = np.zeros(len(step) + 1, dtype=bool)
     size = np.abs(step)
-    beside = np.maximum(size[:-3], size[3:])  # of the sample's two neighbours to those next to them
+    beside = np.maximum(size[:-3], size[3:])  # steps from its two neighbours to the next samples
     quiet = beside < ALONE * np.minimum(size[1:-2], size[2:-1])
     alone[2:-2] = (_there_and_back(step, least)[1:-1] & quiet).any(axis=1)
     return alone if alone.sum() <= max(FEWEST_ALONE, MOST_ALONE * alone.size) else np.zeros_like(alone)

@@ -55,5 +55,5 @@ FAULT = Fault(
     "not-finite",
     "sightings or motion samples that hold NaN or infinity",
     check,
-    after=("stale-frames", "returning-tracks"),  # a dropped sighting would look like a track that went and came back
+    after=("stale-frames", "returning-tracks"),  # a dropped sighting would look like a track that returned
 )

@@ -69,7 +69,7 @@ def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
     same = (values[1:] == values[:-1]).all(axis=1)
     lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
     longest = int(lengths.max(initial=1)) - 1
-    often = (same.sum() - longest + 1) / max(same.size - longest + 1, 2)  # in the rest of the recording, or once
+    often = (same.sum() - longest + 1) / max(same.size - longest + 1, 2)  # in the rest of the recording
     if often >= 1.0:
         return least
     by_chance = 1 + int(np.ceil(np.log(CHANCE / len(values)) / np.log(often)))

@@ -43,5 +43,5 @@ FAULT = Fault(
     "outside-motion",
     "frames before the first or after the last motion sample",
     check,
-    after=("time-order", "not-finite", "implausible", "stuck-samples"),  # a dropped sample at an end uncovers a frame
+    after=("time-order", "not-finite", "implausible", "stuck-samples"),  # a dropped end sample uncovers a frame
 )

@@ -22,7 +22,7 @@ def check(evidence: Evidence) -> Symptom | None:
     """Find gaps in the motion samples and keep the longest stretch between them; else find gaps in the frames."""
     sequence = evidence.sequence
     holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
-    # Only what lies between the first and the last frame matters.
+    # Gaps outside the time of the frames do not matter.
     inside = (sequence.motion.t_ns[holes + 1] > sequence.frames_t_ns[:1]) & (
         sequence.motion.t_ns[holes] < sequence.frames_t_ns[-1:]
     )
@@ -40,7 +40,7 @@ def _holes(t_ns: IntArray, least_s: float) -> IntArray:
 def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
     t_ns = sequence.motion.t_ns
     longest_s = float((t_ns[holes + 1] - t_ns[holes]).max()) / NS_PER_S
-    # A frame at the very edge of a hole still belongs to the stretch beside it.
+    # A frame at the edge of a gap belongs to the adjacent stretch.
     stretch = np.searchsorted(t_ns[holes + 1], sequence.frames_t_ns, side="right")
     in_hole = np.searchsorted(t_ns[holes], sequence.frames_t_ns, side="left") > stretch
     sizes = np.bincount(stretch[~in_hole], minlength=1)

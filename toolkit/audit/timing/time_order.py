@@ -98,7 +98,7 @@ def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
     later = np.flatnonzero(t_ns[row + 1 :] > latest)
     end = row + 1 + int(later[0]) if later.size else t_ns.size  # the first stamp that is new, or none
     if end - row <= FEWEST_AFTER and not later.size:
-        return False  # the recording ends before it shows
+        return False  # too few stamps follow to decide
     return bool(np.diff(t_ns[row + 1 : end + 1]).max(initial=0) < LEAP * usual_ns)
 
 

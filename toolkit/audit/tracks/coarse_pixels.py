@@ -41,7 +41,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 def _step_px(uv_px: Array) -> tuple[float | None, str]:
     """Return the step (px) of coordinates (N, 2), and its description; None where there is none."""
-    some_px = uv_px[:LEAST]  # most recordings are refuted by them
+    some_px = uv_px[:LEAST]  # enough to exclude it in most recordings
     for step_px in STEPS_PX:
         if _share_round(some_px, step_px) > SOME and _share_round(uv_px, step_px) > NEARLY_ALL:
             return step_px, f"uL and uR are multiples of {step_px:g} px"

@@ -64,7 +64,7 @@ def _share_that_stays(intervals: Intervals, v_mps: Array, T_imu_cam: Array, k: i
     """Return the share of a rotation by which the camera's velocity is rotated after interval k and not before."""
     w_imu, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
     deviation = v_mps + np.cross(w_imu, T_imu_cam[:3, 3]) - seen
-    expected = np.cross(turn_rad, seen)  # of a camera that is turned against its extrinsic from there on
+    expected = np.cross(turn_rad, seen)  # if the camera is rotated by it against its extrinsic
     size = np.sum(expected**2, axis=1)
     before, after = slice(max(k - AROUND, 0), k), slice(k + 1, k + 1 + AROUND)
     shares = np.sum(deviation * expected, axis=1) / np.maximum(size, 1e-12)

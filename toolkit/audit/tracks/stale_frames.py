@@ -59,7 +59,7 @@ def _moving_by_samples(sequence: Sequence) -> BoolArray:
         return np.zeros(max(sequence.frame_count - 1, 0), dtype=bool)
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
-    with np.errstate(over="ignore"):  # a sample beyond anything a sensor gives moves, too
+    with np.errstate(over="ignore"):  # by a sample that `implausible` will drop
         speed_mps, rate_radps = np.linalg.norm(mean[:, :3], axis=1), np.linalg.norm(mean[:, 3:], axis=1)
     turning = sequence.rig.fx_px * rate_radps * step_s > TURNING_PX
     return np.asarray(turning | ((sequence.motion_kind == "twist") & (speed_mps > DRIVING_MPS)))
