@@ -17,8 +17,8 @@ from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
 
 # Limit of the stated white noise over that of the samples. It is often stated several times too large on purpose, for
-# vibration and errors of scale. Sound recordings at hand have 12 at most, which includes the factor of 8 that the
-# toolkit itself puts on EuRoC's noise; chosen with them in view.
+# vibration and errors of scale. Sound recordings at hand have 8 at most (accelerometer, 5 s of MH_01), with the factor
+# that this toolkit puts on EuRoC's noise; chosen with them in view.
 MOST_WHITE = 40.0
 # Limit of the stated random walk over the change of the samples, to which motion adds far more than the walk. A true
 # walk exceeds it less than once in ten thousand, by the chi-square of twelve changes (three axes, four quarters of a
