@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.audit.parts.axes import axes_named, right_handed_axes, signed_axes
 from toolkit.audit.parts.edits import split
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import INFLATION, LEVEL, chance_bound, median, slope
+from toolkit.audit.parts.one_step import errors_are_independent
+from toolkit.audit.parts.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.models.camera_motion import camera_motion
@@ -99,3 +101,23 @@ def test_few_stretches_have_a_bound_and_many_are_not_loosened_by_it() -> None:
     assert ten == pytest.approx(
         4.781 * 0.002, rel=1e-3
     )  # Student's t of nine degrees of freedom, 0.0005 on either side
+
+
+def test_axes_are_exchanged_and_negated_in_all_48_ways_of_which_24_are_rotations() -> None:
+    signed, rotations = signed_axes(), right_handed_axes()
+    assert len(np.unique(signed, axis=0)) == 48
+    assert len(np.unique(rotations, axis=0)) == 24
+    assert np.array_equal(signed @ signed.swapaxes(1, 2), np.tile(np.eye(3), (48, 1, 1)))
+    assert np.array_equal(np.round(np.linalg.det(rotations)), np.ones(24))
+    assert np.array_equal(signed[0], np.eye(3))
+    assert np.array_equal(rotations[0], np.eye(3))
+    assert len({axes_named(one) for one in signed}) == 48
+    assert axes_named(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])) == "y, x, -z"
+
+
+def test_errors_are_independent_only_where_five_standard_errors_leave_no_other_correlation() -> None:
+    """The correlation is -1/2 for independent errors, and above -1/4 where a random walk has twice their variance."""
+    assert errors_are_independent(Scalar(-0.45, 0.039))
+    assert not errors_are_independent(Scalar(-0.45, 0.041))
+    assert not errors_are_independent(Scalar(-0.2, 0.001))
+    assert not errors_are_independent(None)
