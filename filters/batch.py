@@ -1,12 +1,13 @@
 """Full smoother: Levenberg-Marquardt over all poses and landmarks at once, answering at the end (GTSAM).
 
-What it approximates: nothing but the noise; every measurement is relinearised at every iteration (Dellaert &
-Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from the trajectory of msckf-fej and the
-landmarks mapped along it, for a start that has diverged, dead-reckoned or with too small a covariance, ends in poor
-minima. The window of that pass is as short with an IMU as without one: what a longer one would add, the solver finds.
+What it approximates: only the noise, by its stated model. Every measurement is relinearised at every iteration
+(Dellaert & Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). The solver starts from the trajectory of
+msckf-fej and from landmarks mapped along it: from a start that has diverged, that is dead-reckoned or whose covariance
+is too small it converges to poor local minima. The window of that causal pass is as short with an IMU as without one,
+because the solver finds what a longer window would add.
 
-Where the rig states noise of tracks, the solves of the schedule are followed by two along the tracks, which are Markov
-chains of sightings (``filters/smoothing/track_chain.py``).
+Where the rig states a track noise model, two more solves follow the schedule. In them each track is a Markov chain of
+sightings (``filters/smoothing/track_chain.py``).
 """
 
 import gtsam
@@ -50,7 +51,8 @@ class Batch:
         self._tracks = DiscountedTracks(setup)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        # The first solves count tracks in full, and are nearer to a pass that does (0027: 4 iterations in place of 16).
+        # The first solves give tracks their full weight, and a causal pass that does so as well starts them nearer to
+        # the optimum (0027: 4 iterations instead of 16).
         self._causal_pass = SlidingWindowFilter(
             setup, AtFirstEstimates(), window_s=setup.settings.window.seconds("twist"), scores_tracks=False
         )
@@ -59,7 +61,7 @@ class Batch:
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> None:
-        """Keep the packet and carry the causal pass on; there is no answer before the end."""
+        """Keep the packet and step the causal pass; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
         self._map.add(packet.frame, self._estimates[-1].T_world_imu)
@@ -89,7 +91,7 @@ class Batch:
         return self._scale.with_covariances(trajectory, linear, self._motion, scale_in(values))
 
     def _motion_factors(self, frames: list[StereoFrame]) -> MotionFactors:
-        """Return the prior and the steps, integrated about the last bias of the causal pass, its best; and bridges."""
+        """Return the prior, the motion factors and the gap bridges, preintegrated about the causal pass's last bias."""
         graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias
         assert best_bias is not None

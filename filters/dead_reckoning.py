@@ -18,7 +18,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class DeadReckoning(Filter):
-    """Integrates the motion; its error grows with time and nothing ever corrects it."""
+    """Integrates the measured motion; its error grows with time, because no measurement corrects it."""
 
     def __init__(self, setup: Setup) -> None:
         self._motion = motion_model(setup.noise, setup.gravity_world)

@@ -1,7 +1,7 @@
 """The report's decoupled EKF made sound: gates, landmark noise in the innovation, biases (Kang, III-C).
 
-What it approximates: pose and landmarks are kept as if independent. A frame then costs a constant time per
-landmark, and the filter is too sure of itself: its covariance does not grow with the distance driven.
+What it approximates: pose and landmarks are kept as if they were independent. A frame then costs a constant time per
+landmark, but the filter is overconfident: its covariance does not grow with the distance driven.
 """
 
 from filters.kalman.compiled import decoupled_steps
@@ -25,7 +25,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class DecoupledEkf(Filter):
-    """Predict, correct the pose by the known landmarks, correct the landmarks, start new ones, forget lost ones."""
+    """Predict, correct the pose by the known landmarks, correct the landmarks, start new ones, drop lost ones."""
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers = setup.rig, setup.settings.outliers

@@ -1,13 +1,15 @@
 """Incremental smoother over a window of seconds; older states are marginalised (Kaess et al. 2012, iSAM2).
 
-What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
-causal answer is the newest state, its final answer each state as it left the window, with the covariance the window
-had for it. A landmark that fell behind the camera is dropped and begins anew with its next sighting; a variable that
-makes the window's system indeterminate is held where it is; a landmark that more sightings refuse than made it begins
-anew, where these agree. The log says so.
+What it approximates: a factor that has left the window stays linearised where it was and is never relinearised. The
+causal answer is the newest state. The final answer is each state as it left the window, with the covariance it had in
+the window. Three faults are recovered from, and the log lists them:
 
-Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
-landmark (``filters/smoothing/chained_window.py``).
+- a landmark that has fallen behind the camera is dropped and started again from its next sighting;
+- a variable that makes the window's system indeterminate is held at its value;
+- a landmark whose gate has rejected more sightings than it was built from is started again, if the rejected ones agree.
+
+Where the rig states a track noise model, the innovation of each sighting of a track, given the sighting before it, is a
+residual of two poses and the landmark (``filters/smoothing/chained_window.py``).
 """
 
 from dataclasses import replace
@@ -39,7 +41,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class FixedLag:
-    """Adds a packet to the window, lets GTSAM relinearise it, reads the states in it."""
+    """Adds a packet to the window, has GTSAM relinearise it, and reads the states in it."""
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
@@ -48,9 +50,9 @@ class FixedLag:
         self._tree = FixedLagTree(self._lag_ns, chained)
         self._builder = GraphBuilder(setup)
         self._stamps_ns: list[int] = []
-        # What the window was when it was last read: the values of its variables, and its landmarks (3,) m.
+        # The window when it was last read: the values of its variables, and its landmarks (3,) m.
         self._values, self._in_window = gtsam.Values(), dict[int, Array]()
-        # What has left it, as it was then.
+        # States and landmarks that have left the window, with their last values in it.
         self._states, self._points = list[Estimate](), dict[int, Array]()
         self._last_seen_ns: dict[int, int] = {}
         self._log: list[str] = []
@@ -89,11 +91,11 @@ class FixedLag:
         return self._states[k].T_world_imu if k < len(self._states) else self._values.atPose3(X(k)).matrix()
 
     def _read(self, packet: Packet) -> Estimate:
-        """Take over the landmarks of the window, and return its newest state; what leaves it stays as last read."""
+        """Read the window's landmarks and return its newest state; states that have left keep their last values."""
         self._values = self._tree.values()
         newest = self._state(packet.index)
         left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < packet.frame.t_ns - self._lag_ns}
-        # Rows of one array: a view of it would keep it whole.
+        # Copied, because each is a row of one array: a view would keep the whole array alive.
         self._points |= {i: self._in_window[i].copy() for i in left}
         self._forget(left)
         self._in_window = points_of(self._values, self._last_seen_ns)
@@ -104,7 +106,7 @@ class FixedLag:
         return newest
 
     def _drop_landmarks(self, packet: Packet, newest: Estimate) -> None:
-        """Drop what is not in front of the camera any more, before it is linearised there, and what is elsewhere."""
+        """Drop landmarks behind the camera before they are linearised there, and those later sightings contradict."""
         seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
         points = np.array([self._in_window[i] for i in seen]).reshape(-1, 3)
         rows = np.flatnonzero(behind_camera(points, newest.T_world_imu, self._rig))
@@ -117,7 +119,7 @@ class FixedLag:
             self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
-        """Keep the log of a recovery, and no point of what it dropped."""
+        """Log a recovery, and forget the points of the landmarks that it dropped."""
         self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
         self._forget(recovery.dropped)
         for i in recovery.dropped:
@@ -125,7 +127,7 @@ class FixedLag:
             self._in_window.pop(i, None)
 
     def _forget(self, landmark_ids: set[int]) -> None:
-        """Let landmarks go that are not in the window any more."""
+        """Forget landmarks that are no longer in the window."""
         self._builder.forget(landmark_ids)
         for i in landmark_ids:
             self._last_seen_ns.pop(i, None)

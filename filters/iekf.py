@@ -1,18 +1,18 @@
 """Joint EKF in the right-invariant error whose updates are iterated to convergence (Bell & Cathey 1993).
 
-What it approximates: as `riekf`, but a frame corrects to the most probable state given the prediction, not to the end
-of one Gauss-Newton step. The prediction stays Gaussian and past sightings stay linearised where they were, so it begins
-to matter in which coordinates the prediction is Gaussian: iterated over landmarks in metres, the mean is biased along
-their depth (NEES of the pose 3 to 9 in flight and on the road, where one step has 1), with Jacobians of the covariance
-at first estimates even more. Landmarks move along their inverse depth from the camera that saw them first, as in
-`riekf`: in that a stereo sighting is linear. The covariance is that of the right-invariant error, reduced by Jacobians
-at the corrected estimate: global position and heading stay as unknown as they were.
+What it approximates: as `riekf`, but a frame corrects to the most probable state given the prediction instead of taking
+one Gauss-Newton step. The prediction stays Gaussian and past sightings stay linearised where they were. It therefore
+matters in which coordinates the prediction is Gaussian: iterated over landmarks in metres, the mean is biased along
+their depth (NEES of the pose 3 to 9 in flight and on the road, where one step has 1), and more so with Jacobians of the
+covariance at first estimates. Landmarks are therefore parametrised by inverse depth from the camera that first saw
+them, as in `riekf`; in these coordinates a stereo sighting is linear. The covariance is that of the right-invariant
+error, reduced with Jacobians at the corrected estimate, so that global position and heading stay unobservable.
 
 The update is Gauss-Newton to the most probable state given the prediction and one frame. An EKF update is the first
-step of that iteration; every further one linearises where the last one ended (Bell & Cathey 1993, "The iterated Kalman
-filter update as a Gauss-Newton method"; on a group Bourmaud, Mégret, Giremus & Berthoumieu 2016, "From intrinsic
-optimization to iterated extended Kalman filtering on Lie groups"). A correction ``delta`` is kept as ``P pull``: its
-cost under the prediction is ``delta . pull``, and the covariance P is never inverted.
+step of that iteration; every further step linearises where the one before it ended (Bell & Cathey 1993, "The iterated
+Kalman filter update as a Gauss-Newton method"; on a group Bourmaud, Mégret, Giremus & Berthoumieu 2016, "From intrinsic
+optimization to iterated extended Kalman filtering on Lie groups"). A correction ``delta`` is represented as ``P pull``:
+its cost under the prediction is ``delta . pull``, and the covariance P is never inverted.
 """
 
 from collections.abc import Iterator
@@ -43,7 +43,7 @@ RULES = {
     "tracks": "a landmark in its state has no state for the error of its track",
     "match_tracks": ("imu",),
 }
-# In standard deviations of what is known after the update.
+# Length of a step in standard deviations of the updated state.
 NEGLIGIBLE_STEP = 1e-4
 MOST_STEPS, MOST_HALVINGS = 10, 6
 
@@ -56,7 +56,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class Iterate(NamedTuple):
-    """A correction (n,) with the pull (k,) that makes it, what is seen from there, and the cost of both."""
+    """A correction (n,), the ``pull`` (k,) that yields it, the sightings linearised there, and the total cost."""
 
     delta: Array
     pull: Array
@@ -65,25 +65,25 @@ class Iterate(NamedTuple):
 
 
 class PullStep(NamedTuple):
-    """A change of the pull (k,), and the length of what it changes in standard deviations after the update."""
+    """A change of the pull (k,), and the length of the resulting correction in standard deviations after the update."""
 
     pull: Array
     length: float
 
 
 class IterationResult(NamedTuple):
-    """The best correction that was found, and whether it is the most probable one."""
+    """The correction of lowest cost that was found, and whether the iteration converged."""
 
     best: Iterate
     converged: bool
 
 
 def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
-    """Correct everything by the landmarks of the state, every one of which the frame must show.
+    """Correct the whole state by its landmarks; the frame must show every one of them.
 
-    The gate tests once, at the prediction, and Huber's weights are those there. The covariance is reduced by Jacobians
-    at the corrected estimate. An iteration that does not converge ends at the lowest cost it has reached; where not
-    even the first step lowered it, the frame corrects nothing.
+    The gate tests once, at the prediction, and Huber's weights are computed there. The covariance is reduced with
+    Jacobians at the corrected estimate. An iteration that does not converge ends at the lowest cost it has reached;
+    where not even the first step lowered the cost, the frame corrects nothing.
     """
     if not len(joint.landmark_ids):
         return
@@ -101,7 +101,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A prediction and what the landmarks (L,) of a frame count for in correcting it."""
+    """A prediction, the frame that corrects it, and the weights (L,) of the frame's landmarks."""
 
     prediction: JointBelief
     frame: StereoFrame
@@ -110,7 +110,7 @@ class Measurement:
     weights: Array
 
     def after(self, pull: Array) -> Iterate:
-        """Return the correction of a pull (k,)."""
+        """Return the correction that a pull (k,) yields."""
         delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
         seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[joint_landmarks.columns(self.prediction)] @ pull
@@ -119,7 +119,7 @@ class Measurement:
         return Iterate(delta, pull, seen, cost)
 
     def step(self, now: Iterate) -> PullStep:
-        """Return the step to the minimum of the cost linearised at a correction."""
+        """Return the step to the minimum of the cost linearised at an iterate."""
         part = joint_landmarks.columns(self.prediction)
         P = self.prediction.cov[part, part]
         H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
@@ -132,7 +132,7 @@ class Measurement:
         return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
 
     def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
-        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
+        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks with non-zero weight, stacked."""
         return joint_landmarks.stacked(self.prediction, seen).weighed(self.weights)
 
 
@@ -152,6 +152,6 @@ def most_probable(measurement: Measurement) -> IterationResult:
 
 
 def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:
-    """Yield the correction after a step, after half of it, and so on."""
+    """Yield the iterate after the full step, after half of it, after a quarter, and so on."""
     for halvings in range(MOST_HALVINGS + 1):
         yield measurement.after(now.pull + 0.5**halvings * pull)

@@ -1,15 +1,21 @@
 """Incremental full smoother: every state and landmark kept, re-solved only where new factors reach (iSAM2, GTSAM).
 
-What it approximates, frame by frame: recent states are relinearised, all together, once one of them has moved by a
-threshold, and a landmark once its image is off, not at every iteration; what none of the last 30 frames has factors on
-is not relinearised at all, and after 60 its marginal stands in the tree for it; and each frame makes one Gauss-Newton
-step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal answer is the
-newest state. For its final answer everything is linearised anew until the error stalls: that is the optimum of all it
-took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by more sightings than
-made it, where these agree, is dropped and the log says so.
+What it approximates, frame by frame (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes
+tree"):
 
-Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
-landmark (``filters/smoothing/chained_past.py``).
+- each frame makes one Gauss-Newton step;
+- recent states are relinearised together, once one of them has moved by a threshold, and a landmark once its predicted
+  image has moved, instead of at every iteration;
+- a variable on which none of the last 30 frames has a factor is not relinearised, and after 60 frames its marginal
+  replaces it in the tree.
+
+The causal answer is the newest state. For the final answer everything is relinearised until the error no longer falls,
+which gives the optimum of all factors in the graph. A landmark is dropped, and the log says so, if it falls behind the
+camera, makes the system indeterminate, or has more sightings rejected by its gate than it was built from while the
+rejected ones agree.
+
+Where the rig states a track noise model, the innovation of each sighting of a track, given the sighting before it, is a
+residual of two poses and the landmark (``filters/smoothing/chained_past.py``).
 """
 
 from dataclasses import replace
@@ -36,7 +42,8 @@ CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark a variable, bridge; one step a frame, old ones frozen"
 RULES = {"window": "it keeps every state", "bridge_gaps": True, "match_tracks": True}
 
-# A landmark tens of kilometres away creeps on for ever, and no pose with it: what counts as converged in `batch` does.
+# A landmark tens of kilometres away never stops moving, although no pose moves with it: the last solve converges by
+# the criterion of `batch`.
 _LAST_STOPPING = Stopping(enough=1e-4)
 
 
@@ -46,7 +53,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class Isam2:
-    """Adds a packet to the tree and reads the newest state; reads all of them in the end."""
+    """Adds a packet to the tree and reads the newest state; at the end it reads all states."""
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._progress = setup.rig, setup.progress
@@ -76,7 +83,7 @@ class Isam2:
         return estimate
 
     def finish(self) -> Finished:
-        """Solve for every state and landmark, all of them linearised anew until the error stalls."""
+        """Solve for every state and landmark, relinearising all of them until the error no longer falls."""
         graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
         beside, stopping = (None, _LAST_STOPPING) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
@@ -90,14 +97,14 @@ class Isam2:
         return Finished(trajectory, Landmarks.of(points), converged, (*self._builder.log(), *self._log, *log))
 
     def _learn(self, packet: Packet) -> None:
-        """Learn from a frame some time ago what tracks count for."""
+        """Measure the residual correlation of tracks in an earlier frame, whose pose has settled."""
         k = packet.index - LEARNT_AFTER_FRAMES
         if k >= 0:
             poses = self._tree.read([X(k), X(k + 1)])
             self._builder.learn(k, np.array([poses.atPose3(X(i)).matrix() for i in (k, k + 1)]))
 
     def _relinearise(self, in_view: dict[int, Array], estimate: Estimate) -> None:
-        """Mark the landmarks (3,) m in view, refused or not, that are no longer where they are linearised.
+        """Mark the landmarks (3,) m in view that are too far from their linearisation points, rejected ones included.
 
         ``in_view`` is in ascending order of track ids.
         """
@@ -112,7 +119,7 @@ class Isam2:
         return replace(estimate, cov=cov, info=self._builder.info)
 
     def _drop_landmarks(self, seen: dict[int, Array], estimate: Estimate, packet: Packet) -> None:
-        """Drop what is not in front of the camera any more, where sightings have no gradient, and what is elsewhere."""
+        """Drop landmarks behind the camera, where a sighting has no gradient, and those later sightings contradict."""
         points = np.array(list(seen.values())).reshape(-1, 3)
         behind = behind_camera(points, estimate.T_world_imu, self._rig).tolist()
         log = {i: "fell behind the camera" for i, is_behind in zip(seen, behind, strict=True) if is_behind}
@@ -124,6 +131,6 @@ class Isam2:
             self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
-        """Keep the log of a recovery; a landmark that was dropped begins anew with its next sighting."""
+        """Log a recovery; a landmark that it dropped is started again from its next sighting."""
         self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
         self._builder.forget(recovery.dropped)

@@ -1,4 +1,7 @@
-"""Landmarks by one small EKF each on the dead-reckoned trajectory, the pose never corrected (Kang, III-B)."""
+"""Landmarks, each with a small EKF of its own, along the dead-reckoned trajectory; the pose is never corrected.
+
+Source: Kang, III-B.
+"""
 
 import numpy as np
 
@@ -22,9 +25,9 @@ def build(setup: Setup) -> Estimator:
 
 
 class Mapping(Filter):
-    """Takes the predicted pose for true and corrects every landmark by what is seen from it (Kang, eqs. 3-10).
+    """Takes the predicted pose as exact and corrects every landmark by its sightings from it (Kang, eqs. 3-10).
 
-    The report has no gate; here a sighting outside that of the outlier policy corrects nothing.
+    The report has no gate; here a sighting outside the gate of the outlier policy corrects nothing.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -35,7 +38,7 @@ class Mapping(Filter):
         self._gate_probability = setup.settings.outliers.gate_probability
 
     def step(self, packet: Packet) -> Estimate:
-        """Integrate the motion, then map from where it leads."""
+        """Integrate the motion, then map from the pose it leads to."""
         self._belief = predicted(self._belief, self._motion, packet.motion)
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
@@ -46,5 +49,5 @@ class Mapping(Filter):
         return self._belief.estimate(packet.frame.t_ns)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark there ever was, as last known."""
+        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()

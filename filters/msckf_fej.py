@@ -1,4 +1,4 @@
-"""MSCKF with first-estimate Jacobians, which do not invent heading (Li & Mourikis 2013)."""
+"""MSCKF with first-estimate Jacobians, which keep the heading unobservable (Li & Mourikis 2013)."""
 
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput

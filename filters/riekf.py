@@ -1,20 +1,21 @@
 """Joint EKF in the right-invariant error, Jacobians at the latest estimates (Barrau & Bonnabel 2015, 2017).
 
-What it approximates: as in `ekf-slam`, past poses and landmarks out of view are marginalised at once. There the
-Jacobians stay at first estimates, however poor those were, so as not to gain information on a heading that nothing
-measures. Here pose, velocity and landmarks are one element of a Lie group and share one rotation error: to move or to
-turn the world is the same error at every estimate, the Jacobians are blind to it wherever they are taken, and so they
-may be taken at the latest estimates. Only the biases are outside the group, and only through them does the propagation
-of the error depend on what is estimated.
+What it approximates: as in `ekf-slam`, past poses and landmarks out of view are marginalised at once. `ekf-slam` keeps
+its Jacobians at first estimates, however poor these were, so as not to gain information on the heading, which no
+measurement observes. Here pose, velocity and landmarks are one element of a Lie group and share one rotation error. A
+translation or rotation of the world is then the same error vector at every estimate, and the Jacobians are zero along
+it wherever they are evaluated. They can therefore be evaluated at the latest estimates. Only the biases are outside the
+group, and only through them does the propagation of the error depend on the estimate.
 
-A landmark is in the group by its anchor, the camera that saw it first, and moves along its inverse depth from there. In
-metres the squared position error was 2.2 times what it is on drive-imu, and 1.3 times in flight. What is left: an
-update is one Gauss-Newton step, and a landmark's first estimate one stereo sighting whose depth is not Gaussian.
+A landmark is anchored in the camera that first saw it, and is parametrised by its inverse depth from there. In metres
+the squared position error was 2.2 times as large on drive-imu, and 1.3 times in flight. What remains approximate: an
+update is one Gauss-Newton step, and a landmark's first estimate is one stereo sighting, whose depth is not Gaussian.
 
-Beside an IMU, landmarks whose residuals are correlated count for less (:mod:`filters.kalman.residual_correlation`):
-the position error was 0.73 +- 0.06 times what it is in full on six draws of `flight-realistic`. Beside odometry they
-count in full: over seven drives and two draws the error would be 0.85 +- 0.08 times that, and the NEES a sixth, but on
-one of the drives the error would be half as much again.
+Beside an IMU, landmarks whose residuals are correlated have a smaller weight
+(:mod:`filters.kalman.residual_correlation`). The position error was 0.73 +- 0.06 of that with full weights on six draws
+of `flight-realistic`. Beside odometry all landmarks have their full weight: over seven drives and two draws the
+position error would be 0.85 +- 0.08 of that, and the NEES a sixth, but on one of the drives the error would be 1.5
+times as large.
 """
 
 from functools import partial

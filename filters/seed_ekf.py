@@ -1,9 +1,9 @@
 """The report's visual-inertial EKF to the letter, so that anyone can see what it does (Kang, III-C, eqs. 1-14).
 
-It corrects the map from the predicted pose and then the pose from that map, taken for exact, with the same
-measurements: no gate, no landmark uncertainty in the innovation. Its pose covariance collapses, after which
-one bad match moves the car. The report's measurement has four rows; ours has vL and vR as their mean with
-half the variance, which gives the same update.
+It corrects the map from the predicted pose and then corrects the pose by that map, taken as exact, with the same
+measurements. It has no gate, and the innovation covariance leaves out the landmarks' uncertainty. The pose covariance
+therefore collapses, after which one mismatched sighting moves the pose. The report's measurement has four rows; here vL
+and vR are replaced by their mean with half the variance, which gives the same update.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet
 
-# Standing in for zero, which has no inverse: a bias of 1e-8 rad/s turns by 1e-6 rad in 100 s.
+# Used instead of zero, which has no inverse: a bias of 1e-8 rad/s turns the pose by 1e-6 rad in 100 s.
 _HELD_VARIANCE = 1e-16
 
 CITES = ("kang_vislam",)
@@ -38,7 +38,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class SeedEkf(Filter):
-    """Equations 1 to 14 in the order the report gives them."""
+    """Equations 1 to 14 in the order of the report."""
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
@@ -64,12 +64,12 @@ class SeedEkf(Filter):
         self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, weighted)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark there ever was, as last known."""
+        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()
 
 
 def _without_biases(belief: Belief) -> Belief:
-    """Return the belief with its biases held where they are: the report's state has none."""
+    """Return the belief with its biases fixed at their values, because the report's state has none."""
     cov, biases = belief.cov.copy(), belief.layout.biases
     cov[biases], cov[:, biases] = 0.0, 0.0
     cov[biases, biases] = _HELD_VARIANCE * np.eye(biases.stop - biases.start)

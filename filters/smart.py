@@ -1,13 +1,14 @@
 """Fixed-lag smoother over a window of seconds whose landmarks are eliminated: smart stereo factors.
 
-What it approximates: a track is a factor on the poses that saw it, linearised anew at every iteration, and its landmark
-is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
-marginalised with it as they were linearised then; one that lives on starts anew, so no landmark is remembered beyond
-the window. Its causal answer is the newest state, its final answer each state as it left the window, with the
-covariance the window had for it.
+What it approximates: a track is a factor on the poses that saw it, relinearised at every iteration; its landmark is
+never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
+marginalised with it at their current linearisation; a track that is still seen starts again, so no landmark is
+remembered beyond the window. The causal answer is the newest state. The final answer is each state as it left the
+window, with the covariance it had in the window.
 
-Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses: a Markov chain
-(:class:`toolkit.models.correlated_noise.Chain`). A track that starts anew does so at its age.
+Where the rig states a track noise model, the innovation of each sighting of a track, given the sighting before it, is a
+residual of two poses: a Markov chain (:class:`toolkit.models.correlated_noise.Chain`). A track that starts again keeps
+its age.
 """
 
 from collections import deque
@@ -44,7 +45,7 @@ def build(setup: Setup) -> Estimator:
 
 
 class Smart:
-    """Adds a packet to the window, solves it, lets the oldest states go."""
+    """Adds a packet to the window, solves it, and removes the oldest states."""
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         outliers = setup.settings.outliers
@@ -88,19 +89,19 @@ class Smart:
         )
 
     def _extended(self, packet: Packet) -> TrackedWindow:
-        """Return the window with the packet's state, predicted, and its sightings."""
+        """Return the window with the packet's predicted state and its sightings."""
         if packet.motion is None:
             return self._started(packet)
         increment = self._motion.integrate(packet.motion, self._belief.bias)
         prediction = increment.predict(self._belief)
         expected = relative_to_its_map(self._belief).predicted(prediction)
-        # The state begins as predicted: the solver iterates.
+        # The predicted state is the initial value; the solver iterates from it.
         _, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks, self._tracks.share)
         self._belief = self._predicted = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
     def _started(self, packet: Packet) -> TrackedWindow:
-        """Return a window that begins here, held at the state as predicted."""
+        """Return a window that begins here, its state tied to the prediction."""
         hold = self._motion.hold(self._belief, packet.index)
         return self._with_state(TrackedWindow.empty(), packet.index, packet.frame, hold)
 
@@ -117,7 +118,7 @@ class Smart:
         return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
 
     def _read(self, packet: Packet) -> None:
-        """Take over every state and landmark of the window; drop the landmarks that fell behind a camera."""
+        """Read every state and landmark of the window; drop the landmarks that fell behind a camera."""
         self._tracked, behind = self._tracked.in_front(self._rig)
         self._log += [f"frame {packet.index}: landmark {i} fell behind a camera and was dropped" for i in behind]
         window, first = self._tracked.window, packet.index + 1 - len(self._tracked.window.keys)
@@ -132,7 +133,7 @@ class Smart:
         self._noise.learn(packet.frame.t_ns, self._predicted, self._belief)
 
     def _complete(self, places: Iterable[int]) -> None:
-        """Give states of the window, by their places in it, the covariance they have there."""
+        """Give states of the window, by their indices in it, their covariance there."""
         first = len(self._states) - len(self._solution.window.keys)
         for i in places:
             state = self._states[first + i]
@@ -143,7 +144,7 @@ class Smart:
         self._complete(range(len(self._solution.window.keys)))
 
     def _shorten(self, packet: Packet) -> None:
-        """Let the states go that are older than the lag, all at once."""
+        """Remove the states that are older than the lag, all at once."""
         oldest_ns, in_window = packet.frame.t_ns - self._lag_ns, len(self._tracked.window.keys)
         leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
         if leaving:
@@ -155,12 +156,12 @@ class Smart:
             self._camera = RobustCamera.of(*self._tracks.now)
 
     def _settle(self, leaving: int) -> None:
-        """Take in the frames of so many of the window's oldest states, whose poses change no more."""
+        """Score tracks at the window's oldest ``leaving`` states, whose poses no longer change."""
         for state in self._states[-len(self._tracked.window.keys) :][:leaving]:
             self._tracks.settle(self._frames.popleft(), state.T_world_imu)
 
     def _learn(self, leaving: int) -> None:
-        """Learn what tracks count for from those that go with the oldest states, of which there are so many."""
+        """Measure the residual correlation of the tracks that leave with the oldest ``leaving`` states."""
         window = self._tracked.window
         going = np.unique(window.sightings.point[window.sightings.pose < leaving])
         self._tracks.learn_from(window.sightings.of_points(going), window.poses, window.points)
