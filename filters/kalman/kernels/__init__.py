@@ -1,10 +1,11 @@
-"""What filters have compiled by numba: NumPy is the definition, of which these are loops over tracks.
+"""The kernels of the filters, compiled by numba: NumPy is the definition, a kernel is the same in loops over tracks.
 
-``track_gate``, ``tracks_in_view``, ``corrections`` and, along an IMU's samples, ``preintegration`` are the kernels of
-the windowed filters, ``decoupled`` and, along twists, ``twists`` those of the decoupled one, named after what they
-stand for; ``algebra``, ``sightings`` and ``rigid_motions`` what they are made of, ``signatures`` what they take,
-``compiling`` how they are compiled and kept. Only this package imports numba.
+Kernels of the windowed filters are ``track_gate``, ``tracks_in_view``, ``corrections`` and, for IMU samples,
+``preintegration``; of the decoupled filter ``decoupled`` and, for twists, ``twists``. Each is named after the NumPy
+code it replaces. They are made of ``algebra``, ``sightings`` and ``rigid_motions``; ``signatures`` has the types of
+their arguments, ``compiling`` how they are compiled and cached. Only this package imports numba.
 
-It is written for a short compilation, which whole arrays in expressions make long: loops over scalars, results put in
-arrays that are given, everything contiguous. Rules (thresholds, numbers of iterations) are arguments.
+The code is written to compile quickly, and array expressions compile slowly: so it has loops over scalars, results
+written to arrays that the caller passes, and contiguous arrays only. Thresholds and numbers of iterations are
+arguments.
 """

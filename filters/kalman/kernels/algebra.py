@@ -32,9 +32,9 @@ def solved_3(N: Array, f: int, damping: float, least: float) -> tuple[float, flo
 
 @compiled
 def cholesky(A: Array, n: int) -> None:
-    """Put the lower Cholesky factor of a symmetric A (n, n) in the place of A, and its transposed in the upper half.
+    """Overwrite a symmetric A (n, n) by its lower Cholesky factor, with the transposed factor in the upper half.
 
-    Row by row of the upper half, whose elements can be taken several at a time where indices have no sign.
+    It goes row by row through the upper half, which the compiler vectorises where indices are unsigned.
     """
     end = np.uint64(n)
     for k in range(n):
@@ -51,7 +51,7 @@ def cholesky(A: Array, n: int) -> None:
 
 @compiled
 def invert(L: Array, n: int, W: Array) -> None:
-    """Put ``(L L^T)^-1`` in the symmetric W (n, n) but for its first three rows and columns, which become zero."""
+    """Write ``(L L^T)^-1`` to the symmetric W (n, n); its first three rows and columns become zero."""
     for j in range(n):
         for i in range(n):
             W[j, i] = 1.0 if i == j and i > 2 else 0.0
@@ -67,7 +67,7 @@ def invert(L: Array, n: int, W: Array) -> None:
 
 @compiled
 def multiply(A: Array, B: Array, out: Array) -> None:
-    """Put A (l, m) B (m, n) in ``out``; what is zero in A takes no time."""
+    """Write A (l, m) B (m, n) to ``out``; zeros in A are skipped."""
     for i in range(A.shape[0]):
         for c in range(B.shape[1]):
             out[i, c] = 0.0
@@ -80,7 +80,7 @@ def multiply(A: Array, B: Array, out: Array) -> None:
 
 @compiled
 def multiply_transposed(A: Array, B: Array, out: Array) -> None:
-    """Put A (l, m) times the transposed B (n, m) in ``out``."""
+    """Write A (l, m) times the transposed B (n, m) to ``out``."""
     for i in range(A.shape[0]):
         for j in range(B.shape[0]):
             out[i, j] = 0.0
@@ -90,7 +90,7 @@ def multiply_transposed(A: Array, B: Array, out: Array) -> None:
 
 @compiled
 def solve(A: Array, B: Array) -> None:
-    """Put the solution of ``A X = B`` in the place of B (n, m), by elimination with row pivots; A (n, n) is lost."""
+    """Overwrite B (n, m) by the solution of ``A X = B``, by elimination with row pivots; A (n, n) is destroyed."""
     n = A.shape[0]
     for k in range(n):
         pivot = k
@@ -116,7 +116,7 @@ def solve(A: Array, B: Array) -> None:
 
 @compiled
 def transpose(A: Array, n: int) -> None:
-    """Transpose A (n, n) in its place."""
+    """Transpose A (n, n) in place."""
     for i in range(n):
         for j in range(i):
             A[i, j], A[j, i] = A[j, i], A[i, j]
@@ -124,7 +124,7 @@ def transpose(A: Array, n: int) -> None:
 
 @compiled
 def clear(A: Array, rows: int) -> None:
-    """Make the first rows of A zero."""
+    """Set the first rows of A to zero."""
     for i in range(rows):
         for j in range(A.shape[1]):
             A[i, j] = 0.0
@@ -132,7 +132,7 @@ def clear(A: Array, rows: int) -> None:
 
 @compiled
 def inverses(T: Array) -> Array:
-    """Return the inverses of rigid motions (W, 4, 4) in the first three rows of as many matrices."""
+    """Return the inverses of rigid motions (W, 4, 4); only the first three rows of each are set."""
     result = np.empty(T.shape)
     for k in range(T.shape[0]):
         for i in range(3):
@@ -146,7 +146,7 @@ def inverses(T: Array) -> Array:
 
 @compiled
 def products(T: Array, A: Array) -> Array:
-    """Return the products of rigid motions (W, 4, 4) with one (1, 4, 4) in the first three rows of as many matrices."""
+    """Return the products of rigid motions (W, 4, 4) with one (1, 4, 4); only the first three rows of each are set."""
     result = np.empty(T.shape)
     for k in range(T.shape[0]):
         for i in range(3):
@@ -159,7 +159,7 @@ def products(T: Array, A: Array) -> Array:
 
 @compiled
 def moved(T: Array, k: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return a point, taken by motion k of T (W, 4, 4)."""
+    """Return a point transformed by motion k of T (W, 4, 4)."""
     return (
         T[k, 0, 0] * x + T[k, 0, 1] * y + T[k, 0, 2] * z + T[k, 0, 3],
         T[k, 1, 0] * x + T[k, 1, 1] * y + T[k, 1, 2] * z + T[k, 1, 3],
@@ -169,9 +169,9 @@ def moved(T: Array, k: int, x: float, y: float, z: float) -> tuple[float, float,
 
 @compiled
 def reflections(H_point: Array, n: int, V: Array, tau: Array) -> None:
-    """Triangulate the first three columns of H_point (n, 4) by reflections ``1 - tau_k v_k v_k^T``, of the fourth too.
+    """Triangularise the first three columns of H_point (n, 4) by reflections ``1 - tau_k v_k v_k^T``.
 
-    v_k is row k of V (3, n): zero before its own place k, where it is one.
+    The fourth column is reflected as well. v_k is row k of V (3, n): zero before element k, which is one.
     """
     for k in range(3):
         below = 0.0
@@ -192,7 +192,7 @@ def reflections(H_point: Array, n: int, V: Array, tau: Array) -> None:
 
 @compiled
 def reflect_both_sides(S: Array, V: Array, k: int, tau: float, n: int) -> None:
-    """Put ``(1 - tau v v^T) S (1 - tau v v^T)`` in the place of the symmetric S (n, n), v being row k of V.
+    """Overwrite the symmetric S (n, n) by ``(1 - tau v v^T) S (1 - tau v v^T)``, with v row k of V.
 
     With ``u = tau S v`` and ``w = u - (tau / 2) (v^T u) v`` it is ``S - v w^T - w v^T``.
     """

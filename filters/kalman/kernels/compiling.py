@@ -1,7 +1,7 @@
-"""How numba compiles the kernels, and how what comes out is kept on disk for later processes.
+"""How numba compiles the kernels, and how the compiled code is cached on disk for later processes.
 
-numba looks at a function's own file alone to tell whether what it kept of it is that of today, and a kernel calls
-others of this package: so what is kept belongs to the text of all files here, and a change in any compiles all anew.
+numba decides by a function's own file whether its cached code is current, but kernels call functions in other files of
+this package. So the cache is keyed by the text of all files here, and a change in any of them recompiles everything.
 """
 
 import gc
@@ -28,34 +28,35 @@ from numba.core.typed_passes import (
 from numba.core.typing.context import Context
 from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, ReconstructSSA, TranslateByteCode
 
-# No fast mathematics: were sums taken in any order, what a process has compiled and what it has found on disk would
-# round another way. What is not called from Python needs no wrapper for it, which is half of the compilation.
+# No fast mathematics: with sums in any order, freshly compiled and cached code could round differently. A function that
+# is not called from Python needs no wrapper, which is half of the compilation.
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 class _Unfinished(JITCodeLibrary):
-    """The code of a part as numba writes it: optimised and made machine code within the kernels that call it alone.
+    """The code of a part before optimisation; optimisation and code generation happen in the kernels that call it.
 
-    Otherwise both are done for every part by itself, too, and again within every part that calls it.
+    By default numba does both for every part by itself, and again within every part that calls it.
     """
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        """Leave the functions as they are, but for the layout of their data."""
+        """Leave the functions unoptimised; only set the layout of their data."""
         ll_module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
-        """Leave the code as it is."""
+        """Skip the optimisation."""
 
     def _finalize_final_module(self) -> None:
-        """Make no machine code."""
+        """Generate no machine code."""
         self._finalize_dynamic_globals()
         self._finalized = True
 
 
 class _Passes(CompilerBase):
-    """What numba has to do with these functions, which have no closures, generators or whole arrays in expressions.
+    """The numba passes these functions need: they have no closures, generators or array expressions.
 
-    It would look for those, and for what to inline, prune and unroll, in a dozen more passes over each.
+    numba's default looks for those, and for code to inline, prune and unroll, in a dozen more passes over each
+    function.
     """
 
     def define_pipelines(self) -> list[PassManager]:
@@ -79,10 +80,10 @@ class _Passes(CompilerBase):
 
 
 class _Remembering(Context):
-    """numba's rules of types, which find once what comes of a call with arguments of some types.
+    """numba's typing rules, with the result for each call and its argument types cached.
 
-    They would try a dozen of them, for arrays, tuples and texts, at each product of two numbers, and once more where
-    it becomes code.
+    Uncached, they try a dozen rules, for arrays, tuples and strings, at each product of two numbers, and once more in
+    code generation.
     """
 
     def __init__(self, rules: Context) -> None:
@@ -98,7 +99,7 @@ class _Remembering(Context):
         return self._signatures[key]
 
     def resolve_value_type(self, val: Any) -> Any:
-        """Return the type of a value, of a function one that finds each signature once."""
+        """Return the type of a value; for a function, one that caches its signatures."""
         found = super().resolve_value_type(val)
         if not isinstance(found, types.BaseFunction):
             return found
@@ -108,7 +109,7 @@ class _Remembering(Context):
 
 
 def _with_cached_types(function: Any) -> Any:
-    """Return a type of functions that finds a call's signature once for each types of its arguments."""
+    """Return a type of functions that resolves a call's signature once for each tuple of argument types."""
     copied, signatures = object.__new__(type(function)), {}
 
     def get_call_type(context: Context, args: Any, kws: Any) -> Any:
@@ -128,7 +129,7 @@ def _remembering(rules: Context) -> Context:
 
 
 def _translated(dispatcher: Any, args: Any, return_type: Any, flags: Flags, library: JITCodeLibrary | None) -> Any:
-    """Return what numba makes of a function for some types of its arguments, in a library of its own if None."""
+    """Return numba's compilation of a function for some argument types, in its own library if ``library`` is None."""
     dispatcher.targetdescr.options.parse_as_flags(flags, dispatcher.targetoptions)
     rules = _remembering(dispatcher.typingctx)
     target = dispatcher.targetctx.subtarget(typing_context=rules)
@@ -136,7 +137,10 @@ def _translated(dispatcher: Any, args: Any, return_type: Any, flags: Flags, libr
 
 
 class _Part(CPUDispatcher):
-    """What kernels call: compiled as far as they need it, once for all numbers; numba would again for each constant."""
+    """A function called by kernels, compiled only as far as they need and once for all numeric arguments.
+
+    numba would compile it again for each constant argument.
+    """
 
     _compiler: Any
 
@@ -145,32 +149,32 @@ class _Part(CPUDispatcher):
         self._compiler._compile_core = self._compile_for_callers
 
     def _compile_for_callers(self, args: Any, return_type: Any) -> Any:
-        """Return what numba makes of the function for some types of its arguments."""
+        """Return numba's compilation of the function for some argument types."""
         flags, target = Flags(), self.targetctx
         flags.no_compile = True
         library = _Unfinished(target.codegen(), self.py_func.__qualname__)
         result = _translated(self, args, return_type, flags, library)
-        # By which callers find it: numba takes the function that Python would call, and there is none.
+        # The key by which callers find it: numba uses the Python-callable function, which does not exist here.
         name = object()
         target.insert_user_function(name, result.fndesc, [library])
         return result._replace(entry_point=name)
 
     def add_overload(self, cres: Any) -> None:
-        """Remember what was compiled for some types."""
+        """Keep the compilation for some argument types."""
         self.overloads[tuple(cres.signature.args)] = cres
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return what a call with arguments of some types is resolved to."""
+        """Return the resolution of a call with some argument types."""
         return super().get_call_template([types.unliteral(arg) for arg in args], kws)
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Return a function that kernels may call, compiled together with the first of them that is."""
+    """Return a function that kernels may call; it is compiled together with the first kernel that calls it."""
     return _Part(function, {"nopython": True, "no_cpython_wrapper": True, **_OPTIONS})
 
 
 class _KeptFor(FunctionCache):
-    """What is kept of a function for as long as some sources stay what they are, wherever its own file is."""
+    """The cache of a function, keyed by the text of source files instead of the function's own file."""
 
     def __init__(self, function: Callable[..., Any], sources: str) -> None:
         super().__init__(function)
@@ -179,20 +183,20 @@ class _KeptFor(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was kept for some types, None where there is nothing; what is damaged is thrown away."""
+        """Return the cached code for some argument types, or None; a damaged cache file is discarded."""
         try:
             return super().load_overload(sig, target_context)
         except (OSError, RuntimeError):
             raise
-        except Exception:  # what unpickling makes of a file that was cut off or overwritten is of any kind
+        except Exception:  # unpickling a truncated or overwritten file can raise any exception
             self.flush()
             return None
 
 
 def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Callable[[Callable[..., Any]], Any]:
-    """Return what compiles a function and keeps what comes out for every process that finds the folder's files so.
+    """Return a decorator that compiles a function and caches the code for every process with the same source files.
 
-    Where nothing can be written (beside the file, in NUMBA_CACHE_DIR, in the user's cache) it is for this process.
+    If no cache can be written (beside the file, in NUMBA_CACHE_DIR, in the user's cache), it lasts for this process.
     """
 
     def compile_or_load(function: Callable[..., Any]) -> Any:
@@ -211,7 +215,7 @@ def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Ca
 
 
 def _kernel(function: Callable[..., Any]) -> Any:
-    """Return a function that Python may call, not compiled yet."""
+    """Return a function that Python may call, not yet compiled."""
     kernel = njit(**_OPTIONS)(function)
     kernel._compiler._compile_core = lambda args, return_type: _translated(kernel, args, return_type, Flags(), None)
     return kernel
@@ -219,7 +223,7 @@ def _kernel(function: Callable[..., Any]) -> Any:
 
 @contextmanager
 def _without_collections() -> Iterator[None]:
-    """Compile without looking for reference cycles, which takes a quarter of the time and frees next to nothing."""
+    """Disable garbage collection while compiling: it takes a quarter of the time and frees next to nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -238,7 +242,7 @@ def sources_of(folder: Path) -> str:
 
 
 def what_was_compiled(kernel: Any, name: str) -> str:
-    """Return what is told of the compilation of a kernel, empty where its result was found on disk."""
+    """Return the log line about the compilation of a kernel, empty if its code was found in the cache."""
     if kernel.stats.cache_hits:
         return ""
     if kernel.stats.cache_path:

@@ -1,8 +1,8 @@
-"""What corrections are made of compiled: motions, images, what tracks leave of their residuals, a correction's test.
+"""Parts of corrections compiled: motions, images, residuals after elimination of landmarks, the test of a correction.
 
-In NumPy that is ``toolkit.geometry.se3_exp``, ``multiview.NUMPY``, ``residual_correlation`` and
-``toolkit.models.corrections``.
-Source of the eigenvalues: Golub & Van Loan, "Matrix Computations" (4th ed.), 8.3 (tridiagonal QR).
+The NumPy definitions are ``toolkit.geometry.se3_exp``, ``multiview.NUMPY``, ``residual_correlation`` and
+``toolkit.models.corrections``. Source of the eigenvalues: Golub & Van Loan, "Matrix Computations" (4th ed.), 8.3
+(tridiagonal QR).
 """
 
 import math
@@ -20,19 +20,19 @@ from toolkit.geometry import Array, BoolArray, IntArray
 # (uL, uR, v) (F, W, 3) px and which were seen (F, W); points (F, 3); poses (W, 4, 4); camera; how many sightings a
 # track needs.
 RESIDUALS = (types.Tuple((STACK, MASK)), MATRIX, STACK, CAMERA, types.int64)
-# Pose (1, 4, 4), velocity m/s and bias (9,), and covariance (d, d), before and after; where velocity, accel bias and
-# gyro bias stand in the error (3,), -1 what it has not; the least share that is told.
+# Pose (1, 4, 4), velocity m/s and bias (9,), and covariance (d, d), before and after; the indices of velocity, accel
+# bias and gyro bias in the error (3,), -1 for what it lacks; the least share of the variance that counts as corrected.
 _STATE = types.Tuple((STACK, ROW, MATRIX))
 CORRECTION = (_STATE, _STATE, types.int64[::1], types.float64)
 # Points (F, 3), poses (W, 4, 4), camera.
 IMAGES = (MATRIX, STACK, CAMERA)
-# Two or three are what an eigenvalue takes.
+# An eigenvalue usually takes two or three.
 _MOST_STEPS = 30
 
 
 @kept((MATRIX,))
 def exponentials(twists: Array) -> Array:
-    """Return the motions (N, 4, 4) of twists (N, 6), [rotation, translation]."""
+    """Return the motions (N, 4, 4) of twists (N, 6), [rotation, translation], by the exponential map."""
     motions = np.empty((twists.shape[0], 4, 4))
     for k in range(twists.shape[0]):
         exponential(twists[k], motions[k : k + 1])
@@ -41,9 +41,9 @@ def exponentials(twists: Array) -> Array:
 
 @kept(IMAGES)
 def predict_images(points: Array, poses: Array, camera: Arrays) -> Arrays:
-    """Return what W poses see of F points, (uL, uR, v) (F, W, 3) px, with its Jacobians and depths; see :data:`IMAGES`.
+    """Return the images of F points in W poses, (uL, uR, v) (F, W, 3) px, Jacobians and depths; see :data:`IMAGES`.
 
-    The Jacobians to the pose (F, W, 18) and to the point (F, W, 9) are row by row; depths (F, W) m.
+    The Jacobians to the pose (F, W, 18) and to the point (F, W, 9) are flattened row by row; depths (F, W) m.
     """
     count, window = points.shape[0], poses.shape[0]
     latest, eye = inverses(poses), (camera[0], inverses(camera[1]), np.zeros((3, 3)))
@@ -67,7 +67,7 @@ def predict_images(points: Array, poses: Array, camera: Arrays) -> Arrays:
 
 @compiled
 def pairs_in(seen: BoolArray, fewest: int) -> int:
-    """Return how often tracks of so many sightings were seen from two poses in a row."""
+    """Return the number of pairs of successive sightings in tracks of at least ``fewest`` sightings."""
     count = 0
     for f in range(seen.shape[0]):
         if sighted(seen, f).size >= fewest:
@@ -78,7 +78,7 @@ def pairs_in(seen: BoolArray, fewest: int) -> int:
 
 @compiled
 def take_up(A: Array, n: int) -> None:
-    """Take from the residuals in the last column of A (n, 4) what a step of the landmark takes up."""
+    """Subtract from the residuals in the last column of A (n, 4) their projection onto its landmark columns."""
     N = np.zeros((1, 10))
     add_products(A, 0, n, N, 0)
     x, y, z = solved_3(N, 0, 0.0, 0.0)
@@ -88,7 +88,10 @@ def take_up(A: Array, n: int) -> None:
 
 @kept(RESIDUALS)
 def successive_residuals(sightings: Arrays, points: Array, poses: Array, camera: Arrays, fewest: int) -> Arrays:
-    """Return whitened residuals (n, 3) that tracks leave, and those of the next poses (n, 3); see :data:`RESIDUALS`."""
+    """Return whitened residuals (n, 3) of tracks after a landmark step, and those at the next pose (n, 3).
+
+    See :data:`RESIDUALS` for the arguments.
+    """
     uvs_px, seen = sightings
     intrinsics, T_imu_cam, whitener, _, _ = camera
     latest, T_cam_imu, most = inverses(poses), inverses(T_imu_cam), 3 * seen.shape[1]
@@ -109,7 +112,7 @@ def successive_residuals(sightings: Arrays, points: Array, poses: Array, camera:
 
 @compiled
 def error_between(before: Arrays, after: Arrays, places: IntArray, error: Array) -> None:
-    """Put the error (d,) that moves one state to the other in ``error``."""
+    """Write the error (d,) that moves one state to the other to ``error``."""
     pose, vector, _ = before
     logarithm(products(inverses(pose), after[0]), error)
     for block in range(3):
@@ -124,7 +127,7 @@ def error_between(before: Arrays, after: Arrays, places: IntArray, error: Array)
 
 @compiled
 def tridiagonalise(A: Array, y: Array, diagonal: Array, beside: Array) -> None:
-    """Put the elements (n,) of ``Q A Q^T`` on and beside its diagonal in two vectors, and Q y in the place of y (n,).
+    """Write the diagonal (n,) and off-diagonal (n,) of the tridiagonal ``Q A Q^T``; replace y (n,) by Q y.
 
     Q is a product of reflections, each of which leaves one element of a column below the diagonal.
     """
@@ -148,7 +151,7 @@ def tridiagonalise(A: Array, y: Array, diagonal: Array, beside: Array) -> None:
 
 @compiled
 def chase(diagonal: Array, beside: Array, y: Array, first: int, last: int) -> None:
-    """Take one implicit QL step, shifted as Wilkinson did, on what stands from ``first`` to ``last``; turn y too."""
+    """Take one implicit QL step with Wilkinson's shift on the rows ``first`` to ``last``; rotate y as well."""
     g = (diagonal[first + 1] - diagonal[first]) / (2.0 * beside[first])
     g = diagonal[last] - diagonal[first] + beside[first] / (g + math.copysign(math.sqrt(g * g + 1.0), g))
     s, c, shift = 1.0, 1.0, 0.0
@@ -169,7 +172,7 @@ def chase(diagonal: Array, beside: Array, y: Array, first: int, last: int) -> No
 
 @compiled
 def diagonalise(A: Array, y: Array, eigenvalues: Array) -> None:
-    """Put the eigenvalues (n,) of a symmetric A (n, n), which is lost, in place, and y (n,) in the axes of each."""
+    """Write the eigenvalues (n,) of a symmetric A (n, n), which is destroyed; rotate y (n,) to the eigenvectors."""
     n, beside = A.shape[0], np.empty(A.shape[0])
     tridiagonalise(A, y, eigenvalues, beside)
     for first in range(n):
@@ -183,10 +186,10 @@ def diagonalise(A: Array, y: Array, eigenvalues: Array) -> None:
 
 @kept(CORRECTION)
 def test_correction(before: Arrays, after: Arrays, places: IntArray, least: float) -> Arrays:
-    """Return squared length and degrees of freedom of a correction; see :data:`CORRECTION`.
+    """Return the NIS and degrees of freedom of a correction; see :data:`CORRECTION`.
 
-    The covariance taken away, its entries in units of the sigmas before, becomes diagonal, and the error is turned with
-    its axes.
+    The reduction of the covariance, with entries in units of the sigmas before it, is diagonalised, and the error is
+    rotated to its eigenvectors.
     """
     P, Q, d = before[2], after[2], before[2].shape[0]
     error, taken, shares = np.empty(d), np.empty((d, d)), np.empty(d)

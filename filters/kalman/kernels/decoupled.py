@@ -1,8 +1,9 @@
-"""The decoupled EKF's frame compiled: ``correction`` and ``landmark_map`` in NumPy, one sighting after another.
+"""One frame of the decoupled EKF compiled: ``correction`` and ``landmark_map`` in NumPy, one sighting after another.
 
-A sighting's covariance S, (3, 3), has a Cholesky factor C, and what counts is ``C^-1 [H r]``: products of its columns
-are ``H^T S^-1 H`` and ``H^T S^-1 r``, of which the pose's information and the landmark's update are made (Kang, eqs.
-6-14). A sighting by the left image alone has zeros in the row of uR and its own noise (``toolkit.models.left_only``).
+With C the Cholesky factor of a sighting's covariance S (3, 3), only ``C^-1 [H r]`` is needed: products of its columns
+are ``H^T S^-1 H`` and ``H^T S^-1 r``, from which the pose's information and the landmark's update are computed (Kang,
+eqs. 6-14). A sighting by the left image alone has zeros in the row of uR and its own noise
+(``toolkit.models.left_only``).
 """
 
 import math
@@ -21,8 +22,8 @@ from toolkit.geometry import Array, IntArray
 # alone (2, 3, 3).
 CAMERA = types.Tuple((ROW, STACK, STACK))
 # Points (N, 3), covariances (N, 3, 3), sightings (uL, uR, v) (N, 1, 3) px and which are by the left image alone (N,);
-# pose (1, 4, 4) and covariance (d, d) of the state; the camera; and of sightings by both images and by the left alone
-# (2, 2): the bound of the NIS, Huber's threshold.
+# pose (1, 4, 4) and covariance (d, d) of the state; the camera; and (2, 2) the bound of the NIS and Huber's threshold,
+# in row 0 for sightings by both images, in row 1 for those by the left alone.
 CORRECTION = (types.Tuple((MATRIX, STACK, STACK, types.boolean[::1])), types.Tuple((STACK, MATRIX)), CAMERA, MATRIX)
 # Sightings (N, 3) px by both images, pose (1, 4, 4), camera.
 START = (MATRIX, STACK, CAMERA)
@@ -30,7 +31,7 @@ START = (MATRIX, STACK, CAMERA)
 
 @compiled
 def whiten(cov: Array, rows: Array) -> None:
-    """Multiply rows (3, n) by C^-1, C being the Cholesky factor of a covariance (3, 3), which becomes it."""
+    """Multiply rows (3, n) by C^-1, with C the Cholesky factor of a covariance (3, 3), which C overwrites."""
     cholesky(cov, 3)
     for i in range(3):
         for c in range(rows.shape[1]):
@@ -41,7 +42,7 @@ def whiten(cov: Array, rows: Array) -> None:
 
 @compiled
 def compare(landmarks: Arrays, f: int, view: Arrays, eye: Arrays, here: IntArray, out: Arrays) -> float:
-    """Linearise the sighting of landmark f as ``linearise`` does, but whiten nothing; return the depth."""
+    """Linearise the sighting of landmark f as ``linearise`` does, without whitening; return the depth."""
     points, _, uvs_px, left_only = landmarks
     depth_m: float = linearise(points, f, uvs_px, here, view, eye, out)
     if left_only[f]:
@@ -52,14 +53,14 @@ def compare(landmarks: Arrays, f: int, view: Arrays, eye: Arrays, here: IntArray
 
 @compiled
 def clear_row(A: Array, i: int) -> None:
-    """Make a row of A zero."""
+    """Set a row of A to zero."""
     for c in range(A.shape[1]):
         A[i, c] = 0.0
 
 
 @compiled
 def add_carried(H: Array, P: Array, n: int, S: Array) -> None:
-    """Add ``H P H^T``, of the first n columns of H and as much of P, to S (3, 3)."""
+    """Add ``H P H^T`` to S (3, 3), using the first n columns of H and the same part of P."""
     for a in range(3):
         for c in range(n):
             carried = 0.0
@@ -71,10 +72,10 @@ def add_carried(H: Array, P: Array, n: int, S: Array) -> None:
 
 @compiled
 def informed_pose(landmarks: Arrays, state: Arrays, eye: Arrays, noises: Array, rules: Array, out: Arrays) -> None:
-    """Gate N sightings; add up what those that passed tell of the pose, ``[M n]`` (6, 7), weighed by Huber's loss.
+    """Gate N sightings; sum the pose's information ``[M n]`` (6, 7) of those that passed, with Huber's weights.
 
-    The gate is of residuals with the uncertainty of pose, landmark and sighting, the loss of those without the pose's.
-    ``out`` gets the NIS (N,) and which passed (N,), too.
+    The gate tests residuals with the uncertainty of pose, landmark and sighting; the loss is of residuals whitened
+    without the pose's uncertainty. ``out`` also gets the NIS (N,) and which passed (N,).
     """
     points, covs, _, left_only = landmarks
     view, P = state
@@ -112,7 +113,7 @@ def informed_pose(landmarks: Arrays, state: Arrays, eye: Arrays, noises: Array, 
 def corrected_pose(information: Array, P: Array) -> tuple[Array, Array]:
     """Return the error (d,) and the covariance (d, d) of the state given ``[M n]`` of its pose.
 
-    As ``correction.updated_by_pose_sightings``: ``P_p (1 + M P_pp)^-1 [M P_p^T, n]``.
+    As in ``correction.updated_by_pose_sightings``: ``P_p (1 + M P_pp)^-1 [M P_p^T, n]``.
     """
     d = P.shape[0]
     A, B, moved_by, cov = np.empty((6, 6)), np.empty((6, d + 1)), np.empty(d), np.empty((d, d))
@@ -144,9 +145,10 @@ def corrected_pose(information: Array, P: Array) -> tuple[Array, Array]:
 def correct_landmarks(
     landmarks: Arrays, state: Arrays, eye: Arrays, noises: Array, rules: Array, accepted: Array
 ) -> tuple[Array, Array]:
-    """Return points (N, 3) and covariances (N, 3, 3), corrected where a sighting passed the gate, and passes it again.
+    """Return points (N, 3) and covariances (N, 3, 3), corrected where a sighting passed the pose's gate and now again.
 
-    With ``A = C^-1 H P``, of the covariance that has pose and landmark in it, a landmark's is lessened by ``A^T A``.
+    With ``A = C^-1 H P``, P being the joint covariance of pose and landmark, the landmark's covariance falls by
+    ``A^T A``.
     """
     points, covs, _, left_only = landmarks
     view, P = state
@@ -203,10 +205,10 @@ def correct(landmarks: Arrays, state: Arrays, camera: Arrays, rules: Array) -> A
 
 @kept(START)
 def start(uvs_px: Array, pose: Array, camera: Arrays) -> tuple[Array, Array]:
-    """Return N landmarks where stereo sees them, points (N, 3) and covariances (N, 3, 3); see :data:`START`.
+    """Return N landmarks triangulated from stereo, points (N, 3) and covariances (N, 3, 3); see :data:`START`.
 
-    With the disparity d the depth is ``z = fx b / d``, of which ``dz/duL = -z / d = -dz/duR``; across and down it is
-    multiplied by ``(uL - cx) / fx`` and ``(v - cy) / fy`` (Kang, eqs. 3-5).
+    With the disparity d the depth is ``z = fx b / d``, so that ``dz/duL = -z / d = -dz/duR``; for the coordinates
+    across and down this is multiplied by ``(uL - cx) / fx`` and ``(v - cy) / fy`` (Kang, eqs. 3-5).
     """
     intrinsics, T_imu_cam, noises = camera
     fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]

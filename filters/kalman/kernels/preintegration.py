@@ -1,9 +1,9 @@
-"""A prediction along an IMU's samples compiled: ``toolkit.models.imu``, whose preintegration is GTSAM's.
+"""A prediction over IMU samples compiled: ``toolkit.models.imu``, whose preintegration is GTSAM's.
 
-The state is integrated in the tangent space of its start: a rotation vector theta, a position and a velocity, of which
-the turn rate w makes ``theta' = J_r^-1(theta) w`` (Forster et al. 2017, "On-manifold preintegration for real-time
+The state is integrated in the tangent space of its start: a rotation vector theta, a position and a velocity. The turn
+rate w gives ``theta' = J_r^-1(theta) w`` (Forster et al. 2017, "On-manifold preintegration for real-time
 visual-inertial odometry", eqs. 26-38; GTSAM's "tangent preintegration"). A step has the Jacobian F (15, 15) of the
-errors of theta, position, velocity and both biases, which carries the covariance.
+errors of theta, position, velocity and both biases; F propagates the covariance.
 """
 
 import numpy as np
@@ -15,15 +15,15 @@ from filters.kalman.kernels.rigid_motions import coefficients, skew
 from filters.kalman.kernels.signatures import MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array
 
-# Lengths s (n,) of steps, specific forces and turn rates (n, 3) in their middles. Variances (5,) of accelerometer,
-# gyro, the walks of their biases, and what integration errs by, densities all. Pose (1, 4, 4), velocity m/s (3,), bias
-# (6,) [accel, gyro] of the state; gravity m/s^2 (3,) in the world.
+# Lengths s (n,) of steps, specific forces and turn rates (n, 3) at their midpoints. Squared noise densities (5,) of
+# accelerometer, gyro, the random walks of their biases, and the integration error. Pose (1, 4, 4), velocity m/s (3,),
+# bias (6,) [accel, gyro] of the state; gravity m/s^2 (3,) in the world.
 SIGNATURE = (types.Tuple((ROW, MATRIX, MATRIX)), ROW, types.Tuple((STACK, ROW, ROW)), ROW)
 
 
 @compiled
 def tangent(theta: Array, R: Array, Jr: Array, inverse: Array, c: Array) -> None:
-    """Put the rotation of a vector in R (3, 3), its right Jacobian in Jr and the inverse of that in ``inverse``.
+    """Write the rotation of a vector to R (3, 3), its right Jacobian to Jr and the inverse of that to ``inverse``.
 
     Its coefficients (5,), as in ``rigid_motions``, go to c.
     """
@@ -42,14 +42,14 @@ def tangent(theta: Array, R: Array, Jr: Array, inverse: Array, c: Array) -> None
 
 @compiled
 def turned(R: Array, v: Array, out: Array) -> None:
-    """Put the product of R (3, 3) with v (3,) in ``out`` (3,)."""
+    """Write the product of R (3, 3) with v (3,) to ``out`` (3,)."""
     for i in range(3):
         out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
 
 
 @compiled
 def rate_by_angle(theta: Array, u: Array, c: Array, M: Array) -> None:
-    """Put the derivative of ``J_r(theta) u`` by theta in M (3, 3), u staying as it is."""
+    """Write the derivative of ``J_r(theta) u`` by theta, with u constant, to M (3, 3)."""
     X, across, twice = np.empty((3, 3)), np.empty(3), np.empty(3)
     skew(theta, 0, 1.0, X)
     turned(X, u, across)
@@ -65,7 +65,7 @@ def rate_by_angle(theta: Array, u: Array, c: Array, M: Array) -> None:
 
 @compiled
 def step(state: Array, force: Array, rate: Array, dt_s: float, F: Array) -> None:
-    """Move theta, position and velocity (9,) by a step of unbiased samples (3,); put its Jacobian in F (15, 15)."""
+    """Move theta, position and velocity (9,) by a step of unbiased samples (3,); write its Jacobian to F (15, 15)."""
     R, Jr, inverse, c = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(5)
     X, XJ, by_angle, u, a = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     tangent(state, R, Jr, inverse, c)
@@ -90,7 +90,7 @@ def step(state: Array, force: Array, rate: Array, dt_s: float, F: Array) -> None
 
 @compiled
 def carry(F: Array, P: Array, work: Array) -> None:
-    """Put ``F P F^T`` in the place of a symmetric P (n, n)."""
+    """Overwrite a symmetric P (n, n) by ``F P F^T``."""
     multiply(F, P, work)
     transpose(work, P.shape[0])
     multiply(F, work, P)
@@ -98,10 +98,10 @@ def carry(F: Array, P: Array, work: Array) -> None:
 
 @compiled
 def over_step(F: Array, A: Array, out: Array) -> None:
-    """Put the first nine rows of F A in ``out``, F being a step's Jacobian; A has 15 columns.
+    """Write the first nine rows of F A to ``out``, with F a step's Jacobian; A has 15 columns.
 
-    Theta depends on theta and the gyro's bias, velocity on theta, itself and the accelerometer's bias, and so does
-    position, which velocity moves as well.
+    Theta depends on theta and the gyro's bias. Velocity depends on theta, itself and the accelerometer's bias; position
+    on these and on itself.
     """
     for i in range(9):
         bias = 12 if i < 3 else 9
@@ -114,7 +114,7 @@ def over_step(F: Array, A: Array, out: Array) -> None:
 
 @compiled
 def carry_over_step(F: Array, P: Array, work: Array) -> None:
-    """Put ``F P F^T`` in the place of a symmetric P (15, 15), F being a step's Jacobian."""
+    """Overwrite a symmetric P (15, 15) by ``F P F^T``, with F a step's Jacobian."""
     over_step(F, P, work)
     for i in range(9):
         for c in range(15):
@@ -129,7 +129,7 @@ def carry_over_step(F: Array, P: Array, work: Array) -> None:
 
 @compiled
 def add_noise(F: Array, variances: Array, dt_s: float, P: Array) -> None:
-    """Add what the noise of a step of Jacobian F makes of theta, position, velocity and biases to P (15, 15)."""
+    """Add the noise of a step with Jacobian F, in theta, position, velocity and biases, to P (15, 15)."""
     accel, gyro = variances[0] / dt_s, variances[1] / dt_s
     for i in range(9):
         variance, first, begin, end = (gyro, 12, 0, 3) if i < 3 else (accel, 9, 3, 9)
@@ -144,7 +144,7 @@ def add_noise(F: Array, variances: Array, dt_s: float, P: Array) -> None:
 
 @compiled
 def identity(A: Array) -> None:
-    """Make A the identity."""
+    """Set A to the identity."""
     clear(A, A.shape[0])
     for i in range(A.shape[0]):
         A[i, i] = 1.0
@@ -152,9 +152,9 @@ def identity(A: Array) -> None:
 
 @compiled
 def integrate(samples: Arrays, variances: Array, bias: Array, state: Array, P: Array, G: Array) -> float:
-    """Integrate samples; put theta, position and velocity in state (9,), their covariance with both biases in P.
+    """Integrate samples; write theta, position and velocity to state (9,), their covariance with both biases to P.
 
-    G (15, 15), the identity at first, gets the derivative by the biases of the start. Returns the duration.
+    G (15, 15), initially the identity, becomes the derivative by the biases of the start. Returns the duration.
     """
     dt_s, forces, rates = samples
     F, work, X, c = np.empty((15, 15)), np.empty((15, 15)), np.empty((3, 3)), np.empty(5)
@@ -164,7 +164,7 @@ def integrate(samples: Arrays, variances: Array, bias: Array, state: Array, P: A
         for i in range(3):
             force[i], rate[i] = forces[k, i] - bias[i], rates[k, i] - bias[3 + i]
             half[i] = 0.5 * dt_s[k] * rate[i]
-        # A specific force stands for the middle of its step, and is turned to the start.
+        # A specific force is that of the step's midpoint; it is rotated to the axes of the start.
         coefficients(half[0] * half[0] + half[1] * half[1] + half[2] * half[2], c)
         skew(half, 0, 1.0, X)
         turned(X, force, across)
@@ -184,7 +184,7 @@ def integrate(samples: Arrays, variances: Array, bias: Array, state: Array, P: A
 
 @compiled
 def to_end(R: Array, Jr: Array, D: Array) -> None:
-    """Put in D (15, 15) what takes errors of theta, position and velocity to the body's axes at the end."""
+    """Write to D (15, 15) the map of errors of theta, position and velocity to the body's axes at the end."""
     identity(D)
     for i in range(3):
         for j in range(3):
@@ -204,7 +204,7 @@ def predict(samples: Arrays, variances: Array, start: Arrays, gravity: Array) ->
     to_end(R, Jr, D)
     carry(D, P, F)
     multiply(D, G, F)
-    # What the start's own error does to theta, position and velocity: they are integrated in its axes.
+    # The effect of the start's own error on theta, position and velocity, which are integrated in the start's axes.
     for block in range(2):
         skew(state, 3 + 3 * block, -1.0, X)
         for i in range(3):

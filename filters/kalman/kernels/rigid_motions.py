@@ -1,4 +1,4 @@
-"""The exponential map of SE(3) compiled, its inverse, right Jacobian and adjoint: ``toolkit.geometry``, one at a time.
+"""The exponential map of SE(3) compiled, with inverse, right Jacobian and adjoint: ``toolkit.geometry`` for one motion.
 
 Twists are [rotation, translation]. Source: Barfoot, "State Estimation for Robotics" (2017), eqs. 7.33, 7.85-7.86.
 """
@@ -14,9 +14,9 @@ from toolkit.geometry import Array
 
 @compiled
 def coefficients(x: float, c: Array) -> None:
-    """Put the five coefficients of the exponential map and its Jacobian at a squared angle x in c (5,).
+    """Write the five coefficients of the exponential map and its Jacobian at a squared angle x to c (5,).
 
-    They are ``sum_k (-x)^k / (2 k + n)!`` for n = 1 ... 5, as in ``toolkit.geometry``: seven terms of a small angle.
+    They are ``sum_k (-x)^k / (2 k + n)!`` for n = 1 ... 5, as in ``toolkit.geometry``; small angles use seven terms.
     """
     if x < 0.25:
         first = 1.0
@@ -36,7 +36,7 @@ def coefficients(x: float, c: Array) -> None:
 
 @compiled
 def skew(v: Array, first: int, sign: float, X: Array) -> None:
-    """Put the matrix of the cross product with three elements of v, times a sign, in X (3, 3)."""
+    """Write the cross-product matrix of three elements of v, times a sign, to X (3, 3)."""
     x, y, z = sign * v[first], sign * v[first + 1], sign * v[first + 2]
     X[0, 0], X[0, 1], X[0, 2] = 0.0, -z, y
     X[1, 0], X[1, 1], X[1, 2] = z, 0.0, -x
@@ -45,7 +45,7 @@ def skew(v: Array, first: int, sign: float, X: Array) -> None:
 
 @compiled
 def exponential(xi: Array, T: Array) -> None:
-    """Put the motion of a twist, the first six elements of xi, in T (1, 4, 4)."""
+    """Write the motion of a twist, the first six elements of xi, to T (1, 4, 4)."""
     X, XX, c = np.empty((3, 3)), np.empty((3, 3)), np.empty(5)
     skew(xi, 0, 1.0, X)
     multiply(X, X, XX)
@@ -60,7 +60,7 @@ def exponential(xi: Array, T: Array) -> None:
 
 @compiled
 def right_jacobian(xi: Array, J: Array) -> None:
-    """Put J_r of a twist, ``exp(xi + d) = exp(xi) exp(J_r d)``, in J (6, 6)."""
+    """Write J_r of a twist, ``exp(xi + d) = exp(xi) exp(J_r d)``, to J (6, 6)."""
     X, Y, XX, XY, YX = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     XYX, XXY, YXX = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     left, right = np.empty((3, 3)), np.empty((3, 3))
@@ -90,7 +90,7 @@ def right_jacobian(xi: Array, J: Array) -> None:
 
 @compiled
 def adjoint_of_inverse(T: Array, A: Array) -> None:
-    """Put the adjoint of the inverse of a motion (1, 4, 4), ``[R^T, 0; -R^T [t]x, R^T]``, in A (6, 6)."""
+    """Write the adjoint of the inverse of a motion (1, 4, 4), ``[R^T, 0; -R^T [t]x, R^T]``, to A (6, 6)."""
     for i in range(3):
         for j in range(3):
             A[i, j] = A[3 + i, 3 + j] = T[0, j, i]
@@ -103,13 +103,13 @@ def adjoint_of_inverse(T: Array, A: Array) -> None:
 
 @compiled
 def rotation_vector(T: Array, phi: Array) -> None:
-    """Put the rotation vector of a motion (1, 4, 4), of length at most pi, in the first three elements of phi.
+    """Write the rotation vector of a motion (1, 4, 4), of length at most pi, to the first three elements of phi.
 
-    Goes through the unit quaternion, of which the largest element is taken first (Shepperd 1978).
+    It is computed from the unit quaternion, starting with its largest element (Shepperd 1978).
     """
     q, trace, largest = np.empty(4), T[0, 0, 0] + T[0, 1, 1] + T[0, 2, 2], 3
     for i in range(3):
-        # Of 4 q q^T the diagonal is 1 + 2 T_ii - trace, and 1 + trace.
+        # The diagonal of 4 q q^T is 1 + 2 T_ii - trace, and 1 + trace.
         if T[0, i, i] >= (trace if largest == 3 else T[0, largest, largest]):
             largest = i
     for i in range(3):
@@ -130,7 +130,7 @@ def rotation_vector(T: Array, phi: Array) -> None:
 
 @compiled
 def logarithm(T: Array, xi: Array) -> None:
-    """Put the twist of a motion (1, 4, 4), of which three rows count, in the first six elements of xi."""
+    """Write the twist of a motion (1, 4, 4), whose fourth row is not read, to the first six elements of xi."""
     X, XX, c, rho = np.empty((3, 3)), np.empty((3, 3)), np.empty(5), np.empty((3, 1))
     rotation_vector(T, xi)
     skew(xi, 0, 1.0, X)

@@ -1,4 +1,4 @@
-"""A track's sightings compiled: their images and Jacobians, and what makes the rows of correlated noise independent."""
+"""A track's sightings compiled: their images and Jacobians, and the decorrelation of rows with correlated noise."""
 
 import math
 
@@ -12,7 +12,7 @@ from toolkit.geometry import Array, BoolArray, IntArray
 
 @compiled
 def sighted(seen: BoolArray, f: int) -> IntArray:
-    """Return the poses that saw a track."""
+    """Return the indices of the poses that saw a track."""
     count = 0
     for j in range(seen.shape[1]):
         count += seen[f, j]
@@ -27,9 +27,9 @@ def sighted(seen: BoolArray, f: int) -> IntArray:
 
 @compiled
 def first_guess(uvs_px: Array, seen: BoolArray, f: int, T_world_cam: Array, intrinsics: Array, points: Array) -> float:
-    """Put in ``points[f]`` where the sighting of a track with the largest disparity says it is; return that disparity.
+    """Write to ``points[f]`` the stereo point of a track's sighting with the largest disparity; return that disparity.
 
-    One of no more than ``points[f, 0]`` px is taken for a pixel in the centre of the image.
+    A disparity of at most ``points[f, 0]`` px is replaced by one pixel, in the centre of the image.
     """
     least_px, nearest, largest = points[f, 0], seen.shape[1] - 1, -np.inf
     for j in range(seen.shape[1]):
@@ -48,9 +48,10 @@ def first_guess(uvs_px: Array, seen: BoolArray, f: int, T_world_cam: Array, intr
 
 @compiled
 def project(intrinsics: Array, x: float, y: float, z: float, J: Array) -> None:
-    """Put the Jacobian of (uL, uR, v) to a point in camera coordinates in J (4, 4), the image in its last column.
+    """Write the Jacobian of (uL, uR, v) to a point in camera coordinates to J (4, 4), the image to its last column.
 
-    Within a millimetre of the camera's plane the point counts as a millimetre in front, as in ``stereo.linearise``.
+    Within a millimetre of the camera's plane the point is taken to be a millimetre in front, as in
+    ``stereo.linearise``.
     """
     z = z if abs(z) >= 1e-3 else 1e-3
     across, down, right = intrinsics[0] / z, intrinsics[1] / z, x - intrinsics[4]
@@ -64,9 +65,9 @@ def linearise(points: Array, f: int, uvs_px: Array, where: IntArray, window: Arr
     """Linearise the sightings of a track from the poses ``where`` (m,); return its least depth.
 
     ``window`` has the inverses of the poses, the poses to linearise at and their inverses; ``eye`` the intrinsics,
-    T_cam_imu and what rows are multiplied by. ``out`` gets the Jacobians to each pose (3 m, 6), and the landmark's
-    Jacobian beside the residual (3 m, 4): from ``T exp([phi, rho])`` a fixed point p, in the frame of the IMU, is seen
-    to move by ``p x phi - rho``.
+    T_cam_imu and the whitener of the rows. ``out`` gets the Jacobians to each pose (3 m, 6), and the landmark's
+    Jacobian beside the residual (3 m, 4). A fixed point p in the IMU frame moves by ``p x phi - rho`` under
+    ``T exp([phi, rho])``.
     """
     inverses_now, poses_at, inverses_at = window
     intrinsics, T_cam_imu, rows = eye
@@ -102,9 +103,9 @@ def linearise(points: Array, f: int, uvs_px: Array, where: IntArray, window: Arr
 
 @compiled
 def noise_roots(ages: IntArray, f: int, where: IntArray, variances: Array, roots: Array) -> None:
-    """Put the Cholesky factors of the covariances of a track's errors, a channel under the other, in roots (3 m, m).
+    """Write the Cholesky factors of the covariances of a track's errors to roots (3 m, m), one channel below the other.
 
-    ``white [j = k] + walk min(a_j, a_k) + offset`` (``toolkit.track_noise``).
+    The covariance is ``white [j = k] + walk min(a_j, a_k) + offset`` (``toolkit.track_noise``).
     """
     m = where.size
     one = np.empty((m, m))
@@ -148,7 +149,7 @@ def decorrelate_transposed(roots: Array, m: int, A: Array, columns: int) -> None
 
 @compiled
 def own_jacobians(H_pose: Array, m: int, roots: Array, correlated: bool, J: Array) -> None:
-    """Put the Jacobians (3 m, 6) of each sighting to its own pose in J (3 m, 6 m), to all; make them independent."""
+    """Write Jacobians (3 m, 6) to each sighting's own pose as Jacobians J (3 m, 6 m) to all poses; decorrelate them."""
     for i in range(3 * m):
         for c in range(6 * m):
             J[i, c] = 0.0
@@ -162,7 +163,7 @@ def own_jacobians(H_pose: Array, m: int, roots: Array, correlated: bool, J: Arra
 
 @compiled
 def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
-    """Add ``[H r]^T [H r]`` of some rows (., 4) to row ``at`` of N, which has what ``solved_3`` takes."""
+    """Add ``[H r]^T [H r]`` of some rows (., 4) to row ``at`` of N, in the form that ``solved_3`` takes."""
     for row in range(first, end):
         c = 0
         for a in range(4):
@@ -173,7 +174,7 @@ def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
 
 @compiled
 def step(points: Array, f: int, nearest_m: float, N: Array, at: int) -> None:
-    """Move a track's point by the solution of row ``at`` of N, no longer than a fifth of the least depth."""
+    """Move a track's point by the solution of row ``at`` of N, by at most a fifth of the least depth."""
     x, y, z = solved_3(N, at, 0.0, 0.0)
     share = min(1.0, 0.2 * nearest_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
     points[f, 0] += share * x

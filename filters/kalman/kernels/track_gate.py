@@ -1,9 +1,9 @@
 """The track gate compiled: the mathematics of ``track_gate``'s NumPy, one track after another.
 
-NumPy pads all tracks to the whole window and forms at once what it needs of them; compiled, a track costs what its own
-m sightings cost. Its covariance is not formed in the null space of its landmark: ``S = H_x P H_x^T`` is made of 3x3
-blocks, one for every two poses, and the reflections that take the landmark away are applied to it from both sides. The
-rows that come out span the same space as NumPy's in another basis: NIS, ``H^T H`` and ``H^T r`` are the same.
+NumPy pads all tracks to the whole window and computes them at once; compiled, the cost of a track depends on its own m
+sightings. The covariance is not formed in the null space of the landmark: ``S = H_x P H_x^T`` is made of 3x3 blocks,
+one for every pair of poses, and the reflections that eliminate the landmark are applied to it from both sides. The
+resulting rows span the same space as NumPy's in another basis: NIS, ``H^T H`` and ``H^T r`` are the same.
 
 Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation",
 eqs. 17-26 and appendix; Golub & Van Loan, "Matrix Computations" (4th ed.), 5.1 (reflections and their products).
@@ -39,7 +39,7 @@ from filters.kalman.kernels.sightings import (
 from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, ROW, STACK, WINDOW, Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
 
-# Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W), their ages (F, W). Then window and camera, rules as
+# Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W), their ages (F, W). Then window and camera, the rules
 # numbered below, and bounds (3 W - 2,) of the NIS by degrees of freedom.
 SIGNATURE = (types.Tuple((STACK, MASK, COUNTS)), WINDOW, CAMERA, ROW, ROW)
 ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_DEPTH, REFINEMENTS, MISMATCHED = range(8)
@@ -49,7 +49,7 @@ ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_D
 def normal_equations(
     points: Array, f: int, sightings: Arrays, T_cam_world: Array, eye: Arrays, N: Array, at: int
 ) -> tuple[float, float]:
-    """Put ``[J r]^T [J r]`` of a track's whitened residuals r at its point in row ``at`` of N; see ``solved_3``.
+    """Write ``[J r]^T [J r]`` of a track's whitened residuals r at its point to row ``at`` of N; see ``solved_3``.
 
     Return half the squared error, infinite where the point is behind a camera, and the least depth.
     """
@@ -81,10 +81,10 @@ def normal_equations(
 def triangulate(
     sightings: Arrays, poses: Array, T_imu_cam: Array, eye: Arrays, rules: Array, points: Array
 ) -> BoolArray:
-    """Put the points that fit F tracks best in ``points`` (F + 1, 3); return which to rely on (F,).
+    """Write the least-squares points of F tracks to ``points`` (F + 1, 3); return which are reliable (F,).
 
-    As ``triangulation.triangulate``: steps of ``(A + lambda diag(A) + 1e-12) step = J^T r``, ``A = J^T J``, and all
-    tracks stop together, as soon as no step of any has lessened its error by the relative decrease.
+    As ``triangulation.triangulate``: steps of ``(A + lambda diag(A) + 1e-12) step = J^T r`` with ``A = J^T J``. All
+    tracks stop together, as soon as no step has reduced the error of any track by the relative decrease.
     """
     uvs_px, seen = sightings
     count = seen.shape[0]
@@ -121,7 +121,7 @@ def triangulate(
 
 @compiled
 def carry_cov(where: IntArray, H_pose: Array, P: Array, S: Array) -> None:
-    """Put ``H_x P H_x^T`` (3 m, 3 m) in S: of sightings i and j the block ``H_i P_ij H_j^T``."""
+    """Write ``H_x P H_x^T`` (3 m, 3 m) to S: the block of sightings i and j is ``H_i P_ij H_j^T``."""
     T = np.empty((3, P.shape[1]))
     for i in range(where.size):
         end = 6 * where[i] + 6
@@ -147,11 +147,11 @@ def carry_cov(where: IntArray, H_pose: Array, P: Array, S: Array) -> None:
 def innovations(
     points: Array, f: int, sightings: Arrays, window: Arrays, eye: Arrays, refinements: float, work: Arrays
 ) -> None:
-    """Linearise track f, its point refined first where its noise is correlated, and make its rows independent.
+    """Linearise track f, refining its point first if its noise is correlated, and decorrelate its rows.
 
-    ``work`` gets Jacobians to each pose (3 m, 6), as they are; landmark's Jacobian and residual (3 m, 4), independent;
-    the covariance (3 m, 3 m) of the latter but for their noise, ``M H_x P H_x^T M^T``; and the roots of the noise,
-    whose inverse M is.
+    ``work`` gets the Jacobians to each pose (3 m, 6), not decorrelated; the landmark's Jacobian and the residual (3 m,
+    4), decorrelated by M; the covariance (3 m, 3 m) of the latter without their noise, ``M H_x P H_x^T M^T``; and the
+    roots of the noise, whose inverse is M.
     """
     uvs_px, ages, where = sightings
     poses, inverses_now, poses_at, inverses_at, P = window
@@ -177,14 +177,14 @@ def innovations(
 
 @compiled
 def nis_of(S: Array, n: int, residual: Array) -> float:
-    """Return ``r^T (S + 1)^-1 r`` of all rows but the first three.
+    """Return ``r^T (S + 1)^-1 r`` over all rows but the first three.
 
     The Cholesky factor L of those rows is left in S, ``L^-1 r`` in ``residual``.
     """
     for i in range(n):
         S[i, i] += 1.0
         for j in range(min(i, 3)):
-            S[i, j] = S[j, i] = 0.0  # the first three rows are a factor by themselves
+            S[i, j] = S[j, i] = 0.0  # decouples the first three rows from the others
     cholesky(S, n)
     total = 0.0
     for i in range(3, n):
@@ -198,11 +198,12 @@ def nis_of(S: Array, n: int, residual: Array) -> float:
 
 @compiled
 def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array, H: Array, first: int) -> None:
-    """Put the rows of ``Q^T J`` but three in H (., 6 W) from row ``first`` on, at the columns of ``where`` (m,).
+    """Write all but the first three rows of ``Q^T J`` to H (., 6 W), from row ``first`` on.
 
-    J (3 m, 6 m) are Jacobians to those poses: unless dense, a row depends on its own pose alone. The product of three
-    reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T, in whose diagonal their factors are and above it
-    ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989); Q itself is not formed.
+    J (3 m, 6 m) are Jacobians to the poses ``where`` (m,), which give the columns of H; unless ``dense``, a row depends
+    on its own pose alone. The product of three reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T. Its
+    diagonal has their factors; above the diagonal ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989). Q
+    itself is not formed.
     """
     n, T, reached = 3 * where.size, np.zeros((3, 3)), np.zeros((3, 6 * where.size))
     for k in range(3):
@@ -231,10 +232,10 @@ def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array
 
 @compiled
 def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array, roots: Array, correlated: bool) -> int:
-    """Return which of a track's m sightings, left out, lessens its NIS most: ``track_gate._worst_sighting``.
+    """Return which of a track's m sightings reduces its NIS most when left out: ``track_gate._worst_sighting``.
 
-    S has a Cholesky factor and ``rest`` residuals as ``nis_of`` leaves them. With ``W = Q [0, 0; 0, S^-1] Q^T``, freed
-    of what made the rows independent, and w = W r the NIS falls by ``w_j^T W_jj^-1 w_j``.
+    S has the Cholesky factor and ``rest`` the residuals that ``nis_of`` leaves. With ``W = Q [0, 0; 0, S^-1] Q^T``,
+    transformed back from the decorrelated rows, and w = W r the NIS falls by ``w_j^T W_jj^-1 w_j``.
     """
     W, w = np.empty((n, n)), np.zeros((n, 1))
     invert(S, n, W)
@@ -271,12 +272,12 @@ def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array, roots: A
 
 @kept(SIGNATURE)
 def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array, bounds: Array) -> Arrays:
-    """Triangulate F tracks, linearise them, free them of their landmarks and test them; see :data:`SIGNATURE`.
+    """Triangulate F tracks, linearise them, eliminate their landmarks and test them; see :data:`SIGNATURE`.
 
-    Returns points (F + 1, 3), the last without meaning; which are reliable (F,): what else is told of others means
-    nothing; the NIS (F,) and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not far above
-    its bound; and of tracks below their bounds n rows, under each other: H (n, 6 W), residuals (n,), and whose each
-    is among the reliable tracks (n,).
+    Returns points (F + 1, 3), whose last row has no meaning; which are reliable (F,) (the other results are undefined
+    for unreliable ones); the NIS (F,) and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not
+    far above its bound; and the n stacked rows of the tracks below their bounds: H (n, 6 W), residuals (n,), and the
+    index of each row's track among the reliable tracks (n,).
     """
     uvs_px, seen, ages = sightings
     poses, poses_at, P = window

@@ -1,13 +1,13 @@
-"""What tracks in view tell compiled: the normal equations of ``tracks_in_view``'s NumPy, one track after another.
+"""The information of tracks in view compiled: the normal equations of ``tracks_in_view``'s NumPy, track by track.
 
-A track's rows are ``[H_f r]`` (3 m, 4) and J (3 m, 6 m), to its landmark and to the poses of its m sightings, the
-newest last. Of them are made ``[H_f r]^T [H_f r]`` and ``B = H_f^T J``, and of these with ``V = (H_f^T H_f)^-1`` what
-is left on the poses, ``J^T J - B^T V B`` and ``J^T r - B^T V H_f^T r`` (Triggs, McLauchlan, Hartley & Fitzgibbon 2000,
-"Bundle adjustment - a modern synthesis", section 6.1).
+A track's rows are ``[H_f r]`` (3 m, 4) and J (3 m, 6 m), the Jacobians to its landmark and to the poses of its m
+sightings, the newest last. From them ``[H_f r]^T [H_f r]`` and ``B = H_f^T J`` are formed, and from these with
+``V = (H_f^T H_f)^-1`` the information on the poses, ``J^T J - B^T V B`` and ``J^T r - B^T V H_f^T r`` (Triggs,
+McLauchlan, Hartley & Fitzgibbon 2000, "Bundle adjustment - a modern synthesis", section 6.1).
 
-:func:`follow` finds the landmarks of the frame before. What is told takes two kernels, for between them BLAS takes the
-rows of all tracks at once to errors whose covariance is one: :func:`normals_of_tracks` forms B without the newest
-sightings, :func:`information_with_newest` tests and adds these.
+:func:`follow` finds the landmarks known from the frame before. The information takes two kernels, because between them
+BLAS transforms the rows of all tracks at once to errors of unit covariance: :func:`normals_of_tracks` forms B without
+the newest sightings, :func:`information_with_newest` tests and adds these.
 """
 
 import math
@@ -30,8 +30,8 @@ from filters.kalman.kernels.sightings import (
 from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, IntArray
 
-# Tracks: (uL, uR, v) (F, W, 3) px, which count (F, W), their ages (F, W), what for (F, W), points (F, 3). Then poses
-# (W, 4, 4), poses to linearise at (W, 4, 4), camera, and rules as numbered below.
+# Tracks: (uL, uR, v) (F, W, 3) px, which are used (F, W), their ages (F, W), weights (F, W), points (F, 3). Then poses
+# (W, 4, 4), poses to linearise at (W, 4, 4), camera, and the rules numbered below.
 SIGNATURE = (types.Tuple((STACK, MASK, COUNTS, MATRIX, MATRIX)), types.Tuple((STACK, STACK)), CAMERA, ROW)
 # What :func:`normals_of_tracks` returns; R (6 W, 6 W), J R of the newest sightings and B R (3 F, 6 W); rules.
 NEWEST_SIGNATURE = (
@@ -40,9 +40,9 @@ NEWEST_SIGNATURE = (
     ROW,
 )
 LEAST_DEPTH, BOUND, HUBER_THRESHOLD = range(3)
-# Of tracks known before: ids (K,), frames of the poses (V,), points (K, 3), what sightings count for (K, V). Of those
-# now: ids (A,), frames (W,), (uL, uR, v) (A, W, 3) px and which were seen (A, W). Poses (W, 4, 4), camera; how many
-# sightings a track needs, and what disparity px.
+# Of tracks known before: ids (K,), frames of the poses (V,), points (K, 3), weights of sightings (K, V). Of the present
+# ones: ids (A,), frames (W,), (uL, uR, v) (A, W, 3) px and which were seen (A, W). Poses (W, 4, 4), camera; the number
+# of sightings and the disparity (px) that a track needs.
 _IDS = types.int64[::1]
 FOLLOWING = (
     types.Tuple((_IDS, _IDS, MATRIX, MATRIX)),
@@ -56,7 +56,7 @@ FOLLOWING = (
 
 @compiled
 def place_of(wanted: int, ids: IntArray, first: int) -> int:
-    """Return where an id stands among ids, looked for from some place on and then before it; -1 where it does not."""
+    """Return the index of an id among ids, searching from ``first`` on and then before it; -1 if absent."""
     for k in range(ids.size):
         at = first + k if first + k < ids.size else first + k - ids.size
         if ids[at] == wanted:
@@ -66,7 +66,7 @@ def place_of(wanted: int, ids: IntArray, first: int) -> int:
 
 @compiled
 def places_of(frames: IntArray, known: IntArray) -> IntArray:
-    """Return where frames (W,) stand among known ones, -1 where they do not."""
+    """Return the indices of frames (W,) among known ones, -1 if absent."""
     places = np.empty(frames.size, dtype=np.int64)
     for j in range(frames.size):
         places[j] = place_of(frames[j], known, j if j < known.size else 0)
@@ -75,9 +75,9 @@ def places_of(frames: IntArray, known: IntArray) -> IntArray:
 
 @kept(FOLLOWING)
 def follow(known: Arrays, now: Arrays, poses: Array, camera: Arrays, fewest: int, least_px: float) -> Arrays:
-    """Return which of A tracks have a landmark (A,), the points (A, 3), and what sightings count for (A, W).
+    """Return which of A tracks have a landmark (A,), the points (A, 3), and the weights of their sightings (A, W).
 
-    They are those known before, and of new tracks where the sighting with the largest disparity puts them.
+    Landmarks are those known before; a new track's is the stereo point of its sighting with the largest disparity.
     """
     known_ids, known_frames, known_points, known_weights = known
     ids, frames, uvs_px, seen = now
@@ -103,7 +103,7 @@ def follow(known: Arrays, now: Arrays, poses: Array, camera: Arrays, fewest: int
 
 @compiled
 def scale(rows: Arrays, first: int, end: int, columns: int, factor: float) -> None:
-    """Multiply some rows of a track, the first columns of J."""
+    """Multiply some rows of a track, and the first columns of their J, by a factor."""
     A, J = rows
     for i in range(first, end):
         for c in range(4):
@@ -116,8 +116,8 @@ def scale(rows: Arrays, first: int, end: int, columns: int, factor: float) -> No
 def add_normals(f: int, where: IntArray, rows: Arrays, n: int, dense: bool, sums: Arrays) -> None:
     """Add n rows of track f to ``[H_f r]^T [H_f r]``, to B, and to ``J^T J`` and ``J^T r`` of all tracks.
 
-    Of J a row has the Jacobian to the pose of its sighting alone (3 m, 6) or, if dense, to all (3 m, 6 m). ``J^T J``
-    is (W, 6, 6) or (1, 6 W, 6 W).
+    A row of J is the Jacobian to the pose of its sighting alone (3 m, 6) or, if ``dense``, to all poses (3 m, 6 m).
+    ``J^T J`` is (W, 6, 6) or (1, 6 W, 6 W).
     """
     A, J = rows
     N, B, D, d = sums
@@ -142,7 +142,7 @@ def add_normals(f: int, where: IntArray, rows: Arrays, n: int, dense: bool, sums
 
 @compiled
 def put_newest(f: int, where: IntArray, rows: Arrays, dense: bool, A_newest: Array, J_newest: Array) -> None:
-    """Put the last three rows of a track with those of the newest sightings: J (3 F, 6), or (3 F, 6 W) if dense."""
+    """Copy the last three rows of a track to those of the newest sightings: J (3 F, 6), or (3 F, 6 W) if ``dense``."""
     A, J = rows
     for a in range(3):
         i = 3 * where.size - 3 + a
@@ -154,13 +154,13 @@ def put_newest(f: int, where: IntArray, rows: Arrays, dense: bool, A_newest: Arr
 
 @kept(SIGNATURE)
 def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array) -> Arrays:
-    """Return the normal equations of F tracks without their newest sightings, and the rows of these.
+    """Return the normal equations of F tracks without their newest sightings, and the rows of the newest.
 
-    These are, for :func:`information_with_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]``
-    (F + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the
-    newest pose or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, a block
-    (W, 6, 6) a pose or the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that a camera has behind
-    it adds nothing.
+    They are, for :func:`information_with_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]`` (F
+    + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the newest
+    pose or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, one block (W, 6, 6)
+    per pose or the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that is behind one of its cameras
+    adds nothing.
     """
     uvs_px, counted, ages, weights, points = tracks
     poses, poses_at = window
@@ -192,10 +192,10 @@ def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Arr
 
 @compiled
 def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array, S: Array) -> None:
-    """Put the innovation of a track's newest sighting, given the others, and its covariance in the first row of S.
+    """Write the innovation of a track's newest sighting, given the others, and its covariance to the first row of S.
 
-    The others put the landmark at ``V (b + B x)``, of which the newest sees ``H_f V (b + B x)``. H (3, 6 W) gets its
-    Jacobian to errors of unit covariance; S has ``[covariance, innovation]`` as ``solved_3`` takes them.
+    The others place the landmark at ``V (b + B x)``, and the newest measures ``H_f V (b + B x)`` of it. H (3, 6 W) gets
+    its Jacobian to errors of unit covariance; S has ``[covariance, innovation]`` in the form that ``solved_3`` takes.
     """
     T, last = np.empty((3, 3)), N.shape[0] - 1
     for a in range(3):
@@ -215,7 +215,7 @@ def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array
             for d in range(3):
                 S[0, at] += T[a, d] * A[3 * f + b, d]
             at += 1
-    # Six sums side by side: one alone would wait for each of its products.
+    # Six independent sums: a single one would wait for each of its products.
     s0, s1, s2, s3, s4, s5 = S[0, 0], S[0, 1], S[0, 2], S[0, 3], S[0, 4], S[0, 5]
     for c in range(JR.shape[1]):
         x, y, z = H[0, c], H[1, c], H[2, c]
@@ -225,7 +225,7 @@ def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array
 
 @compiled
 def weight_of(S: Array, bound: float, huber_threshold: float) -> float:
-    """Return what a sighting counts for whose innovation and its covariance are in the first row of S."""
+    """Return the weight of a sighting whose innovation and covariance are in the first row of S."""
     x, y, z = solved_3(S, S.shape[0] - 1, 0.0, 0.0)
     nis = x * S[0, 6] + y * S[0, 7] + z * S[0, 8]
     return min(1.0, huber_threshold / math.sqrt(max(nis, 1e-12))) if nis < bound else 0.0
@@ -233,7 +233,7 @@ def weight_of(S: Array, bound: float, huber_threshold: float) -> float:
 
 @compiled
 def add_newest(f: int, weight: float, rows: Arrays, JR: Array, BR: Array, sums: Arrays) -> None:
-    """Add a track's newest sighting, weighed, to ``[H_f r]^T [H_f r]``, to B R, and to ``J^T J`` and ``J^T r``."""
+    """Add a track's weighted newest sighting to ``[H_f r]^T [H_f r]``, to B R, and to ``J^T J`` and ``J^T r``."""
     A, J = rows
     N, D, d = sums
     scale(rows, 3 * f, 3 * f + 3, J.shape[1], math.sqrt(weight))
@@ -252,7 +252,7 @@ def add_newest(f: int, weight: float, rows: Arrays, JR: Array, BR: Array, sums: 
 
 @compiled
 def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
-    """Put ``C^-1 B R``, C being the root of a track's ``H_f^T H_f``, in the place of B R, and ``C^-1 H_f^T r`` in e."""
+    """Overwrite B R by ``C^-1 B R``, with C the root of a track's ``H_f^T H_f``, and write ``C^-1 H_f^T r`` to e."""
     l00 = math.sqrt(N[f, 0])
     l10, l20 = N[f, 1] / l00, N[f, 3] / l00
     l11 = math.sqrt(N[f, 2] - l10 * l10)
@@ -270,7 +270,7 @@ def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
 
 @compiled
 def mirror(A: Array) -> None:
-    """Put the lower halves of symmetric matrices (., n, n) in their upper halves."""
+    """Copy the lower halves of symmetric matrices (., n, n) to their upper halves."""
     for k in range(A.shape[0]):
         for i in range(A.shape[1]):
             for j in range(i):
@@ -279,7 +279,7 @@ def mirror(A: Array) -> None:
 
 @compiled
 def blocks_times_root(D: Array, R: Array) -> Array:
-    """Return the product of what has blocks D (., k, k) along its diagonal with a lower triangular R (n, n)."""
+    """Return the product of a block-diagonal matrix of blocks D (., k, k) with a lower triangular R (n, n)."""
     result = np.zeros(R.shape)
     for block in range(D.shape[0]):
         first = block * D.shape[1]
@@ -294,10 +294,10 @@ def blocks_times_root(D: Array, R: Array) -> Array:
 def information_with_newest(normals: Arrays, by_root: Arrays, rules: Array) -> Arrays:
     """Gate the newest sightings of F tracks and finish their information; see :data:`NEWEST_SIGNATURE`.
 
-    Returns points (F, 3) after a step, what the newest sightings count for (F,), which tracks all their cameras have
-    in front (F,), what the landmarks take of the vector, e (3 F,), and ``J^T J R`` (6 W, 6 W) of all sightings, whose
-    ``J^T r`` takes the place of that of the others, and E (3 F, 6 W) that of ``B R``: what is told is ``R^T J^T J R -
-    E^T E`` and ``R^T J^T r - E^T e``.
+    Returns points (F, 3) after a step, the weights of the newest sightings (F,), which tracks are in front of all their
+    cameras (F,), the landmarks' part e (3 F,) of the vector, and ``J^T J R`` (6 W, 6 W) of all sightings. In place,
+    ``J^T r`` becomes that of all sightings and ``B R`` becomes E (3 F, 6 W). The information is then
+    ``R^T J^T J R - E^T E`` and ``R^T J^T r - E^T e``.
     """
     points, depths, N, _, A, J, D, d = normals
     R, JR, BR = by_root

@@ -1,4 +1,4 @@
-"""A prediction along measured twists compiled: ``toolkit.models.twist`` in NumPy, of pose and gyro bias."""
+"""A prediction over measured twists compiled: ``toolkit.models.twist`` in NumPy, of pose and gyro bias."""
 
 import numpy as np
 from numba import types
@@ -9,17 +9,17 @@ from filters.kalman.kernels.rigid_motions import adjoint_of_inverse, exponential
 from filters.kalman.kernels.signatures import MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array
 
-# Lengths s (n,) of twists, their turn rates and velocities (n, 3), what the noise of velocity and turn rate is
-# multiplied by (n, 2), or (0, 2); squared noise densities (9,) of turn rate, velocity and the bias' walk; pose
+# Lengths s (n,) of twists, their turn rates and velocities (n, 3), factors on the noise of velocity and turn rate
+# (n, 2), or (0, 2) for none; squared noise densities (9,) of turn rate, velocity and the bias' random walk; pose
 # (1, 4, 4), bias of the gyro (3,) and covariance (9, 9) of the state.
 SIGNATURE = (types.Tuple((ROW, MATRIX, MATRIX, MATRIX)), ROW, types.Tuple((STACK, ROW, MATRIX)))
 
 
 @compiled
 def integrate(twists: Arrays, densities: Array, bias: Array, T: Array, F: Array, Q: Array) -> Array:
-    """Return the step of n twists, one after another, from the identity T (1, 4, 4).
+    """Return the increment of n twists, one after another, from the identity T (1, 4, 4).
 
-    Of the error (9,) of pose and bias, F gets how the step's end depends on the bias, and Q its covariance.
+    F gets the derivative of the increment's error (9,) of pose and bias by the bias, and Q its covariance.
     """
     dt_s, w_radps, v_mps, noise_scale = twists
     piece, xi, J, carry = np.zeros((1, 4, 4)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
@@ -53,7 +53,7 @@ def integrate(twists: Arrays, densities: Array, bias: Array, T: Array, F: Array,
 
 @kept(SIGNATURE)
 def predict(twists: Arrays, densities: Array, state: Arrays) -> Arrays:
-    """Return pose (1, 4, 4) and covariance (9, 9) of the state carried over n twists; see :data:`SIGNATURE`."""
+    """Return pose (1, 4, 4) and covariance (9, 9) of the state predicted over n twists; see :data:`SIGNATURE`."""
     pose, bias, P = state
     dt_s = twists[0]
     start, F, Q = np.zeros((1, 4, 4)), np.zeros((9, 9)), np.zeros((9, 9))
