@@ -1,8 +1,8 @@
-"""Which parts of the filters run compiled, and how that is chosen: NumPy defines each, a kernel computes the same.
+"""Which parts of the filters run compiled, and how that is chosen: NumPy defines each part, a kernel computes the same.
 
-Each function here is asked for a part when a filter is built, with what was asked for in its run
-(:class:`toolkit.compilation.Compilation`): it returns the definition, or what passes the same arguments on to a kernel.
-Kernels are imported when they are asked for, never before, for only they import numba.
+A filter calls these functions when it is built, each with the compilation its run asked for
+(:class:`toolkit.compilation.Compilation`). A function returns the NumPy definition, or a function of the same arguments
+that calls a kernel. Kernels are imported only when they are used, because only they import numba.
 """
 
 from collections.abc import Callable, Iterable
@@ -64,7 +64,7 @@ def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
 
 
 def share_windowed(noise: MotionNoise, compilation: Compilation) -> None:
-    """Have processes that begin at once share the compilation of what the windowed filters need, the longest first."""
+    """Let processes that start together share the compilation of the windowed filters' kernels, the longest first."""
     along_imu = ["preintegration"] if isinstance(noise, ImuNoise) else []
     compilation.share(f"{_KERNELS}.{name}" for name in ["track_gate", "corrections", "tracks_in_view", *along_imu])
 
@@ -76,7 +76,7 @@ def track_test(compilation: Compilation) -> TrackTest:
         return track_gate.tested
 
     def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bounds: Array) -> TestedTracks:
-        """Test tracks as the definition does, and by it where right images are missing."""
+        """Test tracks as the definition does; where right images are missing, the definition itself is called."""
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
         points, reliable, nis, dof, worst, H, residuals, owners = kernel.test_tracks(
@@ -96,7 +96,7 @@ def track_test(compilation: Compilation) -> TrackTest:
 
 
 def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
-    """Return the two functions of ``tracks_in_view``: the landmarks of tracks in view, and the tracks' information."""
+    """Return the functions of ``tracks_in_view`` that find the landmarks of tracks and the tracks' information."""
     kernel = _kernel(compilation, "tracks_in_view")
     if kernel is None:
         return tracks_in_view.NUMPY
@@ -104,7 +104,7 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
     def followed(
         known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig
     ) -> FollowedTracks:
-        """Return tracks with their landmarks as the definition does, and by it where right images are missing."""
+        """Return tracks with their landmarks as the definition does, which is called where right images are missing."""
         if sightings.left_only.any():
             return tracks_in_view.followed(known, sightings, joint, rig)
         before = _given((known.sightings.track_ids, known.clone_frames, known.points, known.weights))
@@ -115,7 +115,7 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         return FollowedTracks(sightings, joint.clone_frames, points, weights).select(found)
 
     def information(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Information:
-        """Gate the newest sightings as the definition does; the gate is asked for its bounds, it counts nothing."""
+        """Gate the newest sightings as the definition does; only the bounds of ``gate`` are used, it counts nothing."""
         counted = tracks.counted
         if counted.left_only.any():
             return tracks_in_view.information(tracks, window, rig, gate)
@@ -134,12 +134,12 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
     return tracks_in_view.Steps(followed, information)
 
 
-# Has a correlation learn of the residuals of tracks, of points (F, 3) seen from poses (W, 4, 4).
+# Adds the residuals of tracks, with points (F, 3) m seen from poses (W, 4, 4), to a residual correlation.
 Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
 
 
 def learning(compilation: Compilation) -> Learn:
-    """Return the function by which a correlation learns of tracks: :meth:`ResidualCorrelation.learn`."""
+    """Return the function that adds tracks to a residual correlation: :meth:`ResidualCorrelation.learn`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
@@ -147,7 +147,7 @@ def learning(compilation: Compilation) -> Learn:
     def learn(
         correlation: ResidualCorrelation, sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig
     ) -> None:
-        """Take in tracks as the definition does, and by it where right images are missing."""
+        """Add tracks as the definition does, which is called where right images are missing."""
         if not correlation.matches:
             return
         if sightings.left_only.any():
@@ -160,7 +160,7 @@ def learning(compilation: Compilation) -> Learn:
 
 
 def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
-    """Return the function that makes motions (N, 4, 4) of twists (N, 6): :func:`toolkit.geometry.se3_exp`."""
+    """Return the function that maps twists (N, 6) to motions (N, 4, 4): :func:`toolkit.geometry.se3_exp`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return se3_exp
@@ -204,7 +204,7 @@ def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], Corr
 
 
 def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
-    """Return an integrator of motion of some noise under gravity (3,) m/s^2: a motion model, or the same compiled."""
+    """Return an integrator for motion of a noise model under gravity (3,) m/s^2: the motion model, or its kernel."""
     model = motion_model(noise, gravity_world)
     kernel = _kernel(compilation, "preintegration") if isinstance(noise, ImuNoise) else None
     if kernel is None:
@@ -215,7 +215,7 @@ def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilatio
 
 
 class _ImuIntegrator(NamedTuple):
-    """Integrates samples by the kernel as a model does by GTSAM; variances and gravity as the kernel takes them."""
+    """Integrates samples by the kernel as the model does by GTSAM; variances and gravity are in the kernel's form."""
 
     model: MotionModel
     kernel: ModuleType
@@ -229,14 +229,14 @@ class _ImuIntegrator(NamedTuple):
 
 
 class _ImuIncrement(NamedTuple):
-    """The samples between two frames about a bias: integrated when a state is carried over them."""
+    """The samples between two frames and a bias; they are integrated when a state is predicted over them."""
 
     motion: ImuMotion
     bias: Array
     by: _ImuIntegrator
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state over the interval."""
+        """Predict a state over the interval."""
         motion, variances = self.motion, self.by.variances
         if motion.noise_scale is not None:
             variances = np.concatenate([np.square(mean_noise_scale(motion)) * variances[:2], variances[2:]])
@@ -249,12 +249,12 @@ class _ImuIncrement(NamedTuple):
         return transition_over(float(self.motion.dt_s.sum()), self.by.gravity_world, start, end)
 
     def factors(self, k: int) -> Any:
-        """Return what ties state k - 1 to state k in a graph: GTSAM's."""
+        """Return GTSAM's factors between state k - 1 and state k."""
         return self.by.model.integrate(self.motion, self.bias).factors(k)
 
 
 class DecoupledSteps(NamedTuple):
-    """What carries a belief over a motion, corrects it and N landmarks by sightings (N, 3) px, and starts landmarks."""
+    """Functions that predict a belief, correct it and N landmarks by sightings (N, 3) px, and start landmarks."""
 
     predict: Callable[[Belief, Motion], Belief]
     correct: Callable[[Belief, LandmarkMap, Array, StereoRig, FrameGate], FrameCorrection]
@@ -262,10 +262,10 @@ class DecoupledSteps(NamedTuple):
 
 
 def decoupled_steps(model: MotionModel, noise: MotionNoise, compilation: Compilation) -> DecoupledSteps:
-    """Return the steps of the decoupled filter, whose motion has a model of some noise.
+    """Return the steps of the decoupled filter for a motion model and its noise.
 
-    They are ``motion.predicted``, ``correction.corrected`` and ``landmark_map.started``; other motion than twists is
-    left to the model.
+    The definitions are ``motion.predicted``, ``correction.corrected`` and ``landmark_map.started``. Only motion by
+    twists has a kernel; other motion is predicted by the model.
     """
     kernel = _kernel(compilation, "decoupled")
     twists = _kernel(compilation, "twists") if isinstance(noise, TwistNoise) and kernel is not None else None
@@ -290,7 +290,7 @@ def decoupled_steps(model: MotionModel, noise: MotionNoise, compilation: Compila
         return FrameCorrection(belief, LandmarkMap(landmarks.track_ids, points, covs))
 
     def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
-        """Return where stereo sees N landmarks and how well, as the definition does."""
+        """Return the stereo triangulation of N landmarks and its covariances, as the definition does."""
         points, covs = kernel.start(uvs_px, np.array(T_world_imu[None], order="C"), _camera_with_left(rig))
         return points, covs
 
@@ -303,7 +303,7 @@ def _predicted_by(model: MotionModel) -> Callable[[Belief, Motion], Belief]:
 
 
 def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[[Belief, Motion], Belief]:
-    """Return the function that carries the belief of pose and gyro bias over twists of some noise."""
+    """Return the function that predicts pose and gyro bias over twists of a noise model."""
     assert isinstance(noise, TwistNoise)
     densities = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density, noise.gyro_random_walk]) ** 2
 
@@ -319,17 +319,17 @@ def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[
 
 
 def _given(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
-    """Return arrays as kernels take them."""
+    """Return arrays in the form kernels take."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
 
 
 def _pose_of(belief: Belief) -> Array:
-    """Return the pose (1, 4, 4) as kernels take it."""
+    """Return the pose (1, 4, 4) in the form kernels take."""
     return np.array(belief.T_world_imu[None], order="C")
 
 
 def _places(layout: Layout) -> IntArray:
-    """Return where velocity, accel bias and gyro bias stand, -1 for what the layout has not."""
+    """Return the indices of velocity, accel bias and gyro bias in the error state, -1 for what the layout lacks."""
     blocks = (layout.velocity, layout.accel_bias, layout.gyro_bias)
     return np.array([-1 if block is None else block.start for block in blocks])
 
@@ -340,7 +340,7 @@ def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=4)
 def _camera(rig: StereoRig) -> tuple[Array, ...]:
-    """Return a rig as the kernels of the windowed filters take it."""
+    """Return a rig in the form that the kernels of the windowed filters take."""
     none = np.empty((0, 3))
     variances, channels = none, none
     if rig.track_noise is not None:
@@ -352,12 +352,12 @@ def _camera(rig: StereoRig) -> tuple[Array, ...]:
 
 @lru_cache(maxsize=4)
 def _camera_with_left(rig: StereoRig) -> tuple[Array, ...]:
-    """Return a rig as the kernels of the decoupled filter take it."""
+    """Return a rig in the form that the kernels of the decoupled filter take."""
     return *_intrinsics(rig), np.stack([rig.cov_uv_px2, left_only.left_noise_px2(rig)])
 
 
 @lru_cache(maxsize=4)
 def _sighting_rules(probability: float | None, huber: float | None) -> Array:
-    """Return bound and threshold (2, 2) of sightings by both images and by the left alone."""
+    """Return bound and Huber threshold (2, 2), in row 0 for sightings in both images, in row 1 for the left alone."""
     thresholds = np.full(2, np.inf) if huber is None else huber_threshold(_DOF, huber)
     return np.column_stack([FrameGate(probability).bound(_DOF), thresholds])

@@ -1,8 +1,8 @@
 """EKF corrections of the pose by many landmarks and of many landmarks by one pose (Kang, eqs. 6-14).
 
-The report leaves one problem open: its gain inverts a matrix of the size of all measurements (eq. 12). The
-measurement noise is block diagonal, so the same update in information form,
-``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``, needs only 3x3 blocks and is identical; no landmark is left out.
+The report leaves one problem open: its gain inverts a matrix of the size of all measurements (eq. 12). Because the
+measurement noise is block diagonal, the same update in information form, ``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``,
+needs only 3x3 blocks and is identical; no landmark is left out.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 
 class FrameCorrection(NamedTuple):
-    """The corrected belief, and the landmarks corrected by it."""
+    """The corrected belief and the corrected landmarks."""
 
     belief: Belief
     landmarks: LandmarkMap
@@ -29,7 +29,7 @@ class FrameCorrection(NamedTuple):
 def corrected(
     belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
 ) -> FrameCorrection:
-    """Correct the pose by sightings (N, 3) px of N landmarks, then each landmark whose sighting passed by the pose."""
+    """Correct the pose by sightings (N, 3) px of N landmarks, then by the pose the landmarks whose sighting passed."""
     belief, accepted = correct_pose(belief, landmarks, uvs_px, rig, gate)
     nis_bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
     pose_cov = belief.cov[POSE, POSE]
@@ -51,10 +51,10 @@ def correct_pose(
     rig: StereoRig,
     gate: FrameGate,
 ) -> PoseCorrection:
-    """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation.
+    """Correct the pose by sightings (N, 3) px of N landmarks, whose uncertainty is part of the innovation covariance.
 
-    A sighting outside the gate is left out; the others are weighed by the gate's loss, of the norm of their residual
-    whitened by the noise of sighting and landmark.
+    A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
+    residual, whitened by the covariance of sighting and landmark.
     """
     residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, belief.T_world_imu, rig)
     own_cov = H_point @ landmarks.covs @ transposed(H_point) + left_only.noise_px2(uvs_px, rig)
@@ -71,7 +71,7 @@ def correct_pose(
 
 
 def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> stereo.StereoPrediction:
-    """Return sightings (N, 3) px less what is predicted of them, with Jacobians, zero where uR is missing."""
+    """Return the residuals (N, 3) px of sightings, with Jacobians; both are zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
     if not left_only.any_missing(uvs_px):
         return predicted._replace(uv_px=uvs_px - predicted.uv_px)
@@ -84,18 +84,18 @@ def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: St
 
 
 def carried_pose_cov(H_pose: Array, pose_cov: Array) -> Array:
-    """Return ``H P H^T`` (N, 3, 3) of Jacobians (N, 3, 6), the first product being one for all N."""
+    """Return ``H P H^T`` (N, 3, 3) of Jacobians (N, 3, 6); the first product is one multiplication for all N."""
     carried = H_pose.reshape(-1, 6) @ pose_cov
     return np.asarray(carried.reshape(H_pose.shape) @ transposed(H_pose))
 
 
 def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, weighted: Array) -> Belief:
-    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6).
+    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6) to the pose.
 
-    ``weighted`` (N, 3, 6) are the Jacobians, each multiplied by the information matrix of its residual. They add up to
-    an information matrix M (6, 6) and vector n (6,) of the pose. Of the belief's covariance P and its columns p of the
-    pose the update takes ``P_p (1 + M P_pp)^-1 M P_p^T``, and it moves by ``P_p (1 + M P_pp)^-1 n``: the same as the
-    inverse of ``P^-1 + M``, without inverting P.
+    ``weighted`` (N, 3, 6) are the Jacobians, each multiplied by the information matrix of its residual. They sum to the
+    information matrix M (6, 6) and vector n (6,) of the pose. With P the belief's covariance and P_p its columns of the
+    pose, the update subtracts ``P_p (1 + M P_pp)^-1 M P_p^T`` from P and moves the state by ``P_p (1 + M P_pp)^-1 n``.
+    This equals the inverse of ``P^-1 + M`` without inverting P.
     """
     rows = weighted.reshape(-1, 6)
     matrix, vector = rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)
@@ -106,7 +106,7 @@ def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array,
 
 
 class LandmarkCorrection(NamedTuple):
-    """The corrected landmarks, the NIS (N,) of their sightings and the depths (N,) m they were predicted at."""
+    """The corrected landmarks, the NIS (N,) of their sightings and their predicted depths (N,) m."""
 
     landmarks: LandmarkMap
     nis: Array
@@ -118,7 +118,8 @@ def correct_landmarks(
 ) -> LandmarkCorrection:
     """Correct N landmarks by their sightings (N, 3) px from one pose, each by its own 3x3 EKF (Kang, eqs. 6-10).
 
-    ``pose_cov`` (6, 6), zero in the report, counts as measurement noise: a doubtful pose does not harden the map.
+    ``pose_cov`` (6, 6), zero in the report, is added to the measurement noise, so that an uncertain pose does not make
+    the map overconfident.
     """
     residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = left_only.noise_px2(uvs_px, rig)
@@ -147,7 +148,7 @@ class KnownPoseMapper:
         self._rig, self._map, self._probability = rig, TrackedMap(rig), gate_probability
 
     def add(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Correct the landmarks the frame shows again and start its new ones, seen from a pose (4, 4)."""
+        """Correct the landmarks that the frame sees again and start its new ones, both from a pose (4, 4)."""
         seen, uvs_px = self._map.seen_again(frame)
         if len(seen):
             nis_bound = chi2_bound(left_only.degrees_of_freedom(uvs_px), self._probability)
@@ -155,5 +156,5 @@ class KnownPoseMapper:
         self._map.keep(seen, frame, T_world_imu)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark there ever was, as last known."""
+        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()

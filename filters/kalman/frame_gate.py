@@ -1,4 +1,4 @@
-"""The chi-square gate of one frame: which innovations may correct, and what its tests add up to."""
+"""The chi-square gate of one frame: which innovations may correct the state, and the sums over its tests."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,13 +14,13 @@ from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, me
 class FrameGate:
     """Accepts innovations below the chi-square quantile of a probability, counts them, and weighs them by Huber's loss.
 
-    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. ``share`` is the share of
-    its information that any accepted innovation counts for.
+    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. Every accepted innovation
+    is weighted by ``share``, a factor in (0, 1] on its information.
 
-    ``nis`` and ``dof`` are sums over what was accepted, and ``nis_expected`` what the first is expected to be where the
-    innovations are as large as their covariance says: less than ``dof``, for the gate took the largest away. Robust
-    weights come after the test and change neither. ``tested`` and ``accepted`` numbers of innovations, and
-    ``unconverged`` the number of iterated updates that were broken off.
+    ``nis`` and ``dof`` are sums over the accepted innovations. ``nis_expected`` is the expected sum of NIS if the
+    innovations match their covariance; it is less than ``dof``, because the gate has removed the largest ones. Robust
+    weights are applied after the test and change neither sum. ``tested`` and ``accepted`` count innovations,
+    ``unconverged`` counts iterated updates that did not converge.
     """
 
     probability: float | None
@@ -34,11 +34,11 @@ class FrameGate:
     unconverged: int = 0
 
     def bounds(self, most: int) -> Array:
-        """Return the NIS that is just accepted at each number of degrees of freedom up to the most, (most + 1,)."""
+        """Return the gate's bound of the NIS at each number of degrees of freedom from 0 to ``most``, (most + 1,)."""
         return self._table(most).bound[: most + 1]
 
     def bound(self, dof: IntArray | int) -> Array:
-        """Return the NIS that is just accepted at each number of degrees of freedom (N,)."""
+        """Return the gate's bound of the NIS at each number of degrees of freedom (N,)."""
         return np.asarray(self._table(dof).bound[dof])
 
     def _table(self, dof: IntArray | int) -> "_Table":
@@ -48,7 +48,7 @@ class FrameGate:
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test innovations of NIS (N,) and ``dof`` (N,), and count them; return which pass (N,).
 
-        Only those of points in front of the camera do.
+        A point that is not ``in_front`` of the camera does not pass.
         """
         accepted = np.asarray((nis < self._table(dof).bound[dof]) & in_front)
         self.count(nis, dof, accepted)
@@ -69,20 +69,20 @@ class FrameGate:
 
     @property
     def weighs(self) -> bool:
-        """Say whether what is accepted may count for less than in full."""
+        """Say whether accepted innovations may have a weight below 1."""
         return self.huber is not None or self.share != 1.0
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
-        """Return what innovations of NIS (N,) count for (N,): 0 where not ``accepted`` (N,).
+        """Return the weights (N,) of innovations of NIS (N,) and ``dof`` (N,); 0 where not ``accepted`` (N,).
 
-        Else it is Huber's weight, in (0, 1] and 1 without that loss, times the share.
+        An accepted innovation has Huber's weight, in (0, 1] and 1 without that loss, times the share.
         """
         if self.huber is None:
             return self.share * accepted.astype(float)
         return np.where(accepted, self.share * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
 
     def info(self) -> dict[str, float]:
-        """Return the figures by the names an Estimate's info has."""
+        """Return the counts and sums under the keys of an Estimate's info."""
         return {
             "nis": self.nis,
             "nis_dof": self.dof,
@@ -94,7 +94,7 @@ class FrameGate:
 
 
 class _Table(NamedTuple):
-    """At each number of degrees of freedom, from none on, the bound of the NIS and its mean below it."""
+    """At each number of degrees of freedom, from 0 on: the gate's bound of the NIS, and the mean NIS below it."""
 
     bound: Array
     expected: Array
@@ -102,9 +102,10 @@ class _Table(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _table(probability: float | None, bits: int) -> _Table:
-    """Return what a gate needs to know of all numbers of degrees of freedom of so many bits.
+    """Return bounds and means for all numbers of degrees of freedom of at most ``bits`` bits.
 
-    A filter asks for the same few in every frame, and the quantiles take longer than the rest of the gate.
+    Kept between calls: a filter needs the same few in every frame, and the quantiles take longer than the rest of the
+    gate.
     """
     dof = np.arange(2**bits)
     return _Table(chi2_bound(dof, probability), mean_below_bound(dof, probability))

@@ -1,16 +1,16 @@
 """A joint belief whose error is right-invariant: pose, velocity and landmarks are one element of a Lie group.
 
 With X = (R, p, v, l_1 ... l_L) in SE_{2+L}(3), the velocity only where it is part of the state, the error is the xi of
-``X = exp(xi) X_estimated``: one rotation theta of the whole world and a displacement rho of each of its vectors. In the
-errors of the other filters it is, to first order, ``theta = R phi``, ``rho_p = R delta_p + p x theta``, likewise for
-the velocity, and ``rho_l = delta_l + l x theta``. A shift of the world and a turn of it are then the same vectors
-xi whatever the estimate, so that Jacobians taken at ever new estimates agree on what nothing measures. The
-biases stay outside the group and are added (the "imperfect" invariant filter).
+``X = exp(xi) X_estimated``: one rotation theta of the whole world and a displacement rho of each of its vectors. In
+terms of the other filters' errors, to first order, ``theta = R phi``, ``rho_p = R delta_p + p x theta``, likewise for
+the velocity, and ``rho_l = delta_l + l x theta``. A translation or rotation of the world is then the same vector xi at
+every estimate, so that Jacobians evaluated at changing estimates keep the same unobservable directions. The biases stay
+outside the group and are added (the "imperfect" invariant filter).
 
-:class:`AnchoredBelief` is what riekf and iekf use: the same with landmarks along their inverse depth.
+riekf and iekf use :class:`AnchoredBelief`, which also parametrises landmarks by their inverse depth.
 
-Sources: Barrau & Bonnabel 2015, "An EKF-SLAM algorithm with consistency properties", sections III-IV; Barrau &
-Bonnabel 2017, "The invariant extended Kalman filter as a stable observer".
+Sources: Barrau & Bonnabel 2015, "An EKF-SLAM algorithm with consistency properties", sections III-IV; Barrau & Bonnabel
+2017, "The invariant extended Kalman filter as a stable observer".
 """
 
 from copy import copy
@@ -26,14 +26,14 @@ from toolkit.models.state import POSE, POSITION, ROTATION
 class InvariantBelief(JointBelief):
     """A joint belief that is corrected on the group.
 
-    The covariance stands in the coordinates of every joint belief: it can be read, propagated and given new landmarks
-    without conversion, for two errors that are functions of each other propagate alike. They differ only where an
-    estimate moves. What an update leaves is the covariance of the right-invariant error, so that is what
-    stays the same while the estimate moves, and the covariance kept here changes by the change of coordinates.
+    The covariance is kept in the coordinates of every joint belief, so that it can be read, propagated and extended by
+    landmarks without conversion: to first order the two errors are linear functions of each other and propagate alike.
+    They differ only where an estimate moves. An update yields the covariance of the right-invariant error; moving the
+    estimate leaves that covariance unchanged, and the one kept here changes by the change of coordinates.
     """
 
     def move(self, delta: Array) -> None:
-        """Move every estimate by ``exp(xi)`` on the left, xi being the error ``delta`` (n,) at the estimate now."""
+        """Move every estimate by ``exp(xi)`` on the left, where xi is ``delta`` (n,) in invariant coordinates."""
         before = copy(self)
         self._displace(delta)
         carried = self._carried(before, self._carried(before, self._cov).T)
@@ -42,9 +42,10 @@ class InvariantBelief(JointBelief):
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
 
-        In the right-invariant error a sighting is blind to what turns or shifts the whole world: its Jacobian A to the
-        landmark's rho is minus that to the position's, and that to theta is zero. So only ``rho_l - rho_p`` counts,
-        and the left Jacobian of SE(3) at (theta, rho_l - rho_p) leads from there to the error before the move.
+        In the right-invariant error a sighting does not depend on a translation or rotation of the whole world: its
+        Jacobian A to the landmark's rho is minus that to the position's, and its Jacobian to theta is zero. Only
+        ``rho_l - rho_p`` enters, and the left Jacobian of SE(3) at (theta, rho_l - rho_p) converts it to the error
+        before the move.
         """
         old, newest = self.clones[-1], delta[self.clone_columns][-6:]
         turn, away = old[:3, :3], self.points - old[:3, 3]
@@ -58,10 +59,10 @@ class InvariantBelief(JointBelief):
         super()._displace(self._on_the_group(delta))
 
     def _on_the_group(self, delta: Array) -> Array:
-        """Return the error by which adding moves velocity and landmarks as the group's exponential map does.
+        """Return the error that moves velocity and landmarks by addition as the group's exponential map would.
 
-        ``exp(theta) l + J(theta) (delta_l + l x theta) = l + J(theta) delta_l``: a vector turns while it grows, as the
-        position does in the exponential map of a pose.
+        ``exp(theta) l + J(theta) (delta_l + l x theta) = l + J(theta) delta_l``: the vector turns as it grows, like the
+        position in the exponential map of a pose.
         """
         result, layout, phi = delta.copy(), self._core.layout, delta[ROTATION]
         own = delta[self.landmark_columns].reshape(-1, 3)
@@ -72,9 +73,9 @@ class InvariantBelief(JointBelief):
         return result
 
     def _carried(self, before: JointBelief, rows: Array) -> Array:
-        """Return errors (n, m) at the estimates before as errors at the estimates now, xi being the same.
+        """Return errors (n, m) at the estimates before a move as errors at the present estimates, for the same xi.
 
-        Only differences of positions enter, so nothing is lost far from the origin.
+        Only differences of positions enter, so no precision is lost far from the origin.
         """
         result, old, new = rows.copy(), before.core, self._core
         theta = old.T_world_imu[:3, :3] @ rows[ROTATION]
@@ -91,21 +92,21 @@ class InvariantBelief(JointBelief):
 
 
 class AnchoredBelief(LandmarkAnchors, InvariantBelief):
-    """An invariant belief whose landmarks move along their inverse depth from anchors that move with the IMU.
+    """An invariant belief with inverse-depth landmarks whose anchors move with the IMU.
 
-    A landmark's depth is not Gaussian: the stereo sighting that started it is linear in the inverse depth from there.
-    An update that stays where it linearises hardly notices. One that iterates does: it weighs new sightings at the new
-    depth and the old ones as if they had been made from the old, and shortens or lengthens the world. So a landmark
-    has here an anchor, the camera that saw it first, and its error is one of (x / z, y / z, 1 / z) in the anchor's axes
-    (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). The anchor is moved along
-    with the IMU, so the error is one of the landmark relative to the pose: the whole world's shifts and turns are
-    the same vectors whatever the estimate, as in the invariant belief that this one refines.
+    A landmark's depth is not Gaussian, while the stereo sighting that started it is linear in inverse depth. For an
+    update of one step this hardly matters. An iterated update would weight new sightings at the new depth, but the
+    prior, which stands for the old sightings, as if they had been made from the old depth; it would shrink or stretch
+    the world. So a landmark has an anchor here, the camera that first saw it, and its error is one of (x / z, y / z, 1
+    / z) in the anchor's axes (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). The
+    anchor moves with the IMU, so the error is that of the landmark relative to the pose. Translations and rotations of
+    the whole world are therefore the same vectors at every estimate, as in the invariant belief.
     """
 
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
 
-        Pose and anchors move as one, so a sighting depends on a move through the landmark's relative error alone.
+        Pose and anchors move together, so a sighting depends on a move only through the landmark's relative error.
         """
         after, turn = self.displaced(delta), self._core.T_world_imu[:3, :3]
         to_relative = H_point @ after.anchors[:, :3, :3] @ self._stretch(after)
@@ -135,7 +136,7 @@ class AnchoredBelief(LandmarkAnchors, InvariantBelief):
         return np.asarray(np.swapaxes(self.anchors[:, :3, :3], 1, 2) @ in_world)
 
     def _stretch(self, after: "AnchoredBelief") -> Array:
-        """Return what takes relative errors here to those after a move (L, 3, 3), the error in inverse depth kept."""
+        """Return the matrices (L, 3, 3) from relative errors to those after a move, for equal inverse-depth error."""
         before, now = inverse_depth_jacobian(self._anchored()), inverse_depth_jacobian(after._anchored())
         return np.asarray(np.linalg.solve(now, before))
 

@@ -1,13 +1,13 @@
-"""A joint belief in the world's errors whose landmarks move along their inverse depth from where they were first seen.
+"""A joint belief in the world's errors whose landmarks are moved in inverse depth from the camera that first saw them.
 
-The depth of a landmark is not Gaussian, its inverse nearly is: the stereo sighting that started it is linear in
-(x / z, y / z, 1 / z) of the camera that saw it first (Civera, Davison & Montiel 2008, "Inverse depth parametrization
-for monocular SLAM"). Moved in metres by a Gauss-Newton step, a far landmark ends where that step's slope of depth
-leads, and pulls the pose with it.
+The depth of a landmark is not Gaussian, but its inverse nearly is: the stereo sighting that started it is linear in (x
+/ z, y / z, 1 / z) of the camera that first saw it (Civera, Davison & Montiel 2008, "Inverse depth parametrization for
+monocular SLAM"). A Gauss-Newton step in metres extrapolates a far landmark along the slope of depth at the
+linearisation point, overshoots, and pulls the pose along.
 
-That camera stays where it was first estimated, a constant, so that the triple is a function of the landmark alone. With
-Jacobians at first estimates the error in it is a constant matrix times that in metres: the covariance can be kept in
-metres, and what is unobservable stays so. Only the way an estimate takes is another.
+The anchor camera is fixed at its first estimate, so that the triple is a function of the landmark alone. With Jacobians
+at first estimates, the error in the triple is a constant matrix times the error in metres. The covariance can therefore
+be kept in metres, and unobservable directions stay unobservable. Only the path of the estimate differs.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ class LandmarkAnchors(JointBelief):
 
 
 class InverseDepthBelief(LandmarkAnchors):
-    """A belief whose landmarks move along their inverse depth from anchors that stay where they are."""
+    """A belief whose landmarks are moved in inverse depth from anchors that stay fixed."""
 
     def _displace(self, delta: Array) -> None:
         to_anchor = se3_inverse(self.anchors)

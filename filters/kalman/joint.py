@@ -1,7 +1,7 @@
-"""The joint belief of the windowed filters: the IMU now, clones of past poses, landmarks, and all their covariance.
+"""The joint belief of the windowed filters: the present IMU state, clones of past poses, landmarks, their covariance.
 
-Only this class touches the covariance. Every quantity that measurements linearise about is kept twice: as it
-is estimated now, and as it was first estimated; which of the two a Jacobian uses is the filter's choice.
+Only this class touches the covariance. Every quantity that measurements are linearised about is kept twice: its present
+estimate and its first estimate; the filter chooses which of the two a Jacobian uses.
 """
 
 from collections.abc import Callable
@@ -18,20 +18,20 @@ from scipy.sparse import csr_array
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import POSE, Belief, Prediction
 
-# Of each variance at least this share is taken to be independent of all other errors: less is lost in rounding, and
-# without it the covariance of two clones of one pose, equal to sixteen digits, has no root.
+# At least this share of each variance is assumed independent of all other errors. A smaller share is lost in rounding,
+# and without it the covariance of two clones of one pose, equal to sixteen digits, has no Cholesky root.
 _LEAST_INDEPENDENT = 1e-12
 
 
 class Jacobian(Protocol):
-    """A matrix (m, k) that is multiplied from the left: an array, a sparse one, or a triangle."""
+    """A matrix (m, k) that is multiplied from the left: dense, sparse, or triangular."""
 
     def __matmul__(self, right: Any, /) -> Any:
         """Return the product with an array (k, n)."""
 
 
 class JointBelief:
-    """Error state in the order: the IMU's d, six a clone (oldest first), three a landmark (in world axes)."""
+    """Error state in this order: the IMU's d, six per clone (oldest first), three per landmark (in world axes)."""
 
     def __init__(self, core: Belief) -> None:
         self._core = core
@@ -43,14 +43,14 @@ class JointBelief:
         self.points: Array = np.empty((0, 3))
         self.first_points: Array = np.empty((0, 3))
         self._cov = _symmetric(core.cov)
-        # Makes motions (N, 4, 4) of twists (N, 6).
+        # Maps twists (N, 6) to motions (N, 4, 4).
         self.exponentials: Callable[[Array], Array] = se3_exp
 
     @property
     def core(self) -> Belief:
-        """Return the belief of the IMU now, everything else marginalised."""
+        """Return the belief of the present IMU state, everything else marginalised."""
         core, d = self._core, self._core.layout.size
-        # A copy: whoever keeps a part of it would keep the whole.
+        # Copied: a view would keep the whole covariance alive.
         return Belief(core.layout, core.T_world_imu, core.v_world, core.bias, self._cov[:d, :d].copy())
 
     @property
@@ -60,17 +60,17 @@ class JointBelief:
 
     @property
     def clone_columns(self) -> slice:
-        """Return where the clones stand in the error state."""
+        """Return the columns of the clones in the error state."""
         d = self._core.layout.size
         return slice(d, d + 6 * len(self.clones))
 
     @property
     def landmark_columns(self) -> slice:
-        """Return where the landmarks stand in the error state."""
+        """Return the columns of the landmarks in the error state."""
         return slice(self.clone_columns.stop, self._cov.shape[0])
 
     def propagate(self, prediction: Prediction, transition: Array) -> None:
-        """Carry the IMU over an interval by its transition (d, d); the end is the first estimate of the new instant."""
+        """Propagate the IMU state by its transition (d, d); the prediction is the first estimate of the new instant."""
         d = self._core.layout.size
         self._core = replace(self._core, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world)
         self.first_core = self._core
@@ -80,7 +80,7 @@ class JointBelief:
         self._cov = cov
 
     def clone(self, frame: int) -> None:
-        """Add a clone of the pose now, with all its correlations (stochastic cloning)."""
+        """Add a clone of the present pose with all its correlations (stochastic cloning)."""
         end = self.clone_columns.stop
         self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, self._cov.shape[0])])
         self.clone_frames = np.append(self.clone_frames, frame)
@@ -104,7 +104,7 @@ class JointBelief:
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
     def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
-        """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's, plus noise.
+        """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's error, plus noise.
 
         ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
         """
@@ -114,7 +114,7 @@ class JointBelief:
         self.first_points = np.concatenate([self.first_points, points])
 
     def _add_rows(self, jacobian: Array | csr_array, cov: Array) -> None:
-        """Add to the end of the error state what is ``jacobian`` (m, n) times the state's error, plus noise."""
+        """Append to the error state entries whose error is ``jacobian`` (m, n) times the state's error, plus noise."""
         cross = np.asarray(jacobian @ self._cov)
         before, size = self._cov, len(self._cov) + len(cov)
         self._cov = np.empty((size, size))
@@ -123,18 +123,18 @@ class JointBelief:
         self._cov[len(before) :, len(before) :] = _symmetric(jacobian @ cross.T + cov)
 
     def update(self, H: Jacobian, residual: Array, columns: slice) -> None:
-        """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
+        """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to ``columns`` of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
     def inform(self, information: Array, vector: Array) -> None:
-        """Correct everything by the information matrix (k, k) and vector (k,) on the last k errors of the state.
+        """Correct the whole state by an information matrix (k, k) and vector (k,) of the last k errors of the state.
 
-        It is :meth:`update` by rows H and residuals r with ``H^T H`` and ``H^T r``, whatever their number. With the
-        root R of the covariance of the last, ``Y = R^-1 P`` of all and ``M = 1 + R^T H^T H R`` the correction is
-        ``Y^T M^-1 R^T H^T r`` and the covariance left ``P - Y^T Y + Y^T M^-1 Y``;
-        the Y of the last themselves is ``R^T``.
+        It equals :meth:`update` by rows H and residuals r with information ``H^T H`` and ``H^T r``, whatever their
+        number. Let P be the covariance, P_k its rows of the last k errors, R the root of their covariance,
+        ``Y = R^-1 P_k`` and ``M = 1 + R^T H^T H R``. Then the correction is ``Y^T M^-1 R^T H^T r`` and the new
+        covariance ``P - Y^T Y + Y^T M^-1 Y``. The columns of Y for the last k errors are ``R^T``.
         """
         first = self._cov.shape[0] - len(vector)
         root = regular_root(self._cov[first:, first:])
@@ -149,11 +149,11 @@ class JointBelief:
         self.move(half_gain.T @ divided_by_root(matrix_root, (root.T @ vector)[:, None])[:, 0])
 
     def reduce_covariance(self, H: Jacobian, columns: slice) -> None:
-        """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
+        """Reduce the covariance by whitened measurements with Jacobian (m, k); the estimates stay."""
         self._reduce(self._half_gain(H, columns)[1])
 
     def _reduce(self, half_gain: Array) -> None:
-        # Of a matrix and its own transpose NumPy makes an exactly symmetric product.
+        # NumPy's product of a matrix with its own transpose is exactly symmetric.
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
 
@@ -170,7 +170,7 @@ class JointBelief:
         self._displace(delta)
 
     def displaced(self, delta: Array) -> Self:
-        """Return the estimates as :meth:`move` by an error (n,) would leave them, with the covariance before it."""
+        """Return the estimates as after :meth:`move` by an error (n,), with the covariance from before it."""
         result = copy(self)
         result._displace(delta)
         return result
@@ -185,18 +185,18 @@ class JointBelief:
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
 
-        They are those of L measurements, each of the newest clone (L, 3, 6) and of a landmark (L, 3, 3).
+        They belong to L measurements, each of the newest clone (L, 3, 6) and of a landmark (L, 3, 3).
         """
         newest = delta[self.clone_columns][-6:]
         return H_pose @ se3_right_jacobian(newest), H_point
 
 
 def cholesky_root(cov: Array) -> Array:
-    """Return the lower triangular C with ``C C^T`` a covariance (n, n), which may be overwritten.
+    """Return the lower triangular C with ``C C^T`` equal to a covariance (n, n), which may be overwritten.
 
     Raises LinAlgError where it has none.
     """
-    # LAPACK takes columns where NumPy has rows: the transposed upper root is the lower one, and nothing is copied.
+    # LAPACK is column-major and NumPy row-major: the transposed upper root is the lower one, and nothing is copied.
     root, failed = dpotrf(cov.T, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("Matrix is not positive definite")
@@ -204,9 +204,9 @@ def cholesky_root(cov: Array) -> Array:
 
 
 def regular_root(cov: Array) -> Array:
-    """Return the lower triangular root of a covariance (n, n) that may be singular but for rounding.
+    """Return the lower triangular root of a covariance (n, n) that may be singular up to rounding.
 
-    Each variance is taken for larger by a rounding. Raises LinAlgError where it has no root even so.
+    Each variance is increased by a relative rounding error. Raises LinAlgError where it has no root even then.
     """
     cov = cov.copy()
     cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
@@ -215,7 +215,7 @@ def regular_root(cov: Array) -> Array:
 
 def divided_by_root(root: Array, right: Array) -> Array:
     """Return ``C^-1 B`` of a lower triangular root C (n, n) and right sides B (n, m), which may be overwritten."""
-    # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
+    # BLAS is column-major and NumPy row-major: for the transposed problem nothing is copied.
     result: Array = dtrsm(1.0, root.T, right.T, side=1, overwrite_b=1).T
     return result
 
@@ -233,7 +233,7 @@ def transposed_root_times(root: Array, right: Array) -> Array:
 
 
 def without_products(matrix: Array, rows: Array) -> Array:
-    """Return the symmetric ``A - E^T E`` in its lower half, of A (n, n), which may be overwritten, and E (m, n)."""
+    """Return the lower half of the symmetric ``A - E^T E``, with A (n, n), which may be overwritten, and E (m, n)."""
     result: Array = dsyrk(-1.0, rows.T, 1.0, matrix.T, overwrite_c=1).T if len(rows) else matrix
     return result
 
@@ -244,7 +244,7 @@ def _symmetric(cov: Array) -> Array:
 
 
 def _stretches(kept: BoolArray) -> list[slice]:
-    """Return the stretches of a mask (n,) that are True."""
+    """Return the contiguous ranges in which a mask (n,) is True."""
     padded = np.zeros(kept.size + 2, dtype=bool)
     padded[1:-1] = kept
     edges = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
@@ -252,7 +252,7 @@ def _stretches(kept: BoolArray) -> list[slice]:
 
 
 def _of_slices(cov: Array, stretches: list[slice]) -> Array:
-    """Return the rows and columns of a matrix in some stretches, in their order; of few it is faster than an index."""
+    """Return a matrix' rows and columns in some ranges, in their order; for few ranges faster than an index array."""
     ends = list(accumulate(stretch.stop - stretch.start for stretch in stretches))
     result, begin = np.empty((ends[-1], ends[-1])), 0
     for stretch, end in zip(stretches, ends, strict=True):

@@ -1,7 +1,7 @@
 """EKF-SLAM: the pose and every landmark in view in one Gaussian, all cross-covariances kept.
 
-What it approximates: past poses and landmarks out of view are marginalised at once, so the cost is bounded by
-what is in view, and nothing is ever relinearised (Smith, Self & Cheeseman 1990; Bailey et al. 2006).
+What it approximates: past poses and landmarks out of view are marginalised at once, so the cost is bounded by the
+number of landmarks in view, and nothing is ever relinearised (Smith, Self & Cheeseman 1990; Bailey et al. 2006).
 """
 
 from collections.abc import Callable
@@ -27,19 +27,19 @@ from toolkit.sequence import Packet, StereoFrame, StereoRig
 
 
 class Correct(Protocol):
-    """Corrects a joint belief by the landmarks of its state, every one of which the frame must show."""
+    """Corrects a joint belief by the landmarks of its state; the frame must show every one of them."""
 
     def __call__(
         self, joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate, /
     ) -> None:
-        """Correct; the gate counts what was tested."""
+        """Correct the belief; the gate counts the tests."""
 
 
 class JointEkf:
-    """Propagate, forget the landmarks lost or outdated, correct pose and landmarks together, start those new.
+    """Propagate, drop lost or outdated landmarks, correct pose and landmarks together, start new landmarks.
 
-    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is found, and
-    ``correlation`` what landmarks count for, in full if there is none.
+    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is computed. If
+    there is a ``correlation``, it decides the weight of landmarks; without one they have their full weight.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class JointEkf:
 
     @property
     def joint(self) -> JointBelief:
-        """Return the joint belief now."""
+        """Return the present joint belief."""
         return self._joint
 
     def step(self, packet: Packet) -> Estimate:
@@ -80,16 +80,16 @@ class JointEkf:
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark there ever was, as last known."""
+        """Return the last estimate of every landmark of the run."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the run."""
+        """Return the log lines for the user."""
         return self._noise.messages + self._correlation.messages
 
     def _start_new(self, frame: StereoFrame) -> None:
-        """Start the tracks the state does not have from this one view of them."""
+        """Start landmarks for the frame's tracks that are not in the state, from this single view."""
         joint = self._joint
         new = ~is_among(frame.track_ids, joint.landmark_ids)
         sightings = TrackSightings(

@@ -1,6 +1,6 @@
 """Landmarks in a joint belief: how tracks become part of the state and how they correct it afterwards.
 
-Both go through the newest clone of the pose, whose estimate and covariance are those of the pose now.
+Both use the newest clone, whose estimate and covariance are those of the present pose.
 """
 
 from typing import NamedTuple
@@ -22,9 +22,10 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 
 class LandmarkSightings(NamedTuple):
-    """Whitened residuals (L, 3) of the state's landmarks, Jacobians to pose (L, 3, 6) and landmark (L, 3, 3), depth.
+    """Whitened residuals (L, 3) of the state's landmarks, their Jacobians and the landmarks' depths (L,) m.
 
-    ``dof`` are the degrees of freedom (L,) of the residuals, or of each.
+    ``H_pose`` (L, 3, 6) is to the newest clone, ``H_point`` (L, 3, 3) to the landmark. ``dof`` are the degrees of
+    freedom of the residuals: (L,), or one number for all.
     """
 
     residuals: Array
@@ -37,8 +38,8 @@ class LandmarkSightings(NamedTuple):
 class StackedSightings(NamedTuple):
     """Whitened residuals (L, 3) of the state's landmarks, and their Jacobians to the k errors of clones and landmarks.
 
-    A sighting depends on nine of them: ``blocks`` (L, 3, 9) are its Jacobians, to the newest clone and to its landmark,
-    and ``own`` (L, 9) where these errors stand among all k.
+    A sighting depends on nine of these errors: ``blocks`` (L, 3, 9) are its Jacobians to the newest clone and to its
+    landmark, and ``own`` (L, 9) are the indices of these errors among all k.
     """
 
     residuals: Array
@@ -47,7 +48,7 @@ class StackedSightings(NamedTuple):
     k: int
 
     def weighed(self, weights: Array) -> tuple[csr_array, Array]:
-        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks (L,) that count, under each other."""
+        """Return the stacked Jacobian (m, k) and residuals (m,) of the landmarks whose weight (L,) is not zero."""
         rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])
         values = roots[:, None, None] * self.blocks[rows]
         places = np.repeat(self.own[rows], 3, axis=0)
@@ -56,13 +57,13 @@ class StackedSightings(NamedTuple):
 
 
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
-    """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
+    """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last estimates."""
     if len(joint.landmark_ids):
         forget(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
 
 
 def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
-    """Marginalise landmarks (L,) of the state; the memory keeps their last value."""
+    """Marginalise landmarks (L,) of the state; the memory keeps their last estimates."""
     if which.any():
         memory.remember(joint.landmark_ids[which], joint.points[which])
         joint.forget_landmarks(which)
@@ -76,7 +77,7 @@ def correct(
     gate: FrameGate,
     images: Images = NUMPY,
 ) -> None:
-    """Correct everything by the landmarks of the state, every one of which the frame must show."""
+    """Correct the whole state by its landmarks; the frame must show every one of them."""
     if not len(joint.landmark_ids):
         return
     seen = linearise_sightings(joint, frame, at, rig, images)
@@ -89,7 +90,7 @@ def correct(
 def linearise_sightings(
     joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, images: Images = NUMPY
 ) -> LandmarkSightings:
-    """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
+    """Linearise the frame's sightings of all landmarks of the state; the frame must show every one of them."""
     order = np.argsort(frame.track_ids)
     uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
     predicted_px, depth_m = images.plain(joint.points, joint.clones[-1:], rig)
@@ -101,7 +102,7 @@ def linearise_sightings(
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:
-    """Put Jacobians to the newest clone and to each landmark among the columns of all clones and landmarks."""
+    """Expand the Jacobians to the newest clone and each landmark to the columns of all clones and landmarks."""
     clones, count = 6 * len(joint.clones), len(seen.H_pose)
     own = np.empty((count, 9), dtype=np.int64)
     own[:, :6] = np.arange(clones - 6, clones)
@@ -116,9 +117,9 @@ def columns(joint: JointBelief) -> slice:
 
 
 def weighed(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> Array:
-    """Return what landmarks (L,) count for: 0 unless in front of the camera with residuals that pass the gate.
+    """Return the weights of landmarks (L,): 0 unless in front of the camera with residuals that pass the gate.
 
-    A point behind the camera has an image by the formula, which may be the measured one, but no camera sees it.
+    The projection formula gives a point behind the camera an image too, which may even match the measured one.
     """
     H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
     predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
@@ -135,10 +136,10 @@ def _pose_and_landmark_cov(joint: JointBelief) -> Array:
 
 
 def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
-    """Put N tracks seen from the clones into the state at points (N, 3) m, correlated as their sightings have it.
+    """Add N tracks seen from the clones to the state at points (N, 3) m, with the correlations of their sightings.
 
-    A landmark's error is that which its measurements' errors and the poses' errors give its best point:
-    ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``.
+    A landmark's error follows from the errors of its measurements and of the poses: it is
+    ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``, the error of its least-squares point.
     """
     count, window = linearised.residuals.shape[:2]
     H_point = linearised.H_point.reshape(count, 3 * window, 3)

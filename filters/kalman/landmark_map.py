@@ -1,4 +1,4 @@
-"""The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that left."""
+"""The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that were lost."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ class LandmarkMap:
         return self.track_ids.size
 
     def match(self, track_ids: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the rows of the map and of the ids (N,) that belong together."""
+        """Return the rows of the map and of the ids (N,) that match."""
         if not len(self) or not track_ids.size:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         slots = np.minimum(np.searchsorted(self.track_ids, track_ids), len(self) - 1)
@@ -39,18 +39,18 @@ class LandmarkMap:
         return slots[rows], rows
 
     def select(self, slots: IntArray | BoolArray) -> "LandmarkMap":
-        """Return the landmarks at some rows (m,), or of a mask (M,), which must keep the ids ascending."""
+        """Return the landmarks of some rows (m,), or of a mask (M,); the ids must stay ascending."""
         return LandmarkMap(self.track_ids[slots], self.points[slots], self.covs[slots])
 
     def merged(self, other: "LandmarkMap") -> "LandmarkMap":
-        """Return both maps in one; they must not share an id."""
+        """Return the union of both maps, which must not share an id."""
         ids = np.concatenate([self.track_ids, other.track_ids])
         order = np.argsort(ids)
         points, covs = np.concatenate([self.points, other.points]), np.concatenate([self.covs, other.covs])
         return LandmarkMap(ids[order], points[order], covs[order])
 
     def corrected(self, rows: BoolArray, points: Array, covs: Array) -> "LandmarkMap":
-        """Return the map with new values (M, 3), (M, 3, 3) where the mask (M,) allows it."""
+        """Return the map with new values (M, 3), (M, 3, 3) where the mask (M,) is True."""
         return replace(
             self,
             points=np.where(rows[:, None], points, self.points),
@@ -58,14 +58,14 @@ class LandmarkMap:
         )
 
 
-# Says where stereo sees landmarks, as :func:`started` does.
+# Triangulates landmarks from stereo, as :func:`started` does.
 Start = Callable[[Array, Array, StereoRig], tuple[Array, Array]]
 
 
 def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return where stereo sees N landmarks from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
+    """Return N landmarks triangulated from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
 
-    The covariance is that of the measurements (N, 3) px, carried through the triangulation.
+    The covariance is that of the measurements (N, 3) px, propagated through the triangulation.
     """
     points_cam = stereo.triangulate(uvs_px, rig)
     T_world_cam = T_world_imu @ rig.T_imu_cam
@@ -79,7 +79,7 @@ def first_sighting(
 ) -> LandmarkMap:
     """Start the landmarks of rows (m,) of a frame from its pose (4, 4).
 
-    Those of too little disparity are left for a later frame.
+    Tracks whose disparity is too small are left for a later frame.
     """
     uvs_px = frame.uvs_px[rows]
     near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
@@ -87,7 +87,7 @@ def first_sighting(
 
 
 class TrackedMap:
-    """The landmarks in view, kept frame by frame: lost ones leave the state for an archive, new ones start."""
+    """The landmarks in view, updated frame by frame: lost ones move from the state to an archive, new ones start."""
 
     def __init__(self, rig: StereoRig, start: Start = started) -> None:
         self._rig, self._start = rig, start
@@ -95,7 +95,7 @@ class TrackedMap:
         self._left: list[LandmarkMap] = []
 
     def seen_again(self, frame: StereoFrame) -> tuple[LandmarkMap, Array]:
-        """Return the landmarks the frame shows again and their measurements (N, 3) px; forget the others."""
+        """Return the landmarks that the frame sees again and their measurements (N, 3) px; archive the others."""
         slots, rows = self._in_view.match(frame.track_ids)
         lost = np.ones(len(self._in_view), dtype=bool)
         lost[slots] = False
@@ -103,12 +103,12 @@ class TrackedMap:
         return self._in_view.select(slots), frame.uvs_px[rows]
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Keep the landmarks seen again, with their new values; start the frame's other tracks from its pose (4, 4)."""
+        """Keep the updated landmarks seen again; start the frame's other tracks from its pose (4, 4)."""
         new = np.flatnonzero(~is_among(frame.track_ids, seen.track_ids))
         self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig, self._start))
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark there ever was, as last known."""
+        """Return the last estimate of every landmark of the run."""
         parts = [*self._left, self._in_view]
         ids = np.concatenate([p.track_ids for p in parts])
         points, covs = np.concatenate([p.points for p in parts]), np.concatenate([p.covs for p in parts])

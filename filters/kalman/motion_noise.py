@@ -1,14 +1,15 @@
-"""How many times its stated noise the measured motion has, by what the tracks have to correct from frame to frame.
+"""By what factor the variance of an IMU's noise exceeds the stated one, estimated from the corrections by the tracks.
 
-The correction of the state now has the covariance it takes away. A gate cannot test this: what stamps that are some
-milliseconds off, an optimistic data sheet or a scale error of the camera do to all tracks of a frame, each track has so
-little of that it passes, and the NIS of all rows stays near one while the state jumps by many of its sigmas. Biases and
-tilt take most of it, which nothing else measures: gravity is then turned for good.
+The correction of the present state should have the covariance by which the update reduces the state's covariance. The
+gate cannot test this. Stamps that are some milliseconds off, an optimistic data sheet or a scale error of the camera
+affect all tracks of a frame, each by so little that it passes the gate, and the NIS stays near one per degree of
+freedom while the state jumps by many of its sigmas. Biases and tilt, which are otherwise unobserved, absorb most of the
+correction, and the error in the direction of gravity then persists.
 
 So the variance of the motion's noise is matched to the corrections ("covariance matching": Mehra 1972, "Approaches to
-adaptive filtering"; for process noise Mohamed & Schwarz 1999, "Adaptive Kalman filtering for INS/GPS"), never below
-what is stated. It begins where the corrections of a window add up to what chance does once in a million: a sound filter
-stays, to the bit, what it is without.
+adaptive filtering"; for process noise Mohamed & Schwarz 1999, "Adaptive Kalman filtering for INS/GPS"), and is never
+below the stated one. Matching begins where the corrections of a window add up to a value that has a probability of one
+in a million under the stated noise: a consistent filter gives bit-identical answers with and without it.
 """
 
 from collections.abc import Callable
@@ -25,20 +26,21 @@ from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
-# The corrections of a sound filter's window are beyond this quantile once in a million.
+# Probability that the corrections in a window of a consistent filter are beyond the bound.
 BY_CHANCE = 1e-6
-# Of the variance: an IMU that errs a hundred times as much as it states has another fault, of which the status tells.
+# Largest factor on the variance: an IMU whose errors are a hundred times the stated ones has another fault, which the
+# run's status reports.
 _MOST = 1e4
-# Less rounds to 1.0 times the stated noise and is not logged.
+# A smaller factor rounds to 1.0 times the stated noise and is not logged.
 _LEAST_REPORTED = 1.05
 
 
-# Tests what measurements made of a belief.
+# Tests the correction of a belief by measurements.
 Test = Callable[[Belief, Belief], CorrectionTest]
 
 
 class MatchedNoise:
-    """Matches the variance of an IMU's white noise to the corrections of so many latest seconds as a window has."""
+    """Matches the variance of an IMU's white noise to the corrections of the latest ``window_s`` seconds."""
 
     def __init__(self, window_s: float, matches: bool = True, test: Test = correction_test) -> None:
         self._window_ns, self._matches, self._test = round(window_s * NS_PER_S), matches, test
@@ -47,23 +49,23 @@ class MatchedNoise:
 
     @classmethod
     def of(cls, setup: Setup, test: Test = correction_test) -> Self:
-        """Return the matched noise of an estimator; twists, whose noise is measured from their own scatter, keep it."""
+        """Return the matched noise of an estimator. That of twists stays: it is estimated from their own scatter."""
         kind, settings = setup.motion_kind, setup.settings
         return cls(settings.window.seconds(kind), settings.noise.match_imu and kind == "imu", test)
 
     @property
     def scale(self) -> float:
-        """Return how many times the stated variance that of the motion is taken for."""
+        """Return the present factor on the stated variance of the motion."""
         return self._scales[-1]
 
     @property
     def info(self) -> dict[str, float]:
-        """Return the scale of the latest packet's motion, by the name an Estimate's info has."""
+        """Return the factor applied to the latest packet's motion, under its key in an Estimate's info."""
         return {"motion_noise_scale": self._applied}
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Return a line for the log where the stated noise did not hold, else nothing."""
+        """Return a log line if the noise was scaled up, else nothing."""
         most, usual = np.sqrt([max(self._scales), np.median(self._scales)])
         if most < _LEAST_REPORTED:
             return ()
@@ -73,21 +75,22 @@ class MatchedNoise:
         )
 
     def applied(self, packet: Packet) -> Packet:
-        """Return a packet whose motion has the noise that it is taken for now."""
+        """Return a packet whose motion has the matched noise."""
         self._applied = self.scale
         if self.scale == 1.0 or packet.motion is None:
             return packet
         return replace(packet, motion=with_noise_scaled(packet.motion, self.scale))
 
     def learn(self, t_ns: int, predicted: Belief, corrected: Belief) -> None:
-        """Take in what a frame's tracks made of the state that was predicted for it."""
+        """Add the test of a frame's correction, from the predicted to the corrected belief."""
         if self._matches:
             self.take(t_ns, self._test(predicted, corrected))
 
     def take(self, t_ns: int, test: CorrectionTest) -> None:
-        """Take in the test of one more frame.
+        """Add the test of one more frame.
 
-        The scale follows the ratio of NIS to degrees of freedom as an exponential mean over a window's frames does.
+        Once it differs from 1, each frame multiplies the scale by ``1 + w (NIS / dof - 1)``, w being the weight of the
+        latest value in an exponential mean over a window's frames; it stays between 1 and its largest value.
         """
         self._tests = [(t, each) for t, each in self._tests if t >= t_ns - self._window_ns] + [(t_ns, test)]
         scale = self.scale

@@ -1,8 +1,8 @@
-"""Landmarks seen from several poses of a window: their measurements linearised, and freed of the landmark.
+"""Landmarks seen from several poses of a window: their measurements are linearised and the landmark is eliminated.
 
-Everything works on F tracks at once, padded to W poses: ``uvs_px`` (F, W, 3) with a mask ``seen`` (F, W).
-Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial
-navigation", eqs. 17-26; the stereo measurement replaces their monocular one.
+Everything works on F tracks at once, padded to W poses: ``uvs_px`` (F, W, 3) with a mask ``seen`` (F, W). Source:
+Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation", eqs. 17-26;
+the stereo measurement replaces their monocular one.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ REFINEMENTS = 3
 class TrackSightings(NamedTuple):
     """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W).
 
-    ``ages`` (F, W) are those of the sightings in frames, since the first one of the track in the recording.
+    ``ages`` (F, W) is the age of each sighting in frames, since the first sighting of the track in the recording.
     """
 
     track_ids: IntArray
@@ -37,25 +37,25 @@ class TrackSightings(NamedTuple):
 
     @property
     def degrees_of_freedom(self) -> IntArray:
-        """Return how many coordinates of each track (F,) are left when its landmark is eliminated."""
+        """Return how many coordinates of each track (F,) remain once its landmark is eliminated."""
         return np.asarray(3 * self.seen.sum(axis=1) - self.left_only.sum(axis=1) - 3)
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
-        """Return the tracks of a mask (F,) or of some rows; all of them unchanged where a mask has all."""
+        """Return the tracks of a mask (F,) or of some rows; the object itself if the mask is all True."""
         if rows.dtype == np.bool_:
-            rows = rows.nonzero()[0]  # places are found once for all four arrays; a mask has them found for each
+            rows = rows.nonzero()[0]  # once for all four arrays; indexing by a mask would repeat it for each
             if rows.size == self.track_ids.size:
                 return self
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
     def since(self, begin: int) -> "TrackSightings":
-        """Return the sightings without those from the poses before one."""
+        """Return the sightings from pose ``begin`` on."""
         if not begin:
             return self
         return TrackSightings(self.track_ids, self.uvs_px[:, begin:], self.seen[:, begin:], self.ages[:, begin:])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":
-        """Return the tracks of both in one."""
+        """Return the tracks of both, concatenated."""
         track_ids, uvs_px = (
             np.concatenate([self.track_ids, other.track_ids]),
             np.concatenate([self.uvs_px, other.uvs_px]),
@@ -65,9 +65,9 @@ class TrackSightings(NamedTuple):
 
 
 class Images(NamedTuple):
-    """What predicts the images of points (F, 3) from poses (W, 4, 4): ``plain`` (F, W, 3) px and depths (F, W) m.
+    """Functions that predict the images of points (F, 3) from poses (W, 4, 4).
 
-    ``linearised`` has the Jacobians as well, (F, W, 3, .).
+    ``plain`` returns images (F, W, 3) px and depths (F, W) m; ``linearised`` the Jacobians as well, (F, W, 3, .).
     """
 
     plain: Callable[[Array, Array, StereoRig], tuple[Array, Array]]
@@ -77,7 +77,7 @@ class Images(NamedTuple):
 class Linearised(NamedTuple):
     """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3).
 
-    ``decorrelation`` (F, 3W, 3W) makes the rows of a track independent of each other; None where they are.
+    ``decorrelation`` (F, 3W, 3W) makes the rows of a track independent of each other; None where they already are.
     """
 
     residuals: Array
@@ -87,7 +87,7 @@ class Linearised(NamedTuple):
     decorrelation: Array | None = None
 
     def select(self, rows: BoolArray | IntArray) -> "Linearised":
-        """Return what belongs to the tracks of a mask (F,) or of some rows."""
+        """Return the rows of the tracks of a mask (F,) or of some indices."""
         mixing = None if self.decorrelation is None else self.decorrelation[rows]
         residuals, H_pose, H_point, depth_m = (array[rows] for array in self._arrays())
         return Linearised(residuals, H_pose, H_point, depth_m, mixing)
@@ -100,7 +100,7 @@ class Linearised(NamedTuple):
         )
 
     def joined(self, other: "Linearised") -> "Linearised":
-        """Return the tracks of both in one."""
+        """Return the tracks of both, concatenated."""
         pairs = zip(self._arrays(), other._arrays(), strict=True)
         residuals, H_pose, H_point, depth_m = (np.concatenate(pair) for pair in pairs)
         mixings = [mixing for mixing in (self.decorrelation, other.decorrelation) if mixing is not None]
@@ -128,8 +128,8 @@ def linearise(
 ) -> Linearised:
     """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
 
-    Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
-    What was not seen is zero throughout, and so is uR where the right image is missing.
+    Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same poses, or their first estimates.
+    Rows of unseen places are zero throughout, and so is the row of uR where the right image is missing.
     """
     whitener, seen = left_only.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
     there = images.linearised(points, poses_at, rig)
@@ -144,7 +144,7 @@ def linearise(
 
 
 def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
-    """Return tracks together with what makes their rows independent, where the rig's noise is correlated."""
+    """Return linearised tracks with the matrix that makes their rows independent under the rig's track noise model."""
     if rig.track_noise is None:
         return linearised
     mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen, sightings.left_only)
@@ -152,9 +152,9 @@ def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoR
 
 
 def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
-    """Return the points (F, 3) that fit sightings of correlated noise best, from those of white noise.
+    """Return the points (F, 3) that best fit sightings of correlated noise, starting from the best fit for white noise.
 
-    Gauss-Newton, each step no longer than a fifth of the way to the newest pose that saw the point.
+    Gauss-Newton, each step no longer than a fifth of the distance to the newest pose that saw the point.
     """
     count, window = sightings.seen.shape
     for _ in range(REFINEMENTS):
@@ -170,14 +170,14 @@ def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoR
 
 
 class Constraints(NamedTuple):
-    """What F tracks constrain the W poses by: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
+    """Constraints of F tracks on the W poses: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
 
     residuals: Array
     H: Array
     dof: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "Constraints":
-        """Return what belongs to the tracks of a mask (F,) or of some rows."""
+        """Return the constraints of the tracks of a mask (F,) or of some indices."""
         return Constraints(self.residuals[rows], self.H[rows], self.dof[rows])
 
     def scaled(self, factors: Array) -> "Constraints":
@@ -185,7 +185,7 @@ class Constraints(NamedTuple):
         return Constraints(factors[:, None] * self.residuals, factors[:, None, None] * self.H, self.dof)
 
     def joined(self, other: "Constraints") -> "Constraints":
-        """Return the constraints of both in one."""
+        """Return the constraints of both, concatenated."""
         residuals, H = np.concatenate([self.residuals, other.residuals]), np.concatenate([self.H, other.H])
         return Constraints(residuals, H, np.concatenate([self.dof, other.dof]))
 
@@ -215,10 +215,10 @@ def by_pose(rows: Array) -> Array:
 
 
 def null_space(linearised: Linearised) -> Array:
-    """Return rows (F, 3W - 3, 3W) that span what the landmark's Jacobian does not reach.
+    """Return rows (F, 3W - 3, 3W) whose span is the left null space of the landmark's Jacobian.
 
-    What they make of a track's residuals is independent and of unit variance. With rows that are not, decorrelated by
-    M, they are N^T M, the rows of N^T spanning what ``M H_point`` does not reach.
+    Multiplied by them, a track's residuals are independent and of unit variance. Where the rows are correlated and are
+    decorrelated by M, the result is N^T M, with the rows of N^T spanning the left null space of ``M H_point``.
     """
     mixing = linearised.decorrelation
     if mixing is None:
@@ -246,13 +246,13 @@ def _reflectors(linearised: Linearised) -> tuple[Array, Array]:
 
 
 class Triangle(NamedTuple):
-    """An upper triangular matrix (n, n): of its products BLAS leaves out the other half, which may hold anything."""
+    """An upper triangular matrix (n, n). BLAS does not read its lower half, which may hold any values."""
 
     matrix: Array
 
     def __matmul__(self, right: Array) -> Array:
         if right.flags.c_contiguous:
-            # BLAS takes columns where NumPy has rows: to it all is transposed, and the triangle a lower one.
+            # BLAS is column-major and NumPy row-major: BLAS sees everything transposed, the triangle as a lower one.
             result: Array = dtrmm(1.0, self.matrix.T, right.T, side=1, lower=1).T
         else:
             result = dtrmm(1.0, self.matrix.T, right, trans_a=1, lower=1)
@@ -264,8 +264,8 @@ def compressed(H: Array, residuals: Array) -> tuple[Array | Triangle, Array]:
     count, columns = H.shape
     if count <= columns:
         return H, residuals
-    # LAPACK takes columns where NumPy has rows: written that way it works in place. With room for a block of 32
-    # reflections it takes half of the time; it is np.linalg.qr, bit for bit.
+    # LAPACK is column-major: in that layout it works in place. With workspace for a block of 32 reflections it takes
+    # half of the time; the result equals np.linalg.qr bit for bit.
     system = np.empty((columns + 1, count))
     system[:-1], system[-1] = H.T, residuals
     packed = dgeqrf(system.T, lwork=32 * (columns + 1), overwrite_a=1)[0]

@@ -1,11 +1,11 @@
-"""How many sightings of one image err as one, by how alike the residuals of neighbouring tracks are.
+"""How many sightings of one image err together, estimated from the correlation of neighbouring tracks' residuals.
 
-What shifts one patch of an image shifts the patches beside it: patches that overlap, a surface that moves or shines,
-what a calibration leaves of the lens. Where each error is correlated with those of its neighbours by s in sum, the sum
-of n of them has 1 + s times the variance of n independent ones, and so many tell as much as one (Kish 1965, "Survey
-sampling", chapter 5: the design effect of clusters). What a wrong pose makes of an image is alike as well, and no error
-of tracks: so residuals are freed of the pose that explains them best, and with it of what all tracks of an image share,
-which every estimator takes for motion.
+A cause that shifts one patch of an image shifts the patches beside it as well: overlapping patches, a surface that
+moves or reflects, residual lens distortion. If the correlations of each error with those of its neighbours sum to s,
+the sum of n errors has 1 + s times the variance of n independent ones, so that 1 + s sightings carry the information of
+one (Kish 1965, "Survey sampling", chapter 5: the design effect of clusters). A wrong pose also makes the residuals of
+an image alike, but is no error of tracks. Residuals are therefore projected off the pose that explains them best; this
+also removes the error that all tracks of an image share, which every estimator attributes to motion.
 """
 
 import numpy as np
@@ -13,27 +13,28 @@ from scipy.spatial import KDTree
 
 from toolkit.geometry import Array, IntArray
 
-# Neighbours are counted up to these distances (px): about the width of a tracker's patch, and its doubles. Where to end
-# was chosen with three of the seven drives and MH_01 in view, beyond which nothing is alike.
+# Neighbours are counted up to these distances (px): about the width of a tracker's patch, doubled again and again. The
+# last one was chosen by looking at three of the seven drives and MH_01, where residuals farther apart are uncorrelated.
 _RADII_PX = np.array([20.0, 40.0, 80.0, 160.0])
-# Sightings whose pairs are looked at together, up to the end of a frame: all pairs of a run can take 200 MB.
+# Pairs are formed for this many sightings at a time, up to the end of a frame: all pairs of a run can take 200 MB.
 _AT_ONCE = 5000
-# A sum of correlations is beyond chance from so many standard errors on.
+# A sum of correlations counts as significant beyond this many standard errors.
 _STANDARD_ERRORS = 4.0
 
 
 class NeighbourCorrelation:
-    """Measures over a run how many sightings of one image err as one."""
+    """Measures over a run how many sightings of one image err together."""
 
     def __init__(self) -> None:
         self._products, self._pairs = np.zeros(len(_RADII_PX)), np.zeros(len(_RADII_PX))
         self._squares, self._numbers = 0.0, 0
 
     def erring_as_one(self, correlation: float = 0.0) -> float:
-        """Return how many sightings of an image tell as much as one: 1 where none is beyond what chance makes alike.
+        """Return how many sightings of an image carry the information of one: 1 if no correlation is significant.
 
-        ``correlation`` in [0, 1) is that of a residual with the next one of its track: so much the fewer of the pairs
-        tell something new. Of the distances up to which neighbours are counted the one counts that has the most.
+        ``correlation`` in [0, 1) is that of a residual with the next one of its track; the larger it is, the fewer
+        independent pairs there are. Of the distances up to which neighbours are counted, the one with the largest sum
+        is used.
         """
         if not self._numbers:
             return 1.0
@@ -43,7 +44,7 @@ class NeighbourCorrelation:
         return 1.0 + float(np.max(shared, where=shared > _STANDARD_ERRORS * chance, initial=0.0))
 
     def add(self, frames: IntArray, uvs_px: Array, whitened: Array) -> None:
-        """Take in the whitened residuals (N, 3) of sightings (N, 3) px in frames (N,), without outliers."""
+        """Add the whitened residuals (N, 3) of sightings (N, 3) px in frames (N,), outliers left out."""
         if not len(frames):
             return
         order = np.argsort(frames, kind="stable")
@@ -64,9 +65,9 @@ class NeighbourCorrelation:
 
 
 def freed_of_poses(frames: IntArray, whitened: Array, H_pose: Array) -> Array:
-    """Return what residuals (N, 3) in frames (N,) leave once each frame's pose has taken up what it can.
+    """Return residuals (N, 3) in frames (N,) after one Gauss-Newton step of each frame's pose.
 
-    That is a Gauss-Newton step of the poses, to which the whitened Jacobians are ``H_pose`` (N, 3, 6).
+    ``H_pose`` (N, 3, 6) are their whitened Jacobians to these poses.
     """
     count = int(frames.max(initial=-1)) + 1
     matrices, vectors = np.zeros((count, 6, 6)), np.zeros((count, 6))

@@ -1,4 +1,4 @@
-"""Makes an estimator of a filter, whose final answer is its online output: the estimates it gave frame by frame."""
+"""Makes an estimator of a filter; the final answer is its online output, the estimates given frame by frame."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -9,16 +9,16 @@ from toolkit.sequence import Packet
 
 
 class Filter(Protocol):
-    """Answers at every frame and remembers its landmarks; a class that derives from it may leave out the log."""
+    """Answers at every frame and remembers its landmarks; a derived class need not define ``log``."""
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark the filter ever had, as last known."""
+        """Return the last estimate of every landmark of the run."""
 
     def log(self) -> tuple[str, ...]:
-        """Return the lines that a user should read of the run."""
+        """Return the log lines for the user."""
         return ()
 
 
@@ -35,13 +35,13 @@ class OnlineOutput:
         return self._estimates[-1]
 
     def finish(self) -> Finished:
-        """Return the estimates of every frame and the landmarks as last known."""
+        """Return the estimates of every frame and the last estimates of the landmarks."""
         return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._filter.log())
 
 
 @dataclass
 class LandmarkMemory:
-    """Every landmark a filter has had, as last known."""
+    """The last estimate of every landmark a filter has had."""
 
     points: dict[int, Array] = field(default_factory=dict)
 
@@ -50,5 +50,5 @@ class LandmarkMemory:
         self.points.update(zip(track_ids.tolist(), points, strict=True))
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark, as last known."""
+        """Return the last estimate of every landmark."""
         return Landmarks.of(self.points)

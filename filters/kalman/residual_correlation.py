@@ -1,25 +1,28 @@
-"""How much a sighting of a track counts for, by how alike the residuals of its successive sightings are.
+"""The weight of a track's sightings, estimated from the correlation of its successive residuals.
 
-A tracker takes its error along from image to image, and an estimator told white noise takes every sighting of such a
-track for new. That it does shows in residuals that are correlated from one sighting to the next, by rho beyond what
-chance makes of white ones. From then on every track corrects with a share of its information; what is an outlier stays
-a matter of the stated noise. The share is one over the larger of two design effects, either of which misses some of it:
+A tracker drifts: the error of one image persists in the next. An estimator that assumes white noise takes every
+sighting of such a track as new information. Its residuals then correlate from one sighting to the next, by rho, more
+than chance makes white residuals correlate. Once that is detected, the information of every track is multiplied by a
+share below 1; the outlier gate still uses the stated noise. The share is one over the larger of two design effects,
+each of which misses some of the correlation:
 
-- that of long tracks whose errors are an autoregression of first order: with v times the stated variance a sighting
-  tells (1 - rho) / (1 + rho) / v of what it is stated to (Bayley & Hammersley 1946, "The 'effective' number of
-  independent observations in an autocorrelated time series"). Poses that few tracks have corrected take up much of
-  what these are off by;
-- that of what tracks say of a drift (:mod:`filters.kalman.track_scores`), of those that have ended, at poses that will
-  hardly change any more. Early in a run these are the short ones, and there is none until there are enough.
+- that of long tracks whose errors are a first-order autoregression. With v times the stated variance, a sighting
+  carries (1 - rho) / (1 + rho) / v of its stated information (Bayley & Hammersley 1946, "The 'effective' number of
+  independent observations in an autocorrelated time series"). It misses the part of the errors that the poses absorb
+  where few tracks have corrected them;
+- that of the tracks' scores for a drift (:mod:`filters.kalman.track_scores`), over tracks that have ended, at poses
+  that will hardly change any more. Early in a run only short tracks have ended, and until there are enough of them
+  this design effect is not defined.
 
-Where the first is not beyond 1, noise was stated large enough for such tracks, and they count in full: what they say of
-a drift all the same is the motion's error, not theirs (kitti00, dataset3).
+If the first design effect does not exceed 1, the stated noise is large enough for such tracks, and they keep their full
+weight: a drift in their scores is then the motion's error, not theirs (kitti00, dataset3).
 
-Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is smaller by as many as
-err as one (:mod:`filters.kalman.neighbour_correlation`). Not so beside odometry whose white noise is smaller than what
-lasts of any odometry's errors: the less tracks count for, the more the way is left to it. White errors have residuals
-that are correlated negatively, by the landmark that was fitted to them, and count in full: a filter whose noise is as
-stated stays, to the bit, what it is without.
+If the residuals of neighbours in an image correlate significantly as well, the share is also divided by the number of
+sightings that err together (:mod:`filters.kalman.neighbour_correlation`). This is not done with odometry whose stated
+white noise is smaller than the lasting errors that any odometry has: the smaller the weight of the tracks, the more the
+path would follow those errors. White errors leave residuals that correlate negatively, because the landmark was fitted
+to them, and keep their full weight: where the noise is as stated, a filter's answers are bit-identical with and without
+this.
 """
 
 from typing import Self
@@ -38,28 +41,29 @@ from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
-# Chance makes white residuals look correlated once in a thousand: beyond so many standard errors of none they are.
+# The correlation counts as significant beyond this many standard errors; chance exceeds it once in a thousand.
 _STANDARD_ERRORS = 3.0
-# What counts for less than a hundredth would be no measurement; beyond that another cause is likelier.
+# Largest correlation: it gives a sighting a weight of a hundredth. Beyond it another cause is likelier.
 _MOST_CORRELATED = 0.98
-# Odometry with less white noise (m/s/sqrt(Hz)) is stated to be off after a second by less than wheels and cameras are
-# calibrated to, 1 % of 5 m/s. Chosen between what is assumed of odometry that looks free of noise (0.016 at 10 Hz) and
-# the noise of the course's (0.17).
+# Odometry with less white noise (m/s/sqrt(Hz)) is stated to be more accurate over a second than wheels and cameras are
+# calibrated, 1 % of 5 m/s. Chosen between the noise assumed for odometry that looks noise-free (0.016 at 10 Hz) and
+# that of the course's odometry (0.17).
 _LEAST_WHITE_NOISE = 0.05
-# What rounds to the full information is none to speak of.
+# A larger share is not reported to the user.
 _MOST_REPORTED = 0.95
-# Gates, robust weights and linearisation leave residuals of white landmarks correlated, however many there are: by up
-# to 0.07 where there are thousands, on drive, flight and exports of OpenVINS. Tracks that walk are beyond 0.5.
+# Least correlation that counts for landmarks in the state. Gates, robust weights and linearisation correlate the
+# residuals of landmarks with white noise, however many there are: by up to 0.07 for thousands of residuals, on drive,
+# flight and exports of OpenVINS. Tracks with a random-walk error are beyond 0.5.
 _LEAST_OF_LANDMARKS = 0.15
 
 
 class ResidualCorrelation:
-    """Measures over a run the correlation of a track's residuals from one sighting to the next, if it ``matches``."""
+    """Measures over a run the correlation of a track's residuals from one sighting to the next, if ``matches``."""
 
     _of, _least = "tracks", 0.0
 
     def __init__(self, rig: StereoRig, matches: bool = True, counts_neighbours: bool = True) -> None:
-        # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
+        # With a stated track noise model, sightings already correct with its full covariance.
         self._rig, self.matches = rig, matches and rig.track_noise is None
         self._counts_neighbours = counts_neighbours
         self._products, self._squares, self._pairs = 0.0, 0.0, 0
@@ -67,12 +71,12 @@ class ResidualCorrelation:
 
     @classmethod
     def of(cls, setup: Setup) -> Self:
-        """Return what the settings and the motion of a run ask for."""
+        """Return the measurement that the settings and the motion of a run ask for."""
         return cls(setup.rig, setup.settings.noise.match_tracks, not _is_calibration_larger(setup.noise))
 
     @property
     def correlation(self) -> float:
-        """Return the correlation so far, 0 unless it is beyond what chance, or the filter, makes of white residuals."""
+        """Return the correlation so far; 0 unless it exceeds what chance, or the filter, gives white residuals."""
         if not self._pairs:
             return 0.0
         found = self._products / max(self._squares, np.finfo(float).tiny)
@@ -81,7 +85,7 @@ class ResidualCorrelation:
 
     @property
     def share(self) -> float:
-        """Return the share of its information that a track counts for: all where residuals along it are not alike."""
+        """Return the weight of a track, a factor in (0, 1] on its information: 1 if residuals are not correlated."""
         along = self._effect_along_tracks
         if along <= 1.0:
             return 1.0
@@ -89,13 +93,13 @@ class ResidualCorrelation:
 
     @property
     def _effect_along_tracks(self) -> float:
-        """Return how many times the stated variance the mean of a long track has: 0 where residuals are not alike."""
+        """Return the ratio of actual to stated variance of a long track's mean; 0 if residuals are not correlated."""
         rho = self.correlation
         return (1.0 + rho) / (1.0 - rho) * self._squares / self._pairs if rho > 0.0 else 0.0
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Return what a user should know, a line, where tracks do not count in full."""
+        """Return one log line if tracks have less than their full weight, else nothing."""
         if self.share > _MOST_REPORTED:
             return ()
         together = self._neighbours.erring_as_one(self.correlation)
@@ -106,7 +110,7 @@ class ResidualCorrelation:
         )
 
     def learn(self, sightings: TrackSightings, points: Array, poses: Array) -> None:
-        """Take in tracks of points (F, 3) that have corrected W poses, as they are corrected (W, 4, 4)."""
+        """Add tracks with points (F, 3) m that have corrected W poses; ``poses`` (W, 4, 4) are the corrected ones."""
         long_enough = sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS
         if not self.matches or not long_enough.any():
             return
@@ -116,7 +120,7 @@ class ResidualCorrelation:
         self.add(left[:, :-1][both], left[:, 1:][both])
 
     def add(self, before: Array, after: Array) -> None:
-        """Take in whitened residuals (n, 3) of n sightings, and those of the same tracks a frame later."""
+        """Add whitened residuals (n, 3) of n sightings, and those of the same tracks one frame later (n, 3)."""
         if not self.matches:
             return
         self._products += float((before * after).sum())
@@ -124,17 +128,17 @@ class ResidualCorrelation:
         self._pairs += 3 * len(before)
 
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Take in the next frame whose pose (4, 4) will hardly change any more."""
-        # Tracks are scored of frames that follow one another: once begun, none is left out.
+        """Add the next frame whose pose (4, 4) will hardly change any more."""
+        # Scores need successive frames: once begun, no frame is left out.
         if self._effect_along_tracks > 1.0 or self._scores.sightings:
             self._scores.add(frame, T_world_imu)
 
     def settle_last(self) -> None:
-        """Take in the tracks that are seen to the end."""
+        """Score the tracks that are still in view at the end of the run."""
         self._scores.finish()
 
     def add_images(self, frames: IntArray, uvs_px: Array, whitened: Array, H_pose: Array) -> None:
-        """Take in what images show together: whitened residuals (N, 3) of sightings (N, 3) px in frames (N,).
+        """Add residuals of the same images: whitened (N, 3), of sightings (N, 3) px in frames (N,).
 
         ``H_pose`` (N, 3, 6) are their whitened Jacobians to the poses of the frames.
         """
@@ -143,12 +147,12 @@ class ResidualCorrelation:
 
 
 class LandmarkCorrelation(ResidualCorrelation):
-    """The same of the landmarks in a filter's state, by what the corrected state leaves of their sightings.
+    """The residual correlation of landmarks in a filter's state, from residuals at the corrected state.
 
-    Such a landmark collects sightings for as long as it is seen, not for a window, and what its track has come to be
-    off by stays in it: its residuals are correlated for longer than those of tracks that correct once, and it counts
-    for less. White ones are hardly correlated: what an optimal filter leaves of a sighting is its innovation times a
-    gain, and innovations are white.
+    Such a landmark accumulates sightings for as long as it is seen, not only over a window, and accumulates its track's
+    error with them. Its residuals are therefore correlated for longer than those of tracks that correct once, and its
+    weight is smaller. With white noise they are hardly correlated: an optimal filter's residual is its innovation times
+    a gain, and innovations are white.
     """
 
     _of, _least = "tracks of landmarks in the state", _LEAST_OF_LANDMARKS
@@ -166,9 +170,9 @@ class LandmarkCorrelation(ResidualCorrelation):
         T_world_imu: Array,
         images: multiview.Images = multiview.NUMPY,
     ) -> None:
-        """Take in a frame's sightings of landmarks (L, 3) m with ids (L,), all as they have corrected its pose (4, 4).
+        """Add a frame's sightings of landmarks (L, 3) m with ids (L,), after these have corrected its pose (4, 4).
 
-        Outliers by the stated noise are left out.
+        Outliers under the stated noise are left out.
         """
         if not self.matches:
             return
@@ -189,7 +193,7 @@ class LandmarkCorrelation(ResidualCorrelation):
     def _add_image(
         self, uvs_px: Array, whitened: Array, points: Array, T_world_imu: Array, images: multiview.Images
     ) -> None:
-        """Take in what one image shows together, where sightings have come to count for less."""
+        """Add the residuals of one image, if landmarks have come to have less than their full weight."""
         if not self._counts_neighbours or self.share == 1.0 or not len(points):
             return
         there = images.linearised(points, T_world_imu[None], self._rig)
@@ -198,9 +202,9 @@ class LandmarkCorrelation(ResidualCorrelation):
 
 
 def residuals_left(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
-    """Return the whitened residuals (F, W, 3) of tracks once their landmarks have taken up what they can.
+    """Return the whitened residuals (F, W, 3) of tracks after one Gauss-Newton step of their points (F, 3).
 
-    That is a Gauss-Newton step of the points (F, 3) to first order, the poses (W, 4, 4) as they are.
+    The step is to first order; the poses (W, 4, 4) are fixed.
     """
     seen = multiview.linearise(sightings, points, poses, poses, rig)
     count, window = sightings.seen.shape
@@ -211,5 +215,5 @@ def residuals_left(sightings: TrackSightings, points: Array, poses: Array, rig: 
 
 
 def _is_calibration_larger(noise: MotionNoise) -> bool:
-    """Return whether odometry's white noise is smaller than what lasts of its errors."""
+    """Return whether odometry's white noise is smaller than its lasting errors, such as those of calibration."""
     return isinstance(noise, TwistNoise) and float(noise.velocity_noise_density.max()) < _LEAST_WHITE_NOISE

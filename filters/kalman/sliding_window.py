@@ -1,17 +1,17 @@
 """The multi-state constraint Kalman filter: a window of cloned poses, tied by tracks whose landmarks are eliminated.
 
-What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that left
-the window are never corrected again (Mourikis & Roumeliotis 2007). The answer at a frame is the state given the tracks
-still in view as well; of that nothing is kept (:mod:`filters.kalman.tracks_in_view`). A pose leaves once it is older
-than the window reaches, as a state does in the smoothers. With ``landmarks`` the tracks that span the window stay in
-the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for
-vision-aided inertial navigation").
+What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that have
+left the window are never corrected again (Mourikis & Roumeliotis 2007). The answer at a frame is the state given also
+the tracks still in view; these do not correct the belief itself (:mod:`filters.kalman.tracks_in_view`). A pose leaves
+once it is older than the window, as a state does in the smoothers. With ``landmarks``, up to that many tracks that span
+the window are kept in the state for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design
+for vision-aided inertial navigation").
 
-Where residuals along tracks turn out correlated under white noise, tracks count for less, and landmarks in the state by
-their own (:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track
-correct with their whole covariance, and a landmark in the state has the error of its track beside it. What is
-approximated: a track that lives on after it was used starts anew at its age, and the error it has come to by then is
-taken for drawn anew.
+If residuals along tracks turn out correlated although white noise is stated, tracks are given less weight, and so are
+landmarks in the state, by their own residuals (:mod:`filters.kalman.residual_correlation`). If the rig states a track
+noise model, the sightings of a track correct with their full covariance, and each landmark in the state has the error
+of its track as a state beside it. What is approximated then: a track that is still seen after it was used starts again
+at its age, and its error at that age is taken as independent of the earlier sightings.
 """
 
 from collections import deque
@@ -45,8 +45,9 @@ from toolkit.track_noise import TrackNoise
 class SlidingWindowFilter:
     """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
 
-    ``landmarks`` is how many long-lived landmarks the state may have, ``window_s`` how far back the window reaches,
-    in seconds, if not as far as the settings say; ``scores_tracks`` whether tracks are asked what drift they speak of.
+    ``landmarks`` is the number of long-lived landmarks the state may have; ``window_s`` the length of the window in
+    seconds, by default that of the settings; ``scores_tracks`` whether the tracks' scores for a drift may lower their
+    weight.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class SlidingWindowFilter:
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup, compiled.correction_test(setup.compilation))
         self._correlation = ResidualCorrelation.of(setup)
-        # Beside odometry, tracks that count for less by their scores leave the pose to the landmarks in the state: with
+        # With odometry, scores that lower the weight of tracks leave the pose to the landmarks in the state: with
         # scores msckf-slam has 0.99 +- 0.07 times the ATE on the UTIAS drives, and loses a quarter on the longest.
         self._scores_tracks = scores_tracks and (setup.motion_kind == "imu" or not landmarks)
         self._learn = compiled.learning(setup.compilation)
@@ -104,12 +105,12 @@ class SlidingWindowFilter:
         return now.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark that was ever triangulated, as last known."""
+        """Return the last estimate of every landmark that was ever triangulated."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the run."""
+        """Return the log lines for the user."""
         return self._noise.messages + self._correlation.messages + self._landmark_correlation.messages
 
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
@@ -126,10 +127,10 @@ class SlidingWindowFilter:
             )
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
-        """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
+        """Correct by the tracks that have ended, and by those seen from poses (C,) that leave the window now.
 
-        All at once, unless there is room for landmarks: what a landmark is linearised at for life is triangulated
-        after the window has been corrected by the others.
+        Both together, unless there is room for landmarks. A new landmark's linearisation point stays, so it is
+        triangulated after the ended tracks have corrected the window.
         """
         gate.share, used = self._correlation.share, self._tracks.ended()
         if not self._room:
@@ -143,7 +144,7 @@ class SlidingWindowFilter:
         return max(self._most_landmarks - len(self._joint.landmark_ids), 0)
 
     def _correct_by(self, sightings: TrackSightings, gate: FrameGate) -> None:
-        """Correct the window by tracks; add as many of those still seen as landmarks as there is room for."""
+        """Correct the window by tracks; add those still seen as landmarks, as many as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
         track_gate = TrackGate(joint, self._at, self._rig, self._track_test, self._images)
@@ -161,17 +162,17 @@ class SlidingWindowFilter:
         self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
 
     def _update(self, H: Array, residuals: Array) -> None:
-        """Correct everything by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
+        """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
         joint, (count, size) = self._joint, H.shape
         end = joint.clone_columns.stop
         if count > size and end == joint.cov.shape[0]:
             joint.inform(H.T @ H, H.T @ residuals)
             return
-        # With landmarks behind the clones, an update by fewer rows takes less.
+        # With landmarks after the clones in the error state, an update by fewer rows is cheaper.
         joint.update(*multiview.compressed(H, residuals), slice(end - size, end))
 
     def _correct_by_bridge(self, packet: Packet) -> None:
-        """Correct the last three poses where no track leads from one of them to the next."""
+        """Correct the last three poses where no track links one of them to the next."""
         if self.bridge is None:
             return
         kept, joint = self.bridge.added(packet.frame, packet.motion), self._joint
@@ -188,7 +189,7 @@ class SlidingWindowFilter:
             joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, linearised)
 
     def _forget_clones(self, which: BoolArray) -> None:
-        """Forget poses (C,), which are the oldest."""
+        """Marginalise poses (C,), which are the oldest."""
         if which.any():
             for T_world_imu in self._joint.clones[which]:
                 frame = self._frames.popleft()
@@ -200,7 +201,7 @@ class SlidingWindowFilter:
 
 
 class WindowTracks:
-    """The tracks not yet used: sightings of A tracks from the W poses of the window, one column a clone."""
+    """The tracks not yet used: sightings of A tracks from the W poses of the window, one column per clone."""
 
     def __init__(self) -> None:
         self._ids: IntArray = np.empty(0, dtype=np.int64)
@@ -223,7 +224,7 @@ class WindowTracks:
         self._ids, self._uvs_px, self._seen, self._ages = np.concatenate([self._ids, new]), uvs_px, seen, ages
 
     def drop_oldest(self, count: int) -> None:
-        """Forget what was seen from that many poses."""
+        """Drop the sightings from the ``count`` oldest poses."""
         self._uvs_px, self._seen, self._ages = self._uvs_px[:, count:], self._seen[:, count:], self._ages[:, count:]
         self._keep(np.asarray(self._seen.any(axis=1)))
 
@@ -240,7 +241,7 @@ class WindowTracks:
         return TrackSightings(self._ids, self._uvs_px, self._seen, self._ages)
 
     def take(self, rows: BoolArray) -> TrackSightings:
-        """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
+        """Return those tracks (A,) and drop their sightings; a track that is still seen starts again."""
         tracks = self.unused()
         self._keep(np.logical_not(rows))
         return tracks.select(rows)
@@ -254,7 +255,7 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
 
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
-    """Return the frame without the sightings of the state's landmarks."""
+    """Return the frame without the sightings of landmarks in the state."""
     if not len(joint.landmark_ids):
         return frame
     return frame.select(~is_among(frame.track_ids, joint.landmark_ids))

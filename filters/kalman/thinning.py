@@ -1,7 +1,8 @@
-"""Where a window may not hold the states of all frames: those of frames evenly apart in time, the others predicted.
+"""Where a window may not hold the states of all frames, it holds those of frames evenly spaced in time.
 
-Filters and smoothers are thinned alike: an estimator is given the frames of its states alone, with the whole motion
-between them, and what the other frames saw is not used. Where the window's cap does not bind it is given every frame.
+Filters and smoothers are thinned alike: the estimator gets only the frames of its states, with the whole motion between
+them. The states of the other frames are predicted, and their sightings are not used. Where the cap on the number of
+states does not bind, the estimator gets every frame.
 """
 
 from dataclasses import replace
@@ -16,7 +17,7 @@ from toolkit.sequence import Packet
 
 
 class Thinned:
-    """Passes on to an estimator the first frame of each of the window's intervals, numbered anew."""
+    """Passes on to an estimator the first frame of each of the window's intervals, renumbered from 0."""
 
     def __init__(self, setup: Setup, estimator: Estimator) -> None:
         self._estimator = estimator
@@ -43,7 +44,7 @@ class Thinned:
         return answer
 
     def finish(self) -> Finished:
-        """Return what the estimator does, with the frames left out carried on from the states before them."""
+        """Return the estimator's result, with the omitted frames predicted from the states before them."""
         finished = self._estimator.finish()
         if not self._left_out:
             return finished
@@ -60,7 +61,7 @@ class Thinned:
 
 
 def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
-    """Return two motions, one after the other, as one; where one is none, the other."""
+    """Concatenate two successive motions; where one is None, return the other."""
     if first is None or second is None:
         return second if first is None else first
     durations = np.concatenate([first.dt_s, second.dt_s])

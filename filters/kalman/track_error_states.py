@@ -1,8 +1,8 @@
-"""Landmarks in a joint belief whose tracks err by a walk and an offset: the error of each track is a state beside it.
+"""Landmarks in a joint belief whose tracks have a random-walk error and an offset: each track's error is a state.
 
-A track that walks takes its error along: the sightings that put its landmark into the state and all later ones share
-it. With the error b of a track (in :data:`toolkit.track_noise.CHANNELS`) in the state, what is left in a sighting is
-its white noise, independent of all others. Over an interval of n frames b gains the variance n walk^2.
+A track's error persists: the sightings that initialised its landmark and all later ones share it. With the error b of a
+track (in :data:`toolkit.track_noise.CHANNELS`) in the state, the remaining noise of a sighting is white and independent
+of all others. Over an interval of n frames the variance of b grows by n walk^2.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from toolkit.track_noise import CHANNELS, TrackNoise
 
 
 class TrackErrorBelief(JointBelief):
-    """A joint belief with the errors of its landmarks' tracks behind the landmarks, three a track.
+    """A joint belief with the errors of its landmarks' tracks after the landmarks, three per track.
 
     ``track_errors_px`` (L, 3) are their estimates, ``ages`` (L,) the ages of the tracks at their last sighting.
     """
@@ -36,17 +36,17 @@ class TrackErrorBelief(JointBelief):
 
     @property
     def landmark_columns(self) -> slice:
-        """Return where the landmarks stand in the error state."""
+        """Return the columns of the landmarks in the error state."""
         start = self.clone_columns.stop
         return slice(start, start + 3 * len(self.points))
 
     @property
     def track_error_columns(self) -> slice:
-        """Return where the errors of the tracks stand in the error state."""
+        """Return the columns of the tracks' errors in the error state."""
         return slice(self.landmark_columns.stop, self.cov.shape[0])
 
     def add_landmarks_with_errors(self, started: "Started", ages: IntArray) -> None:
-        """Add landmarks with the errors of their tracks, whose last sightings have these ages (N,)."""
+        """Add landmarks with the errors of their tracks; ``ages`` (N,) are those of the last sightings."""
         landmarks, before = self.landmark_columns, self.cov.shape[0]
         self._add_rows(started.jacobian, started.cov)
         new = np.arange(before, self.cov.shape[0]).reshape(-1, 2, 3)
@@ -59,7 +59,7 @@ class TrackErrorBelief(JointBelief):
         self.ages = np.concatenate([self.ages, ages])
 
     def walk(self, ages: IntArray) -> None:
-        """Let the tracks walk on to new ages (L,)."""
+        """Propagate the tracks' errors to new ages (L,) by their random walk."""
         variance_px2 = np.square(self.noise.walk_px) * (ages - self.ages)[:, None]
         rows = np.arange(self.track_error_columns.start, self.track_error_columns.stop)
         self._cov = self._cov.copy()
@@ -81,7 +81,7 @@ class TrackErrorBelief(JointBelief):
 
 
 def correct(joint: TrackErrorBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
-    """Correct everything by the landmarks of the state, every one of which the frame must show."""
+    """Correct the whole state by its landmarks; the frame must show every one of them."""
     count = len(joint.landmark_ids)
     if not count:
         return
@@ -108,9 +108,9 @@ def correct(joint: TrackErrorBelief, frame: StereoFrame, at: Linearisation, rig:
 
 
 def implausible_errors(joint: TrackErrorBelief, gate: FrameGate) -> BoolArray:
-    """Say which tracks (L,) have come to an error that the walk and the offset do not explain, by the gate's measure.
+    """Say which tracks (L,) have an estimated error beyond the gate's bound under the stated walk and offset.
 
-    What moves slowly by itself passes the gate at every frame, and its track's error takes up all of it.
+    A point that moves slowly passes the gate at every frame, while the error of its track absorbs the movement.
     """
     variance_px2 = correlated_noise.walked_variance(joint.noise, joint.ages)
     return np.asarray((np.square(joint.track_errors_px) / variance_px2).sum(axis=1) > gate.bound(3))
@@ -124,11 +124,12 @@ def _columns_each(joint: TrackErrorBelief) -> IntArray:
 
 
 class Started(NamedTuple):
-    """N landmarks (N, 3) and errors of their tracks (N, 3) px as sightings from a window tell them.
+    """N landmarks (N, 3) and errors of their tracks (N, 3) px, estimated from the sightings of a window.
 
-    Their errors, six a landmark, are ``jacobian`` (6 N, n) times the state's plus noise of covariance ``cov``.
-    ``first_points`` (N, 3) are those that the sightings were linearised at. Later ones must be as well: between two
-    places of a landmark there is heading that nobody measured, and a noise of a tenth of a pixel makes much of it.
+    Their errors, six per landmark, are ``jacobian`` (6 N, n) times the state's error plus noise of covariance ``cov``.
+    ``first_points`` (N, 3) are the linearisation points. Later sightings must be linearised there too: Jacobians at two
+    different points of a landmark gain information on the heading, which no measurement observes, and with a noise of a
+    tenth of a pixel they gain much.
     """
 
     track_ids: IntArray
@@ -140,18 +141,18 @@ class Started(NamedTuple):
 
 
 def add_tracks(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
-    """Put N tracks, seen from the newest clone and others, into the state: points (N, 3) m, and their errors by now."""
+    """Add N tracks to the state: points (N, 3) m, and their errors at the newest clone, which sees all of them."""
     joint.add_landmarks_with_errors(started(joint, sightings, points, linearised), sightings.ages[:, -1])
 
 
 def started(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> Started:
-    """Return what a window's sightings say of N points (N, 3) m and of their tracks' errors at the newest pose.
+    """Estimate N points (N, 3) m and their tracks' errors at the newest pose from a window's sightings.
 
-    With residuals, Jacobians and noise e decorrelated, ``r = H_x x + H p + e``, the best point errs by
-    ``-V H^T (H_x x + e)``, V being ``(H^T H)^-1``, and the best error of the track by ``b - K Q (H_x x + e)``: K is its
-    covariance with e, and ``Q = 1 - H V H^T`` leaves what the landmark does not explain. The noise in them is that of
-    generalised least squares and of the best linear prediction after it, and independent of ``Q e``, by which the
-    track corrects the window.
+    With residuals, Jacobians and noise e decorrelated, ``r = H_x x + H p + e``, the least-squares point has the error
+    ``-V H^T (H_x x + e)`` with ``V = (H^T H)^-1``, and the track error b is estimated with the error
+    ``b - K Q (H_x x + e)``. K is the covariance of b with e, and ``Q = 1 - H V H^T`` projects onto the part that the
+    landmark does not explain. The noise in both is that of generalised least squares followed by the best linear
+    prediction; it is independent of ``Q e``, by which the track corrects the window.
     """
     count, window = sightings.seen.shape
     mixing, d = linearised.decorrelation, joint.cov.shape[0]

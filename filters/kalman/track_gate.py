@@ -1,9 +1,9 @@
 """The gate of the windowed filters: which tracks, and which of their sightings, may correct the window.
 
-A track is accepted or rejected as a whole, and one mismatched sighting would have all the others rejected with it. So
-where a track fails the gate by a wide margin, the sighting that disagrees most with the rest of the track and with the
-window is left out, and the track is tested once more if two sightings remain. One that fails by little may be a sound
-track with bad luck: to leave out its worst sighting would choose the measurements by their agreement.
+A track is accepted or rejected as a whole, so one mismatched sighting would reject all the others of its track.
+Therefore, if a track fails the gate by a wide margin, the sighting that disagrees most with the rest of the track and
+with the window is left out, and the track is tested once more if at least two sightings remain. A track that fails by
+little may be sound and unlucky: leaving out its worst sighting would select measurements by their agreement.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,12 +21,12 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
 
-# Tracks are tested apart where that leaves out so many places for sightings in all: about what a group costs to form.
+# Tracks are tested in separate groups where that saves this many padded places in all: about the cost of a group.
 _LEAST_LEFT_OUT = 300
 
 
 class WindowPoses(NamedTuple):
-    """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the covariance (6 W, 6 W) of all."""
+    """The poses (W, 4, 4) of the window, their linearisation points (W, 4, 4) and their covariance (6 W, 6 W)."""
 
     poses: Array
     poses_at: Array
@@ -34,23 +34,23 @@ class WindowPoses(NamedTuple):
 
     @classmethod
     def of(cls, joint: JointBelief, at: Linearisation) -> "WindowPoses":
-        """Return the window of a joint belief, linearised as chosen."""
+        """Return the window of a joint belief, linearised at the chosen points."""
         columns = joint.clone_columns
         return cls(joint.clones, at.clones(joint), joint.cov[columns, columns])
 
     def since(self, begin: int) -> "WindowPoses":
-        """Return the window without the poses before one."""
+        """Return the window from pose ``begin`` on."""
         poses = self.poses[begin:]
         poses_at = poses if self.poses_at is self.poses else self.poses_at[begin:]
         return WindowPoses(poses, poses_at, self.cov[6 * begin :, 6 * begin :]) if begin else self
 
 
 class TestedTracks(NamedTuple):
-    """F tracks with a landmark (F, 3) each: the NIS (F,) of what they constrain the window by, and those constraints.
+    """F tracks with landmarks (F, 3): the NIS (F,) of their constraints on the window, and those constraints.
 
     ``dof`` (F,) are the degrees of freedom of the NIS. ``worst`` (F,) is the sighting that disagrees most where the NIS
-    is far above its bound, else -1. Of the tracks below their bounds the whitened constraints stand under each other:
-    ``H`` (n, 6 W), ``residuals`` (n,), and whose each is, ``track`` (n,).
+    is far above its bound, else -1. The whitened constraints of the tracks below their bounds are stacked: ``H`` (n, 6
+    W), ``residuals`` (n,), and ``track`` (n,), the track of each row.
     """
 
     sightings: TrackSightings
@@ -63,14 +63,14 @@ class TestedTracks(NamedTuple):
     track: IntArray
 
 
-# Tests tracks against a window; the bounds (3 W - 2,) are those of the NIS by degrees of freedom.
+# Tests tracks against a window; the bounds (3 W - 2,) of the NIS are indexed by degrees of freedom.
 TrackTest = Callable[[TrackSightings, WindowPoses, StereoRig, Array], TestedTracks]
 
 
 class AcceptedTracks(NamedTuple):
-    """F tracks that passed: the sightings that count, points (F, 3), weights (F,), and their constraints.
+    """F tracks that passed: their accepted sightings, points (F, 3), weights (F,), and their constraints.
 
-    The constraints on the W poses are whitened, weighed and stand under each other: H (n, 6 W), residuals (n,).
+    The constraints on the W poses are whitened, weighted and stacked: H (n, 6 W), residuals (n,).
     """
 
     sightings: TrackSightings
@@ -80,15 +80,15 @@ class AcceptedTracks(NamedTuple):
     residuals: Array
 
     def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
-        """Return the tracks of both in one."""
+        """Return the tracks of both, concatenated."""
         pairs = zip(self[1:], other[1:], strict=True)
         return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
 
 
 def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bounds: Array) -> TestedTracks:
-    """Triangulate tracks, free them of their landmarks and test them, all at once in NumPy: the definition.
+    """Triangulate tracks, eliminate their landmarks and test them, all at once in NumPy: the definition.
 
-    ``bounds`` (n,) is the NIS that is just accepted at each number of degrees of freedom.
+    ``bounds`` (n,) is the gate's bound of the NIS at each number of degrees of freedom.
     """
     points, reliable = triangulate(sightings.uvs_px, sightings.seen, window.poses, rig)
     sightings, points = sightings.select(reliable), points[reliable]
@@ -107,7 +107,7 @@ def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bound
 def _joined(
     sightings: TrackSightings, points: Array, groups: list[tuple[int, IntArray]], parts: list[TestedTracks]
 ) -> TestedTracks:
-    """Return the results for groups of the tracks, each from a first pose on, as those of all; H has rows by group."""
+    """Merge the results of groups of tracks, each of which starts at a pose of its own; the rows of H stay by group."""
     count, window = sightings.seen.shape
     nis, dof, worst = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     H, end = np.zeros((sum(len(part.H) for part in parts), 6 * window)), 0
@@ -121,10 +121,10 @@ def _joined(
 
 
 def _by_first_pose(seen: BoolArray) -> Iterator[tuple[int, IntArray]]:
-    """Yield tracks that were seen (F, W) late together: the pose from which on all were, and their rows.
+    """Yield groups of tracks by the pose from which on all of their sightings are (F, W): that pose, and their rows.
 
-    All tracks of a group cost what the longest does, so each has the later half of the poses of the one before, where
-    that leaves out enough to pay for a group.
+    All tracks of a group cost as much as its longest, so each group has the later half of the poses of the one before,
+    where that saves enough to pay for a group.
     """
     first, begin, rows = seen.argmax(axis=1), 0, np.arange(len(seen))
     while True:
@@ -141,7 +141,7 @@ def _by_first_pose(seen: BoolArray) -> Iterator[tuple[int, IntArray]]:
 def _constrained(
     sightings: TrackSightings, points: Array, window: WindowPoses, rig: StereoRig, bounds: Array
 ) -> TestedTracks:
-    """Free tracks of their landmarks (F, 3) and test them."""
+    """Eliminate the landmarks (F, 3) of tracks and test the tracks."""
     linearised = _linearised(sightings, points, window, rig)
     constraints = multiview.without_landmark(linearised, sightings)
     covs = innovation_covs(constraints, window.cov)
@@ -172,7 +172,7 @@ def _linearised(
 
 
 def innovation_covs(constraints: Constraints, P: Array) -> Array:
-    """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals, that of the window being P (6 W, 6 W)."""
+    """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals, with P (6 W, 6 W) that of the window."""
     covs = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
     variances = np.einsum("fii->fi", covs)
     variances += 1.0
@@ -180,11 +180,11 @@ def innovation_covs(constraints: Constraints, P: Array) -> Array:
 
 
 def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray) -> IntArray:
-    """Return the sighting (F,) of each track without which its NIS would be least.
+    """Return the sighting (F,) of each track without which its NIS would be smallest.
 
-    ``basis`` (F, 3W - 3, 3W) made its residuals (F, 3W - 3) of those of its sightings (F, W); ``covs`` (F, 3W - 3,
-    3W - 3) are theirs. Leaving out a sighting is letting it be anything: with ``W`` the precision of all coordinates
-    and ``r`` their residuals, the NIS falls by ``(W r)_j^T W_jj^-1 (W r)_j``.
+    ``basis`` (F, 3W - 3, 3W) maps the residuals of a track's sightings (F, W) to ``residuals`` (F, 3W - 3), whose
+    covariances are ``covs`` (F, 3W - 3, 3W - 3). Leaving a sighting out means leaving its value free: with ``W`` the
+    information matrix of all coordinates and ``r`` their residuals, the NIS falls by ``(W r)_j^T W_jj^-1 (W r)_j``.
     """
     count, window = seen.shape
     informed = np.linalg.solve(covs, np.concatenate([basis, residuals[..., None]], axis=2))
@@ -196,7 +196,7 @@ def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray
 
 
 class TrackGate:
-    """Tests tracks against a joint belief, by NumPy or by what computes the same."""
+    """Tests tracks against a joint belief, by the NumPy definition or an equivalent kernel."""
 
     def __init__(
         self,
@@ -218,13 +218,13 @@ class TrackGate:
         return accepted.joined(self._tested(again, gate)[0]) if len(again.track_ids) else accepted
 
     def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
-        """Return the accepted tracks of some rows (m,) linearised, landmarks included, with their weights."""
+        """Return some rows (m,) of the accepted tracks, linearised with their landmarks and weighted."""
         sightings, points = tracks.sightings.select(rows), tracks.points[rows]
         linearised = _linearised(sightings, points, self._window, self._rig, self._images)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
-        """Return the tracks that pass as they are, and those that fail by far less their worst sighting, to test."""
+        """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, to retest."""
         bounds = gate.bounds(3 * sightings.seen.shape[1])
         tracks = self._test(sightings, self._window, self._rig, bounds)
         accepted = gate.accepts(tracks.nis, tracks.dof)

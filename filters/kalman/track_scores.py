@@ -1,16 +1,17 @@
-"""How much less tracks tell of a drift than their stated noise has it: the design effect of their scores.
+"""How much less information tracks carry about a drift than their stated noise says: the design effect of their scores.
 
-Of what tracks are wrong by, that part does harm which looks like motion. A constant error ``eta`` (6,) of the twist
-over the life of a track moves the pose of its k-th sighting by ``a_k eta``, a_k the frames from the middle of its life.
-With its residuals ``r``, whitened as stated and freed of its landmark, and their Jacobian ``H`` to ``eta``, the score
-of the track is ``H^T r``, and its covariance ``H^T H`` where the noise is as stated. Over tracks that err independently
+Errors of tracks do harm where they look like motion. A constant error ``eta`` (6,) of the twist during the life of a
+track moves the pose of its k-th sighting by ``a_k eta``, where a_k is the number of frames from the middle of its life.
+Let ``r`` be the track's residuals, whitened by the stated noise and projected off its landmark, and ``H`` their
+Jacobian to ``eta``. The score of the track is ``H^T r``, and its covariance is ``H^T H`` if the noise is as stated.
+Over tracks with independent errors,
 
     trace((sum H^T H)^-1 sum H^T r r^T H) / 6
 
-is 1 then, and else how many times the stated variance what tracks say of a drift has (Liang & Zeger 1986,
-"Longitudinal data analysis using generalized linear models", for the sandwich this is the middle of; Kish 1965, "Survey
-sampling", for the word). It assumes neither a shape of the correlation along tracks nor a length of them: white noise
-comes to 1 for tracks of any length, a random walk to the more the longer they are.
+is then 1; otherwise it is the ratio of actual to stated variance of the tracks' estimate of a drift (Liang & Zeger
+1986, "Longitudinal data analysis using generalized linear models", for the sandwich estimator whose middle this is;
+Kish 1965, "Survey sampling", for the term design effect). It assumes no model of the correlation along tracks and no
+length of them: for white noise it is 1 for tracks of any length, for a random walk it grows with their length.
 """
 
 from typing import NamedTuple, Self
@@ -25,26 +26,26 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
-# Of three sightings the landmark takes up too much for what is left to say how successive ones are related.
+# With three sightings, the fitted landmark absorbs too much of the residuals to show how successive ones correlate.
 FEWEST_SIGHTINGS = 4
-# What chance explains less often, by the stated noise, is an outlier and says nothing of the others.
+# Probability of the chi-square bound beyond which, by the stated noise, a sighting is an outlier and not used.
 SOUND = 0.999
-# Longer tracks are scored in parts, so that a landmark that is seen for ever is scored, and kept, for some time only.
+# Longer tracks are scored in parts, which bounds the memory of a track that never ends and lets it be scored.
 _MOST_SIGHTINGS = 64
-# So many tracks that have ended are scored at once, which takes little longer than one by itself.
+# This many ended tracks are scored at once, which takes little longer than scoring one.
 _SCORED_TOGETHER = 40
-# Fewer tracks say too little of a variance.
+# Fewer tracks do not determine a variance.
 _FEWEST_TRACKS = 20
-# Poses that fewer tracks at once hold err by more than a track is asked to tell of: on dataset3, with 4, tracks better
-# than stated came to a design effect of 30 at the poses of fixed-lag, and to less than 1 at those of batch.
+# With fewer tracks at once the poses err by more than the tracks do: on dataset3, with 4 tracks whose errors are below
+# the stated noise, the design effect was 30 at the poses of fixed-lag and below 1 at those of batch.
 _FEWEST_AT_ONCE = 20
 
 
 class TrackScores:
-    """Measures over a run how many times their stated variance what tracks say of a drift has.
+    """Measures over a run the ratio of actual to stated variance of what tracks say of a drift.
 
-    Sightings are kept until the tracks they are of have ended: N of them, each with the number of its track, counted
-    anew where an id comes again, and its column among the poses (W, 4, 4).
+    Sightings are kept until their tracks have ended. There are N of them; each has the number of its track, which is
+    new if an id returns, and its column among the poses (W, 4, 4).
     """
 
     def __init__(self, rig: StereoRig) -> None:
@@ -57,18 +58,18 @@ class TrackScores:
 
     @property
     def design_effect(self) -> float | None:
-        """Return it so far; None of too few tracks, or of too few at once."""
+        """Return the design effect so far; None with too few tracks, or too few at once."""
         if self._tracks < _FEWEST_TRACKS or self._seen < _FEWEST_AT_ONCE * self._frames:
             return None
         return float(np.trace(np.linalg.solve(self._information, self._squares))) / 6.0
 
     @property
     def sightings(self) -> int:
-        """Return how many sightings wait for their tracks to end."""
+        """Return how many sightings are kept because their tracks have not ended."""
         return len(self._numbers)
 
     def add(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Take in the next frame, with its pose (4, 4) as it will hardly change any more."""
+        """Add the next frame, with its pose (4, 4), which will hardly change any more."""
         self._frames, self._seen = self._frames + 1, self._seen + len(frame.track_ids)
         before, self._in_view = self._in_view, self._in_view.at(frame.track_ids, self._begun)
         numbers = self._in_view.numbers
@@ -83,12 +84,12 @@ class TrackScores:
             self._score()
 
     def finish(self) -> None:
-        """Score the tracks that are still seen."""
+        """Score the tracks that are still in view."""
         self._in_view = _InView.nothing()
         self._score()
 
     def _score(self) -> None:
-        """Score the tracks that are not in view, and forget their sightings and the poses that only they need."""
+        """Score the tracks that have ended, and drop their sightings and the poses that only they need."""
         rows = ~is_among(self._numbers, self._in_view.numbers)
         self._add_scores(self._tracks_of(rows))
         self._numbers, self._columns, self._uvs_px = self._numbers[~rows], self._columns[~rows], self._uvs_px[~rows]
@@ -96,7 +97,7 @@ class TrackScores:
         self._columns, self._poses, self._ended = self._columns - first, self._poses[first:], 0
 
     def _tracks_of(self, rows: BoolArray) -> TrackSightings:
-        """Return the tracks of sightings (N,) that are long enough, one column a pose."""
+        """Return the tracks of sightings (N,) that are long enough, one column per pose."""
         numbers, track = np.unique(self._numbers[rows], return_inverse=True)
         shape = (len(numbers), len(self._poses))
         uvs_px, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
@@ -121,7 +122,7 @@ class TrackScores:
 
 
 class _InView(NamedTuple):
-    """The tracks of a frame by ascending id (A,), their numbers (A,) and lengths (A,), and the order they came in."""
+    """The tracks of a frame by ascending id (A,): numbers (A,), lengths (A,), and the order of their sightings."""
 
     track_ids: IntArray
     numbers: IntArray
@@ -133,7 +134,7 @@ class _InView(NamedTuple):
         return cls(*(np.empty(0, dtype=np.int64) for _ in range(4)))
 
     def at(self, track_ids: IntArray, begun: int) -> "_InView":
-        """Return those of the next frame; tracks that begin, or were seen often enough, are numbered from ``begun``."""
+        """Return the tracks of the next frame; new ones, and parts of long ones, are numbered from ``begun`` on."""
         order = np.argsort(track_ids)
         rows, known = rows_of(track_ids[order], self.track_ids)
         known[known] = self.lengths[rows[known]] < _MOST_SIGHTINGS

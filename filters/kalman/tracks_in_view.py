@@ -1,15 +1,15 @@
-"""The state now as the tracks say that are still in view: for the answer alone, nothing of it is kept.
+"""The present state given also the tracks still in view: for the answer alone, it does not enter the belief.
 
-A windowed filter corrects by a track once, when it ends or leaves the window. Until then the belief knows nothing of
-its sightings, and the newest pose would be carried by the measured motion alone. So the answer at a frame is the belief
-given all tracks in view, computed beside the belief and thrown away: no sighting counts twice, and up to linearisation
-it is the answer that the filter would give if every track ended here (tested).
+A windowed filter corrects by a track once, when the track ends or leaves the window. Until then the belief has no
+information from its sightings, and the newest pose would follow the measured motion alone. So the answer at a frame is
+the belief given all tracks in view, computed beside the belief and then discarded. No sighting counts twice, and up to
+linearisation it is the answer that the filter would give if every track ended here (tested).
 
 Landmarks are eliminated by the Schur complement of the normal equations (Triggs, McLauchlan, Hartley & Fitzgibbon 2000,
 "Bundle adjustment - a modern synthesis", section 6.1), which for a track is the same as projecting its rows onto the
 left null space of its landmark (Mourikis & Roumeliotis 2007, eqs. 23-24): one matrix product for all tracks. With L and
-n the information matrix and vector that is left on the clones, the update in information form gives the state's error
-as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its covariance.
+n the resulting information matrix and vector of the clones, the update in information form moves the state's error by
+``P_xc (1 + L P_cc)^-1 n`` and subtracts ``P_xc (1 + L P_cc)^-1 L P_cx`` from its covariance.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ from toolkit.settings import Outliers
 
 
 class FollowedTracks(NamedTuple):
-    """F tracks in view of W clones: points (F, 3), and what each sighting counts for (F, W), 0 if rejected.
+    """F tracks in view of W clones: points (F, 3), and the weight of each sighting (F, W), 0 if rejected.
 
     The newest clone sees all of them.
     """
@@ -72,7 +72,7 @@ class FollowedTracks(NamedTuple):
 
 
 class RootedWindow(NamedTuple):
-    """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the root R (6 W, 6 W) of their cov."""
+    """The window's poses and their linearisation points (W, 4, 4), and the root R (6 W, 6 W) of their covariance."""
 
     poses: Array
     poses_at: Array
@@ -85,12 +85,12 @@ class RootedWindow(NamedTuple):
 
 
 class Information(NamedTuple):
-    """The information of F tracks on W poses, a matrix (6 W, 6 W) and a vector (6 W,), free of the landmarks.
+    """The information matrix (6 W, 6 W) and vector (6 W,) of F tracks on W poses, with the landmarks eliminated.
 
-    Both are of errors u of unit covariance, of which those of the poses are ``R u``; of the matrix the lower half
-    counts. ``weights`` (F,) is what the newest sightings count for, ``points`` (F, 3) the landmarks after a
-    Gauss-Newton step. Tracks that are not ``usable`` (F,), in front of all their cameras and of a known place, tell
-    nothing.
+    Both are in terms of errors u of unit covariance; the poses' errors are ``R u``. Only the lower half of the matrix
+    is set. ``weights`` (F,) are those of the newest sightings, ``points`` (F, 3) the landmarks after a Gauss-Newton
+    step. A track is ``usable`` (F,) if it is in front of all its cameras and its landmark is determined; other tracks
+    add no information.
     """
 
     points: Array
@@ -100,7 +100,7 @@ class Information(NamedTuple):
     vector: Array
 
 
-# Finds the landmarks of tracks among those known before, or anew.
+# Returns the landmarks of tracks: those known before, and new ones by triangulation.
 Follow = Callable[[FollowedTracks, TrackSightings, JointBelief, StereoRig], FollowedTracks]
 # Gates the newest sightings of tracks and returns the information of the tracks on a window.
 InformationOf = Callable[[FollowedTracks, RootedWindow, StereoRig, FrameGate], Information]
@@ -123,7 +123,7 @@ def information(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, ga
 
 
 def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig) -> FollowedTracks:
-    """Return tracks with their landmarks, as last known or as a first triangulation has them: the definition."""
+    """Return tracks with their landmarks, from the frame before or from a first triangulation: the definition."""
     sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
     rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
     points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
@@ -138,7 +138,7 @@ def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelie
 
 
 class Steps(NamedTuple):
-    """What finds the landmarks of tracks that have two sightings or more, and what returns their information."""
+    """Functions that find the landmarks of tracks with two sightings or more, and return their information."""
 
     follow: Follow
     information: InformationOf
@@ -148,10 +148,11 @@ NUMPY = Steps(followed, information)
 
 
 class TracksInView:
-    """Corrects a belief by the tracks in view, and remembers of them from frame to frame what spares work.
+    """Corrects a belief by the tracks in view, and keeps their landmarks and weights from frame to frame.
 
-    A landmark is triangulated at its track's second sighting and follows by a Gauss-Newton step a frame. A sighting is
-    gated once, at its frame, against the window and the earlier sightings of its track; what it counts for then stays.
+    A landmark is triangulated at its track's second sighting and then follows by one Gauss-Newton step a frame. A
+    sighting is gated once, at its frame, against the window and the earlier sightings of its track; its weight then
+    stays.
     """
 
     def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, steps: Steps = NUMPY) -> None:
@@ -159,9 +160,9 @@ class TracksInView:
         self._known = FollowedTracks.none()
 
     def corrected(self, joint: JointBelief, sightings: TrackSightings, share: float = 1.0) -> Belief:
-        """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet.
+        """Return the present state given the tracks that the newest of W poses sees and that have not corrected yet.
 
-        ``share`` is the share of its information that each counts for.
+        ``share`` multiplies the information of each.
         """
         tracks = self._steps.follow(self._known, sightings, joint, self._rig)
         if not len(tracks.points):
@@ -180,7 +181,8 @@ class TracksInView:
 class _Rows(NamedTuple):
     """Independent rows of F tracks, by sighting: residuals (F, W, 3), Jacobians to the landmark and to poses.
 
-    ``H_point`` is (F, W, 3, 3). ``H_pose`` (F, W, 3, k) is to the pose of the sighting, k = 6, or to all, k = 6 W.
+    ``H_point`` is (F, W, 3, 3). ``H_pose`` (F, W, 3, k) is to the pose of the sighting, k = 6, or to all poses, k = 6
+    W.
     """
 
     residuals: Array
@@ -198,7 +200,7 @@ class _Rows(NamedTuple):
         return _Rows(by * self.residuals, by[..., None] * self.H_point, by[..., None] * self.H_pose, self.depth_m)
 
     def mixed(self, mixing: Array) -> "_Rows":
-        """Return what a matrix (F, 3 W, 3 W) makes of each track's rows, stacked by sighting."""
+        """Return each track's rows, stacked by sighting, multiplied by a matrix (F, 3 W, 3 W)."""
         tracks, window = self.residuals.shape[:2]
         residuals = (mixing @ self.residuals.reshape(tracks, 3 * window, 1)).reshape(tracks, window, 3)
         H_point = (mixing @ self.H_point.reshape(tracks, 3 * window, 3)).reshape(tracks, window, 3, 3)
@@ -207,9 +209,9 @@ class _Rows(NamedTuple):
 
 
 def _rows(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig) -> tuple[_Rows, BoolArray]:
-    """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front.
+    """Return the tracks' rows, zero where rejected, and which tracks (F,) are in front of all their cameras.
 
-    Where right images are missing, the sightings before the newest must tell where the landmark is.
+    Where right images are missing, the sightings before the newest must determine the landmark.
     """
     counted = tracks.counted
     seen = multiview.linearise(counted, tracks.points, window.poses, window.poses_at, rig)
@@ -227,9 +229,9 @@ def _rows(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig) -> tuple
 
 
 class _Normals(NamedTuple):
-    """The normal equations of F tracks, by sighting: of the landmark ``N x = b`` and, in ``B``, of it and the poses.
+    """The normal equations of F tracks, by sighting: ``N x = b`` of the landmark, and ``B``, of landmark and poses.
 
-    N (F, W, 3, 3), b (F, W, 3), B (F, W, 3, k), with the rows that they are made of.
+    N (F, W, 3, 3), b (F, W, 3), B (F, W, 3, k), with the rows that they are formed of.
     """
 
     rows: _Rows
@@ -247,8 +249,8 @@ class _Normals(NamedTuple):
     def newest_nis(self, root: Array) -> Array:
         """Return the NIS (F,) of the newest sightings, each given the window and the others of its track.
 
-        ``root`` (6 W, 6 W) is that of the covariance of the poses. The others put the landmark at ``V (b + B x)``, V
-        being ``N^-1``, of which the newest sees ``H V (b + B x)``.
+        ``root`` (6 W, 6 W) is that of the covariance of the poses. The others place the landmark at ``V (b + B x)``
+        with ``V = N^-1``, and the newest sighting measures ``H V (b + B x)`` of it.
         """
         rows, (tracks, window) = self.rows, self.b.shape[:2]
         toward = -rows.H_point[:, -1] @ np.linalg.inv(self.N[:, :-1].sum(axis=1))
@@ -262,7 +264,7 @@ class _Normals(NamedTuple):
         return mahalanobis_squared(innovations, by_root @ np.swapaxes(by_root, 1, 2) + noise)
 
     def newest_weighed(self, weights: Array) -> "_Normals":
-        """Return these with each track's newest sighting weighed (F,)."""
+        """Return the normal equations with each track's newest sighting multiplied by its weight (F,)."""
         factors = np.ones(self.b.shape[:2])
         factors[:, -1] = weights
         by = factors[..., None]
@@ -270,11 +272,11 @@ class _Normals(NamedTuple):
         return _Normals(rows, by[..., None] * self.N, by * self.b, by[..., None] * self.B)
 
     def point_steps(self) -> Array:
-        """Return the Gauss-Newton step (F, 3) m of each landmark, the poses as they are."""
+        """Return the Gauss-Newton step (F, 3) m of each landmark with the poses fixed."""
         return np.asarray(np.linalg.solve(self.N.sum(axis=1), self.b.sum(axis=1)[..., None])[..., 0])
 
     def of_clones(self) -> tuple[Array, Array]:
-        """Return the information matrix (6 W, 6 W) and vector (6 W,) on the clones, without the landmarks."""
+        """Return the information matrix (6 W, 6 W) and vector (6 W,) on the clones, the landmarks eliminated."""
         tracks, window = self.b.shape[:2]
         both = np.concatenate([_to_all_poses(self.B), self.b.sum(axis=1)[..., None]], axis=2)
         inverse_roots = np.linalg.inv(np.linalg.cholesky(self.N.sum(axis=1)))
@@ -307,7 +309,7 @@ def _of_poses(rows: _Rows) -> tuple[Array, Array]:
 
 
 def _informed(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:
-    """Return the state now given information (6 W, 6 W), (6 W,) on what the clones' errors are ``root`` times of.
+    """Return the present state given information (6 W, 6 W), (6 W,) on errors of which the clones' are ``root`` times.
 
     The matrix is overwritten.
     """
@@ -328,7 +330,7 @@ def _no_longer_than(most_m: Array, steps: Array) -> Array:
 
 
 def _rows_in(ids: IntArray, wanted: IntArray) -> tuple[IntArray, BoolArray]:
-    """Return the row (N,) that each of the wanted ids (N,) has among ids, and whether (N,) it is there."""
+    """Return the row (N,) of each wanted id (N,) among ids, and whether (N,) it is there."""
     order = np.argsort(ids)
     places = np.searchsorted(ids, wanted, sorter=order)
     rows = np.append(order, 0)[places]

@@ -1,7 +1,7 @@
-"""Where landmarks are that several poses have seen: Levenberg-Marquardt over all tracks at once.
+"""Triangulation of landmarks seen from several poses: Levenberg-Marquardt over all tracks at once.
 
-The sightings are taken as one flat list, ordered by track, for tracks differ much in length. Source of the problem:
-Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation", appendix.
+The sightings are one flat list, ordered by track, because tracks differ much in length. Source of the problem: Mourikis
+& Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation", appendix.
 """
 
 from typing import NamedTuple
@@ -14,16 +14,16 @@ from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.sequence import StereoRig, is_left_only
 
 ITERATIONS, FIRST_DAMPING = 6, 1e-3
-# A track's residuals are freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
+# The landmark is eliminated to first order afterwards, so a fit to better than a hundredth of a sigma has no effect.
 RELATIVE_DECREASE = 1e-4
-# A step that changes the error by rounding alone is taken, lest rounding should choose between the points.
+# A step that raises the error by no more than rounding is accepted, so that rounding does not decide.
 ROUNDING = 1e-12
-# What rays that are parallel to a thousandth of a radian say of where they meet.
+# Added to the normal equations: the information of rays that are parallel to within a thousandth of a radian.
 _LEAST_RAY = 1e-6
 
 
 class _Views(NamedTuple):
-    """N sightings (N, 3) px, ordered by track, and how each sees the world: ``p_cam = R p_world + t``.
+    """N sightings (N, 3) px, ordered by track, and the camera pose of each: ``p_cam = R p_world + t``.
 
     ``track`` (N,) is the row of the point each sees, ``first`` (F,) where each track's sightings begin.
     """
@@ -36,7 +36,10 @@ class _Views(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Points (F, 3), half the squared error (F,) of each, infinite behind a camera, and its derivatives."""
+    """Points (F, 3), half the squared error (F,) of each, its derivatives, and the least depth (F,) m.
+
+    The error is infinite where a point is behind a camera that saw it.
+    """
 
     points: Array
     cost: Array
@@ -48,9 +51,9 @@ class _Fit(NamedTuple):
 def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
     """Return the points (F, 3) that fit sightings (F, W, 3) px from poses (W, 4, 4) best, and which (F,) to rely on.
 
-    ``seen`` (F, W) marks the sightings, of which every track must have one. The start is the stereo triangulation
-    with the largest disparity. A point is reliable if it lies in front of every pose that saw it and had a
-    disparity that tells its depth; where right images are missing, also if the sightings together tell it
+    ``seen`` (F, W) marks the sightings, of which every track must have one. The start is the stereo triangulation with
+    the largest disparity. A point is reliable if it lies in front of every pose that saw it and one disparity is large
+    enough to determine its depth; where right images are missing, also if the sightings together determine it
     (:func:`is_determined`).
     """
     if not len(seen):
@@ -74,7 +77,7 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
 
 
 def nearest_view(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
-    """Return where the sighting with the largest disparity puts each point (F, 3), and whether (F,) it is enough.
+    """Return each point (F, 3) by the sighting of largest disparity, and whether (F,) the disparity is large enough.
 
     Where it is not and right images are missing, the point is where the rays of all sightings meet best.
     """
@@ -90,21 +93,21 @@ def nearest_view(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -
 
 
 def lacking(uvs_px: Array, seen: BoolArray, wide: BoolArray) -> BoolArray:
-    """Say which tracks (F,) have no disparity that tells their depth, for want of right images perhaps."""
+    """Say which tracks (F,) have no disparity that determines their depth and lack a right image."""
     return np.asarray(~wide & (seen & is_left_only(uvs_px)).any(axis=1))
 
 
 def is_determined(information: Array, depth_m: Array) -> BoolArray:
-    """Say which points (F,) sightings with an information (F, 3, 3) 1/m^2 put to within their depths (F,) m.
+    """Say which points (F,) are determined to within their depths (F,) m by an information matrix (F, 3, 3) 1/m^2.
 
-    By the rule of :data:`toolkit.models.gating.LEAST_DISPARITY_PX`, the standard deviation of no direction may be as
-    large as the depth itself.
+    By the rule of :data:`toolkit.models.gating.LEAST_DISPARITY_PX`, the standard deviation in every direction must be
+    less than the depth itself.
     """
     return np.asarray(np.linalg.eigvalsh(information)[:, 0] * np.square(depth_m) > 1.0)
 
 
 def _where_rays_meet(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> Array:
-    """Return the points (F, 3) nearest to the rays of the left image, parallel ones meeting far in front of it."""
+    """Return the points (F, 3) nearest to the rays of the left image; parallel rays meet far in front of it."""
     T_world_cam = poses @ rig.T_imu_cam
     rays = np.ones((*seen.shape, 3))
     rays[..., 0] = (uvs_px[..., 0] - rig.cx_px) / rig.fx_px
