@@ -1,14 +1,15 @@
-"""The chained sightings of a smoother that keeps every state: linearised where they came in, renewed as they move.
+"""The chained sightings of a smoother that keeps every state: linearised as they arrive, relinearised as they move.
 
-The graph has their linearisations: residuals about estimates, and Jacobians where the tree linearises the variables at
-the same time. What neither motion nor vision tells, such as how a tilt and the accelerometer's bias share an error, is
-in the null space of both only at one place; with Jacobians at the estimates, less than 0.01 rad away, a tilt was told
-to a seventh of the standard deviation it had (:mod:`~filters.smoothing.chained_window` of fixed-lag has the same rule).
+The graph holds their linearisations: residuals about the estimates, and Jacobians at the tree's own linearisation
+points of the variables. The reason for the latter: a direction that neither motion nor vision observes, such as an
+exchange of tilt and accelerometer bias, is in the null space of both only if both are linearised at the same point.
+With Jacobians at the estimates, less than 0.01 rad away, the standard deviation of a tilt came out as a seventh of the
+right one (:mod:`~filters.smoothing.chained_window` of fixed-lag follows the same rule).
 
-Recent states are therefore linearised anew together. A linearisation of a recent frame is replaced once what is new in
-its sighting is no longer what it says, once that weighs something else by the loss, and when the tree linearises one of
-its variables elsewhere. Those of older frames stay as they are until the end, and their landmarks where they are
-linearised. A track that was lost for longer than that starts anew at its age, until the end.
+Recent states are therefore relinearised together. The linearisation of a sighting in a recent frame is replaced when
+its innovation has changed, when the loss gives it another weight, or when the tree relinearises one of its variables.
+Linearisations of older frames, and the linearisation points of their landmarks, stay fixed until the final solve. Until
+then a track that was lost for longer than that starts again at its age.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -23,31 +24,31 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import L
 from toolkit.sequence import StereoFrame, StereoRig
 
-# A linearisation is replaced that is off by so much, in sigmas of what is new in the sighting, or whose weight by the
-# loss has changed by this share: a hundredth of the variance.
+# A linearisation is replaced when its innovation is off by this many sigmas, which is a hundredth of the variance, or
+# when its weight has changed by this share.
 RENEW_BEYOND = 0.1
-# Of m and of a rotation's entries: what is not linearised elsewhere stays where it is to the last digits.
+# In m, and in entries of a rotation matrix: linearisation points closer than this are the same.
 ROUNDING = 1e-9
 
 Read = Callable[[list[int]], "Places"]
 
 
 class Places(NamedTuple):
-    """The estimates of variables, and where the tree linearises them."""
+    """The estimates of variables, and the tree's linearisation points of them."""
 
     estimates: gtsam.Values
     linearised_at: gtsam.Values
 
 
 class Renewal(NamedTuple):
-    """New factors, and the slots of those they stand for, with the keys of their landmarks."""
+    """New factors, and the slots of the factors that they replace, with the keys of their landmarks."""
 
     factors: gtsam.NonlinearFactorGraph
     replaced: Mapping[int, int]
 
 
 class _Between(NamedTuple):
-    """Where N sightings have their poses (N, 4, 4), own and that of the one before, and points (N, 3)."""
+    """Poses (N, 4, 4) of N sightings and of the sightings before them, and points (N, 3) m."""
 
     own: Array
     before: Array
@@ -55,19 +56,19 @@ class _Between(NamedTuple):
 
     @classmethod
     def at(cls, chained: ChainedFactors, values: gtsam.Values) -> "_Between":
-        """Return the places of sightings at values."""
+        """Return poses and points of sightings at values."""
         poses, points = chained.sightings.places(values)
         return cls(poses, poses[chained.sightings.chain.before], points)
 
     def differ_from(self, other: "_Between") -> BoolArray:
-        """Say which (N,) differ by more than rounding."""
+        """Say which rows (N,) differ by more than rounding."""
         pairs = ((ours - theirs).reshape(len(self.own), -1) for ours, theirs in zip(self, other, strict=True))
         return np.asarray(np.abs(np.hstack(list(pairs))).max(axis=1) > ROUNDING)
 
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """N sightings, linear about estimates with the Jacobians of other places, and their weights (N,)."""
+    """N sightings linearised about the estimates, with Jacobians at other points, and their weights (N,)."""
 
     about: _Between
     jacobians_at: _Between
@@ -90,7 +91,7 @@ class _Linearised:
         return cls(about, jacobians_at, chained.weights(linear.innovation), linear)
 
     def differs_from(self, old: "_Linearised") -> BoolArray:
-        """Say where (N,) old linearisations are off by now, weigh something else, or have Jacobians of elsewhere."""
+        """Say where (N,) an old linearisation is off, has another weight, or has Jacobians at other points."""
         now, then = self.about, old.about
         steps = _step(then.own, now.own), _step(then.before, now.before), now.points - then.points
         predicted = sum((by @ step[..., None])[..., 0] for by, step in zip(old.linear[1:], steps, strict=True))
@@ -107,7 +108,7 @@ class _Linearised:
         return self._of(column[len(column) - count :] for column in self._columns())
 
     def followed_by(self, new: "_Linearised") -> "_Linearised":
-        """Return the rows with those of new sightings behind them."""
+        """Return the rows with those of new sightings appended."""
         return self._of(np.concatenate(pair) for pair in zip(self._columns(), new._columns(), strict=True))
 
     def with_rows(self, rows: BoolArray, new: "_Linearised") -> "_Linearised":
@@ -129,18 +130,18 @@ def _step(start: Array, end: Array) -> Array:
 
 
 class ChainedPast:
-    """The sightings of all frames, those of the latest with their linearisations, and the slots of their factors."""
+    """The sightings of all frames, the linearisations of recent ones, and the slots of their factors."""
 
     def __init__(self, rig: StereoRig, huber: float | None, recent_frames: int) -> None:
         self._rig, self._huber, self._recent_frames = rig, huber, recent_frames
         self._rows, self._linearised = SightingRows.none(), _Linearised.none()
-        # Where the factor of each of these sightings is, -1 for nowhere.
+        # The slot of each sighting's factor, -1 if it has none.
         self._slot = np.empty(0, dtype=np.int64)
         self._older: list[tuple[SightingRows, IntArray]] = []
         self._settled = set[int]()
 
     def add(self, frame: StereoFrame, k: int) -> None:
-        """Take in what frame k sees; what is no longer recent stays linearised as it is."""
+        """Add the sightings of frame k; the linearisations of frames that are no longer recent stay."""
         stay = self._rows.pose > k - self._recent_frames
         self._older.append((self._rows.select(~stay), self._slot[~stay]))
         self._settled.update(map(L, self._rows.track_id[~stay].tolist()))
@@ -149,13 +150,13 @@ class ChainedPast:
 
     @property
     def settled(self) -> set[int]:
-        """Return the keys of landmarks that older sightings are linear in, where they are linearised."""
+        """Return the keys of landmarks with sightings whose linearisation is fixed."""
         return self._settled
 
     def renewal(self, read: Read, first_slot: int) -> Renewal:
-        """Return the factors of what is new and of what has moved, which get the slots from one on.
+        """Return the factors of new and relinearised sightings; their slots start at ``first_slot``.
 
-        ``read`` returns where the variables of keys are, and where they are linearised with these factors.
+        ``read`` returns the estimates of the variables of keys, and their linearisation points with these factors.
         """
         if not self._rows.pose.size:
             return Renewal(gtsam.NonlinearFactorGraph(), {})
@@ -171,7 +172,7 @@ class ChainedPast:
         return Renewal(chained.factors(now.linear, places.estimates, stale), replaced)
 
     def drop(self, track_ids: Iterable[int]) -> None:
-        """Let the sightings of some landmarks go."""
+        """Drop the sightings of some landmarks."""
         ids = list(track_ids)
         self._settled.difference_update(map(L, ids))
         kept = ~np.isin(self._rows.track_id, ids)
@@ -181,7 +182,7 @@ class ChainedPast:
         self._older = [(rows.select(kept), slots[kept]) for rows, slots, kept in older]
 
     def move(self, slot_of: Mapping[int, int]) -> None:
-        """Take down that the factors have other slots."""
+        """Record that the factors have moved to other slots."""
 
         def moved(slots: IntArray) -> IntArray:
             return np.array([slot_of.get(slot, -1) for slot in slots.tolist()], dtype=np.int64)

@@ -1,8 +1,9 @@
-"""The chained sightings of an incremental smoother: frames come, states and landmarks leave, and factors are renewed.
+"""The chained sightings of an incremental smoother: frames are added, states and landmarks leave, factors are renewed.
 
-The graph has their linearisations, in every frame new ones about the latest estimates: the residuals are then exact,
-and the weights of the loss are those of the residuals. A variable that a marginal holds where it was linearised has its
-Jacobians from there, as GTSAM's own factors do: what no sighting can tell, neither sightings nor marginal then claim.
+The graph holds their linearisations, renewed in every frame about the latest estimates: the residuals are then exact,
+and the weights of the loss are those of the residuals. For a variable whose linearisation point a marginal fixes, the
+Jacobians are taken at that point, as in GTSAM's own factors. An unobservable direction is then in the null space of
+both sightings and marginal.
 """
 
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 
 class ChainedWindow:
-    """The sightings of the frames in a window, and the slots of their factors in the graph that has them."""
+    """The sightings of the frames in a window, and the slots of their factors in the graph."""
 
     def __init__(self, rig: StereoRig, huber: float | None) -> None:
         self._rig, self._huber = rig, huber
@@ -25,30 +26,31 @@ class ChainedWindow:
 
     @property
     def is_used(self) -> bool:
-        """Say whether the rig states noise of tracks at all."""
+        """Say whether the rig states a track noise model."""
         return self._rig.track_noise is not None
 
     @property
     def slots(self) -> list[int]:
-        """Return where in the graph the factors are."""
+        """Return the slots of the factors in the graph."""
         return self._slots
 
     def add(self, frame: StereoFrame, k: int) -> None:
-        """Take in what frame k sees of landmarks."""
+        """Add the sightings of landmarks in frame k."""
         self._rows = self._rows.followed_by(frame, k)
 
     def drop(self, track_ids: Iterable[int]) -> None:
-        """Let the sightings of some landmarks go."""
+        """Drop the sightings of some landmarks."""
         self._rows = self._rows.select(~np.isin(self._rows.track_id, list(track_ids)))
 
     def placed(self, slots: Iterable[int]) -> None:
-        """Take down where the factors that were returned last have their places."""
+        """Record the slots of the factors that were returned last."""
         self._slots = list(slots)
 
     def forget(self, oldest_ns: int) -> None:
-        """Let older frames go, with the factors on them, which a marginal has taken up.
+        """Drop older frames with the factors on them, which a marginal has absorbed.
 
-        Such are the innovations of the next sightings, too. Those that follow go on from the sightings that stay.
+        These factors include the innovations of the sightings that come next after the dropped ones. Later sightings
+        chain from those that stay.
         """
         if not self.is_used:
             return
@@ -62,14 +64,14 @@ class ChainedWindow:
         return self._rows.keys()
 
     def counted_keys(self, values: gtsam.Values) -> set[int]:
-        """Return the keys of the poses and landmarks of the sightings that count at some values."""
+        """Return the keys of the poses and landmarks of the sightings that are used at some values."""
         if not self._rows.pose.size:
             return set()
         sightings = ChainedFactors.of(self._rows, self._rig, self._huber).in_front(values).sightings
         return set(self._rows.select(sightings.counted).keys())
 
     def factors(self, values: gtsam.Values, jacobians_at: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return what is new in each sighting, linear about the values; their slots are to be told."""
+        """Return the innovation of each sighting, linearised about the values; report their slots to :meth:`placed`."""
         if not self._rows.pose.size:
             self._since_ns = []
             return gtsam.NonlinearFactorGraph()

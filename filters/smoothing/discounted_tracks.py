@@ -1,7 +1,7 @@
-"""Tracks that count for a share of their information in smoothers, and the residuals along them that tell it.
+"""Tracks with a reduced weight in smoothers, and the residuals along them from which the weight is estimated.
 
-What is an outlier stays a matter of the stated noise, so a loss has its threshold in pixels where it was. Which share,
-and why: :mod:`filters.kalman.residual_correlation`.
+Outliers are still decided by the stated noise, so the threshold of a loss stays the same in pixels. How the weight is
+estimated, and why: :mod:`filters.kalman.residual_correlation`.
 """
 
 from collections import Counter
@@ -24,16 +24,17 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 
 class Discounted(NamedTuple):
-    """A rig whose sightings count for a share of their information, and the threshold of Huber's loss beside it."""
+    """A rig whose noise gives sightings a share of their information, and the threshold of Huber's loss for it."""
 
     rig: StereoRig
     huber: float | None
 
 
 def discounted(rig: StereoRig, huber: float | None, share: float) -> Discounted:
-    """Return the rig and the threshold (in sigma, None for no loss) with which sightings count for a share in (0, 1].
+    """Return the rig and the loss threshold that give sightings a share in (0, 1] of their information.
 
-    The loss is of residuals in sigma, which become smaller by the root of the share: so does its threshold.
+    Whitened residuals become smaller by the root of the share, and so must the loss's threshold (in sigma; None for no
+    loss).
     """
     if share == 1.0:
         return Discounted(rig, huber)
@@ -44,11 +45,11 @@ def discounted(rig: StereoRig, huber: float | None, share: float) -> Discounted:
 def discounted_past(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, share: float
 ) -> gtsam.NonlinearFactorGraph:
-    """Return the graph of a window whose landmarks owe what has left it a share in (0, 1] of its information.
+    """Return a window's graph whose marginals have a share in (0, 1] of their information on landmarks.
 
-    The marginals of what has left are densities of states times those of landmarks given these states. The second come
-    of sightings alone: their information is what is multiplied. What is known of states stays, for motion tells most of
-    it or part. ``values`` are of all variables of the graph.
+    The marginal of variables that have left is a density of states times one of landmarks given these states. The
+    second comes from sightings alone, so its information is multiplied by the share. The density of states is kept,
+    because motion contributes most or part of it. ``values`` are of all variables of the graph.
     """
     made = gtsam.NonlinearFactorGraph()
     for factor in (graph.at(i) for i in range(graph.size())):
@@ -60,7 +61,7 @@ def discounted_past(
 def _discounted_marginal(
     factor: gtsam.NonlinearFactor, values: gtsam.Values, share: float
 ) -> gtsam.LinearContainerFactor:
-    """Eliminate the landmarks first: their rows are the conditional density, and all below concern states alone."""
+    """Eliminate the landmarks first: their rows are the conditional density, those below involve states alone."""
     jacobian, residual = factor.linearize(values).jacobian()
     sizes = {key: values.extract([key]).dim() for key in factor.keys()}  # noqa: SIM118 - not a mapping
     blocks = dict(zip(sizes, np.split(jacobian, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
@@ -73,12 +74,12 @@ def _discounted_marginal(
 
 
 class DiscountedTracks:
-    """What the sightings of a smoother count for, by those of earlier frames, or by all.
+    """The weight of a smoother's sightings, estimated from those of earlier frames, or from all.
 
-    Beside odometry that is what the correlation along tracks and among neighbours leaves, beside an IMU also what they
-    tell of a drift. Odometry's noise is stated, or found in its scatter, as white, which says nothing of errors that
-    last, such as a wrong radius of the wheels: tracks that count for no more than they tell of a drift leave the drift
-    to it.
+    With odometry the weight follows from the correlation along tracks and among neighbours; with an IMU also from the
+    tracks' scores for a drift. The noise of odometry is stated, or estimated from its scatter, as white, which does not
+    cover lasting errors such as a wrong wheel radius. If tracks had no more weight than their scores allow, the drift
+    would follow these errors.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -88,28 +89,28 @@ class DiscountedTracks:
 
     @property
     def share(self) -> float:
-        """Return the share of its information that a sighting counts for now."""
+        """Return the present weight of a sighting, a factor in (0, 1] on its information."""
         return self._correlation.share
 
     @property
     def now(self) -> Discounted:
-        """Return the rig and the loss that give sightings this share."""
+        """Return the rig and the loss threshold that give sightings this weight."""
         return discounted(self._rig, self._huber, self.share)
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Return what a user should know, a line, where tracks do not count in full."""
+        """Return one log line if tracks have less than their full weight, else nothing."""
         return self._correlation.messages
 
     def learn(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
-        """Take in what the first of two frames saw of points (3,) m, beside the second one, from poses (2, 4, 4)."""
+        """Add residuals of points (3,) m in the first of two frames and in the second, from poses (2, 4, 4)."""
         if self._correlation.matches:
             left = residuals_of(frames, T_world_imu, points, self._rig)
             self._learn(left, left.select(left.frames == 0))
             self.settle(frames[0], T_world_imu[0])
 
     def learn_from_all(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
-        """Take in what all frames saw of points (3,) m, at the answer for their poses (K, 4, 4)."""
+        """Add residuals of points (3,) m in all frames, at the final poses (K, 4, 4)."""
         if not self._correlation.matches:
             return
         left = residuals_of(frames, T_world_imu, points, self._rig)
@@ -119,12 +120,12 @@ class DiscountedTracks:
         self._correlation.settle_last()
 
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Take in the next frame whose pose (4, 4) will hardly change any more."""
+        """Add the next frame whose pose (4, 4) will hardly change any more."""
         if self._beside_imu:
             self._correlation.settle(frame, T_world_imu)
 
     def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
-        """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""
+        """Add sightings, with the rows of their poses in (K, 4, 4) and of their points in (M, 3) m."""
         if not self._correlation.matches:
             return
         often = np.bincount(sightings.point, minlength=len(points)) >= FEWEST_SIGHTINGS
@@ -139,7 +140,7 @@ class DiscountedTracks:
 
 
 def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
-    """Return the ids of the tracks with sightings enough that their landmarks do not take up all there is."""
+    """Return the ids of tracks with enough sightings that the fitted landmark does not absorb their residuals."""
     count = Counter[int]()
     for frame in frames:
         count.update(frame.track_ids.tolist())
@@ -156,17 +157,17 @@ class Residuals(NamedTuple):
     H_pose: Array
 
     def select(self, rows: BoolArray) -> "Residuals":
-        """Return some of them (N,)."""
+        """Return some rows (N,)."""
         tracks, frames, uvs_px, whitened, H_pose = self
         return Residuals(tracks[rows], frames[rows], uvs_px[rows], whitened[rows], H_pose[rows])
 
     @property
     def sound(self) -> "Residuals":
-        """Return those that are no outliers by the stated noise."""
+        """Return the residuals that are not outliers by the stated noise."""
         return self.select(np.square(self.whitened).sum(axis=1) < chi2_bound(3, SOUND))
 
     def successive(self) -> tuple[Array, Array]:
-        """Return those (n, 3) of tracks that have one a frame later, and that one (n, 3)."""
+        """Return the residuals (n, 3) whose track is also seen one frame later, and those of that frame (n, 3)."""
         order = np.lexsort((self.frames, self.tracks))
         before, after = order[:-1], order[1:]
         pairs = (self.tracks[before] == self.tracks[after]) & (self.frames[after] == self.frames[before] + 1)
@@ -176,7 +177,7 @@ class Residuals(NamedTuple):
 def residuals_of(
     frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array], rig: StereoRig
 ) -> Residuals:
-    """Return the residuals of what frames saw of points (3,) m from poses (K, 4, 4), but for outliers."""
+    """Return the residuals of points (3,) m in frames from poses (K, 4, 4), outliers left out."""
     frames = [frame.select(np.array([i in points for i in frame.track_ids.tolist()], dtype=bool)) for frame in frames]
     index = np.repeat(np.arange(len(frames)), [len(frame.track_ids) for frame in frames])
     track_ids = np.concatenate([frame.track_ids for frame in frames])

@@ -1,10 +1,11 @@
-"""In which order the variables of a smoother's graph are eliminated: in COLAMD's, or, along a standstill, in time.
+"""The elimination order of a smoother's graph: COLAMD's, or the order of time where the vehicle stands still.
 
-COLAMD (Davis, Gilbert, Larimore and Ng 2004, "A column approximate minimum degree ordering algorithm") is the faster
-one where landmarks come and go. While a vehicle stands, hundreds of states see the same landmarks. In the order of time
-such a landmark waits for the last state that saw it, and a state depends on no more than the next one and what waits.
-Which order it is to be is counted: both are eliminated symbolically, and the one of fewer operations is taken. That
-takes the time of half an iteration, so it is asked only where a landmark is seen so often that they may differ.
+COLAMD (Davis, Gilbert, Larimore and Ng 2004, "A column approximate minimum degree ordering algorithm") is faster where
+landmarks come and go. While a vehicle stands, hundreds of states see the same landmarks. In the order of time such a
+landmark is eliminated after the last state that saw it, and a state depends only on the next state and the landmarks
+not yet eliminated. The choice is made by counting: both orders are eliminated symbolically, and the one with fewer
+operations is taken. Counting takes the time of half an iteration, so it is done only where a landmark is seen so often
+that the two orders may differ.
 """
 
 from collections import defaultdict
@@ -20,16 +21,16 @@ from toolkit.sequence import StereoFrame
 
 Order = Callable[[gtsam.NonlinearFactorGraph, list[StereoFrame]], gtsam.Ordering]
 
-# In the order of time a landmark that more states saw than this waits for the last of them.
+# In the order of time, a landmark seen from more states than this is eliminated after the last of them.
 _MOST_TIED = 50
-# With no landmark that more states saw than this, nothing is counted.
+# If no landmark is seen from more states than this, COLAMD is taken without counting.
 _FEWEST_STANDING = 150
-# Rows of each kind of variable. A twist's bias has half of an IMU's, which does not change the choice.
+# Dimension of each kind of variable. The bias of twists has half of it, which does not change the choice.
 _SIZES = {"x": 6, "v": 3, "b": 6, "l": 3, "s": 1}
 
 
 def cheaper_order(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> Order:
-    """Return how to order a graph of states that move so, of which state k saw the landmarks of frame k."""
+    """Return the cheaper order for a graph with these motion factors; state k sees the landmarks of frame k."""
     if max((count for _, count, _ in _landmarks(frames)), default=0) <= _FEWEST_STANDING:
         return by_colamd
     graph = _symbolic(motion, frames)
@@ -43,7 +44,7 @@ def by_colamd(graph: gtsam.NonlinearFactorGraph, _frames: list[StereoFrame]) -> 
 
 
 def in_time(graph: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.Ordering:
-    """Return landmarks first, then the states in time, each after the landmarks that wait for it, and all else last."""
+    """Return landmarks first, then states in time, each followed by the landmarks last seen from it, the rest last."""
     return _in_time(graph.keyVector(), frames)
 
 
@@ -65,7 +66,7 @@ def _in_time(keys: Iterable[int], frames: list[StereoFrame]) -> gtsam.Ordering:
 
 
 def _operations(graph: gtsam.SymbolicFactorGraph, ordering: gtsam.Ordering) -> int:
-    """Return how many operations an elimination takes, in proportion: rows times those they depend on, squared."""
+    """Return the operations of an elimination, in proportion: rows times the squared number of columns they involve."""
     net, total = graph.eliminateSequential(ordering), 0
     for conditional in map(net.at, range(net.size())):
         sizes = [_SIZES[kind_of(key)] for key in conditional.keys()]  # noqa: SIM118 - not a mapping
@@ -74,7 +75,7 @@ def _operations(graph: gtsam.SymbolicFactorGraph, ordering: gtsam.Ordering) -> i
 
 
 def _landmarks(frames: list[StereoFrame]) -> list[tuple[int, int, int]]:
-    """Return each track's id, in how many frames it is seen, and the last of them."""
+    """Return the id of each track, the number of frames that see it, and the last of them."""
     sizes = [frame.track_ids.size for frame in frames]
     frame: IntArray = np.repeat(np.arange(len(frames)), sizes)
     ids, track, counts = np.unique(
@@ -86,7 +87,7 @@ def _landmarks(frames: list[StereoFrame]) -> list[tuple[int, int, int]]:
 
 
 def _symbolic(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.SymbolicFactorGraph:
-    """Return which variables depend on one another."""
+    """Return the symbolic graph: which variables share a factor."""
     graph = gtsam.SymbolicFactorGraph()
     for keys in (motion.at(i).keys() for i in range(motion.size())):
         for tied in combinations(keys, 2) if len(keys) > 1 else [keys]:

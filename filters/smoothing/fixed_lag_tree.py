@@ -1,22 +1,23 @@
-"""The window of a fixed-lag smoother on GTSAM's Bayes tree, which goes on when its system becomes indeterminate.
+"""The window of a fixed-lag smoother on GTSAM's Bayes tree, with recovery from an indeterminate system.
 
-GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
-state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
-then the landmarks (those that the marginals of what has left tie to one another last, in a few large cliques), then the
-states in the order of time, but the oldest, which leaves next, beside the newest in the root: the last covariance of
-the one and the first of the other are nearly free, and the update costs no more. Behind the newest comes a variable
-without a meaning, for the sake of the condition of the cliques (``indeterminate``).
+GTSAM's own IncrementalFixedLagSmoother does not control the elimination order within the window and leaves the newest
+state deep in the tree: its marginal then costs twice the update. Here the variables that are about to leave are
+eliminated first, then the landmarks (those that marginals of departed variables connect come last, in a few large
+cliques), then the states in the order of time. The oldest state, which leaves next, is the exception: it stands beside
+the newest in the root. The last covariance of the oldest and the first of the newest are then nearly free, and the
+update costs no more. A dummy variable follows the newest state, for the condition number of the cliques
+(``indeterminate``).
 
-A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
-frame is dropped, and so are landmarks without a depth in a clique that GTSAM names by another. A state that does so the
-first time is a matter of rounding in the normal equations: the window is then solved by QR, ten times as long, until
-vision has been back for as long as it reaches. Either way a new tree is built of the factors of the old, with the same
-estimates.
+A variable that makes the system indeterminate is held weakly at its value. A landmark that does so again in the same
+frame is dropped, and so are landmarks without a determined depth in a clique for which GTSAM names another variable.
+For a state, the first cause is rounding in the normal equations: the window is then solved by QR, which takes ten times
+as long, until vision has been available again for the length of the window. In either case a new tree is built from the
+factors of the old one, with the same estimates.
 
-Chained sightings are linearised about the latest estimates in every frame, and everything else must be linearised
-there with them: what neither motion nor vision tells, such as how a tilt and the accelerometer's bias share an error,
-is in the null space of both only at the same place. Off by a hundredth of a radian, they told a tilt to a sixth of
-the standard deviation it had.
+Chained sightings are relinearised about the latest estimates in every frame, and everything else must be linearised
+there with them. A direction that neither motion nor vision observes, such as an exchange of tilt and accelerometer
+bias, is in the null space of both only at the same linearisation point. With points a hundredth of a radian apart, the
+standard deviation of a tilt came out as a sixth of the right one.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -39,19 +40,19 @@ from toolkit.errors import EstimatorError
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
-# How many landmarks are eliminated in one clique that what has left the window tells of: fewer, and what is copied from
-# clique to clique costs more; more, and rows have zeros.
+# How many landmarks with a marginal on them are eliminated in one clique: with fewer, copying from clique to clique
+# costs more; with more, rows have zeros.
 _MOST_AT_ONCE = 12
-# Radians, metres and their kin that an estimate may be from where GTSAM linearised its factors; beside chained
-# sightings nothing, but for what a marginal holds.
+# How far an estimate may be from GTSAM's linearisation point, in rad, m and so on. With chained sightings no distance
+# is allowed, except for variables that a marginal fixes.
 RELINEARISE_BEYOND, BESIDE_CHAINED = 0.01, 0.0
 
-# Makes another graph of one and of the values of all its variables.
+# Maps a graph and the values of all its variables to another graph.
 Remake = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.NonlinearFactorGraph]
 
 
 class FixedLagTree:
-    """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
+    """Adds factors and values with their stamps; variables older than the lag are marginalised."""
 
     def __init__(self, lag_ns: int, chained: ChainedWindow) -> None:
         self._lag_ns, self._chained = lag_ns, chained
@@ -62,18 +63,18 @@ class FixedLagTree:
         self._state_stamps_ns: dict[int, int] = {}
         self._landmark_stamps_ns: dict[int, int] = {}
         self._first_seen_ns: dict[int, int] = {}
-        # What the trees before this one marginalised is linear in these variables, where they are linearised.
+        # Variables in marginals of earlier trees, which are valid only at the linearisation points of these variables.
         self._fixed: set[int] = set()
-        # The variables of the newest state with their sizes; where the factors are that tie the last variable to them.
+        # The variables of the newest state with their sizes, and the slots of the factors that tie the dummy to them.
         self._newest: dict[int, int] = {}
         self._tie_slots: list[int] = []
-        # The landmarks that did not come into the latest tree, none of their sightings counting any more.
+        # The landmarks that are not in the latest tree, because none of their sightings is used any more.
         self._behind = set[int]()
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
-        """Take in what a packet at a time adds, and solve; return what had to be recovered.
+        """Add a packet's factors and values at a time, and solve; return the recoveries.
 
-        Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
+        Raises EstimatorError where the system stays indeterminate after all recoveries.
         """
         self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
         seen = list(map(L, extension.landmark_ids))
@@ -84,19 +85,19 @@ class FixedLagTree:
             self._chained.add(*extension.chained)
         self._newest = {key: extension.values.extract([key]).dim() for key in extension.state_keys}
         added, back = self._solved(extension.factors, extension.values), Recovery([], set())
-        # Only now: a landmark that is dropped on the way back may be among those of the packet.
+        # Only after the update: a landmark dropped by the return to Cholesky may be one of the packet's.
         if self._by_qr_from_ns is not None and extension.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
             self._by_qr_from_ns = None
             back = self.rebuild()
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def rebuild(self, remade: Remake | None = None) -> Recovery:
-        """Build the tree anew; its estimates, now and later, are the same but for rounding, and for factors remade."""
+        """Rebuild the tree; except for factors remade, its present and later estimates are the same up to rounding."""
         factors, values = self._emptied()
         return self._solved(factors if remade is None else remade(factors, values), values)
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
-        """Take landmarks out with their sightings in the window; the others keep what older sightings added."""
+        """Remove landmarks and their sightings in the window; other variables keep older sightings' information."""
         self._chained.drop(track_ids)
         keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
         slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
@@ -105,7 +106,7 @@ class FixedLagTree:
         return self._solved(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of the window, and of what the last packet made leave it."""
+        """Return the latest values of the window, and of the variables that left it with the last packet."""
         return self._values
 
     def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
@@ -115,14 +116,14 @@ class FixedLagTree:
     def _solved(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int] = ()
     ) -> Recovery:
-        """Add factors and values, take some factors out, and solve until nothing is indeterminate."""
+        """Add factors and values, remove some factors, and solve until nothing is indeterminate."""
         log: list[str] = []
         held, dropped = set[int](), set[int]()
         for _ in range(MOST_RECOVERIES):
             try:
                 self._update(factors, values, dropped_slots)
             except RuntimeError as refusal:
-                # What was new is in the tree by now, but the tree is not to be used any more.
+                # The new factors are in the tree by now, but the tree is not usable any more.
                 key, dropped_slots = variable_named(refusal), ()
                 if kind_of(key) != "l" and self._by_qr_from_ns is None:
                     self._by_qr_from_ns = self._newest_ns()
@@ -151,7 +152,7 @@ class FixedLagTree:
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
     def _undetermined(self, but: int) -> list[int]:
-        """Return the landmarks whose own factors do not determine them; none where a given one is among them."""
+        """Return the landmarks that their own factors do not determine; none if ``but`` is among them."""
         beyond = undetermined(without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint())
         return [] if but in beyond else beyond
 
@@ -161,7 +162,7 @@ class FixedLagTree:
     def _with_the_last_tied(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, slots: list[int]
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
-        """Return what is added and taken out, and with it the ties of the last variable, from one state to the next."""
+        """Return factors to add and slots to remove that also move the dummy variable's ties to the newest state."""
         factors, values = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values)
         if not self._isam.valueExists(LAST):
             values.insert(LAST, np.zeros(1))
@@ -171,13 +172,13 @@ class FixedLagTree:
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int]) -> None:
         old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < self._oldest_ns]
         old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < self._oldest_ns]
-        # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it; and
-        # CCOLAMD takes no place beyond the number of variables it orders.
+        # Before an old state can leave, everything below it in the tree must be eliminated again, after it; and
+        # CCOLAMD accepts no index beyond the number of variables it orders.
         new = set(values.keys())
         known = [key for key in (*self._landmark_stamps_ns, *self._state_stamps_ns) if key not in new]
         factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
         self._add(factors, values, slots, _key_list(known))
-        # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.
+        # QR eliminates singular systems without an error: it appears here, before anything is marginalised.
         self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
         still_there = [key for key in leaving if self._isam.valueExists(key)]
@@ -194,14 +195,14 @@ class FixedLagTree:
         dropped_slots: Iterable[int],
         eliminated_anew: gtsam.KeyList,
     ) -> None:
-        """Add factors and values, take some factors out, and linearise all chained sightings anew."""
+        """Add factors and values, remove some factors, and relinearise all chained sightings."""
         before, together = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph(factors)
         slots = [*dropped_slots, *self._chained.slots]
         together.push_back(self._relinearised(values))
         try:
             result = self._isam.update(together, values, slots, self._order(), _key_list(self._fixed), eliminated_anew)
         except RuntimeError:
-            # What was new is in the tree by now: in the first slots that were free, in its order.
+            # The new factors are in the tree by now: in the first free slots, in their order.
             new_slots = _new_slots(before, self._isam.getFactorsUnsafe())
             self._chained.placed(new_slots[factors.size() :])
             raise
@@ -210,7 +211,7 @@ class FixedLagTree:
         self._chained.placed(placed[ours:])
 
     def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return the factors of chained sightings about the latest estimates, or where there are none the new."""
+        """Return the factors of chained sightings about the latest estimates, for new variables about ``new``."""
         if not self._chained.is_used:
             return gtsam.NonlinearFactorGraph()
         keys = self._chained.keys()
@@ -221,7 +222,7 @@ class FixedLagTree:
         return self._chained.factors(estimates, _joined(at, estimates, keys))
 
     def _latest(self, new: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
-        """Return the latest estimates of keys, or where there are none the new."""
+        """Return the latest estimates of keys, those of ``new`` for keys not in the tree."""
         known = [key for key in keys if self._values.exists(key) and key not in self._left]
         return _joined(self._values.extract(known), new, keys)
 
@@ -232,12 +233,12 @@ class FixedLagTree:
         self._fixed.difference_update(leaving)
 
     def _emptied(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Begin a new tree; return all that was in the old one, to be taken in.
+        """Start a new tree; return all factors and values of the old one, to be added to it.
 
-        A landmark that was dropped with all its factors stays behind: in a tree it would be a variable without a place.
-        So is one that the last step took behind every camera that saw it: none of its sightings counts.
-        GTSAM's marginal factors have no linearisation point: they stay right only while their variables stay linearised
-        where they are. The tree that made them holds those fixed; the next one must be given them.
+        A landmark that was dropped with all its factors is left out, because in a tree it would be a variable without
+        an elimination index. So is one that the last step moved behind every camera that saw it: none of its sightings
+        is used. GTSAM's marginal factors have no linearisation point: they stay right only while their variables keep
+        their linearisation points. The tree that made them fixes those; for the next tree they must be passed on.
         """
         others, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
         for slot in self._chained.slots:
@@ -260,7 +261,7 @@ class FixedLagTree:
     def _without(
         self, key: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return factors and values less a landmark and its sightings; what the prior has of it is marginalised."""
+        """Return factors and values without a landmark and its sightings; the prior is marginalised over it."""
         self._chained.drop([gtsam.Symbol(key).index()])
         kept = gtsam.NonlinearFactorGraph()
         for factor in (factors.at(i) for i in range(factors.size())):
@@ -283,9 +284,9 @@ class FixedLagTree:
         return gtsam.ISAM2(params)
 
     def _order(self) -> gtsam.KeyGroupMap:
-        """Return the place of every variable in the elimination; those to leave have none, which is the first.
+        """Return the elimination index of every variable; those about to leave have none, which puts them first.
 
-        Places must be consecutive: CCOLAMD, unchecked, wants fewer of them than variables.
+        Indices must be consecutive: CCOLAMD, unchecked, expects fewer of them than variables.
         """
         landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns >= self._oldest_ns]
         states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= self._oldest_ns]
@@ -303,11 +304,12 @@ class FixedLagTree:
         return groups
 
     def _in_turn(self, landmarks: list[int]) -> list[list[int]]:
-        """Return which landmarks are eliminated together: first those that what has left the window tells nothing of.
+        """Return groups of landmarks to eliminate together: first those that are in no marginal.
 
-        All others are tied to one another. Of those that were seen up to about the same time one that was seen the
-        latest leads: then no other has states that it has not, and they are eliminated as one clique, not each as one
-        of nearly all that is left.
+        All others are connected by marginals. They are grouped by when they were last seen, and each group starts with
+        its landmark seen the latest. No other landmark of the group then involves states that the first does not, and
+        the group is eliminated as one clique; otherwise each landmark would be eliminated in a clique of nearly all
+        remaining variables.
         """
         connected = [key for key in landmarks if self._first_seen_ns[key] < self._oldest_ns]
         connected.sort(key=self._landmark_stamps_ns.__getitem__)
@@ -317,13 +319,13 @@ class FixedLagTree:
 
 
 def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
-    """Say whether a factor goes when a landmark does: a sighting, or what is linear and concerns nothing else."""
+    """Say whether a factor is removed with a landmark: a sighting, or a linear factor on it alone."""
     keys: list[int] = factor.keys()
     return landmark in keys and (len(keys) == 1 or not isinstance(factor, gtsam.LinearContainerFactor))
 
 
 def _without_ties(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """Return the factors but those on the last variable."""
+    """Return the factors except those on the dummy variable."""
     kept = gtsam.NonlinearFactorGraph()
     for factor in (factors.at(i) for i in range(factors.size())):
         if LAST not in factor.keys():  # noqa: SIM118 - not a mapping
@@ -343,12 +345,12 @@ def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
 
 
 def _new_slots(before: gtsam.NonlinearFactorGraph, after: gtsam.NonlinearFactorGraph) -> list[int]:
-    """Return the slots, ascending, that have a factor where there was none."""
+    """Return the slots, ascending, that have a factor now and had none before."""
     was = [slot < before.size() and before.exists(slot) for slot in range(after.size())]
     return [slot for slot in range(after.size()) if after.exists(slot) and not was[slot]]
 
 
 def _joined(first: gtsam.Values, second: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
-    """Return values of keys: the first, and of keys that are not among them the second."""
+    """Return values of keys: those of the first, and those of the second for keys not in the first."""
     first.insert(second.extract([key for key in keys if not first.exists(key)]))
     return first

@@ -1,10 +1,10 @@
-"""Variables of an incremental tree that stay linearised where they are: frozen ones, and those of them that left it.
+"""Variables of an incremental tree whose linearisation points are fixed: frozen ones, and those that left the tree.
 
-No recent frame has factors on a frozen one. iSAM2 walks its whole tree once a frame, whatever the frame changes, so
-that frozen variables are marginalised for its speed, and kept for the final solve. The marginal of one that leaves says
-of the others what it said itself, to rounding; those others GTSAM holds where they are linearised, too. Source: Kaess
-et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", section 3.3, of which a marginal of leaves
-is the cached factor on a subtree's separator.
+No recent frame has factors on a frozen variable. iSAM2 traverses its whole tree once a frame, whatever the frame
+changes, so frozen variables are marginalised for speed, and kept for the final solve. The marginal of a variable that
+leaves has the same information on the others as its factors, up to rounding; GTSAM fixes the linearisation points of
+those others too. Source: Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", section
+3.3: the marginal of leaves is the cached factor on a subtree's separator.
 """
 
 from collections import deque
@@ -14,9 +14,9 @@ import gtsam
 
 
 class FrozenVariables:
-    """Which variables no recent frame has factors on, to be left where they are linearised.
+    """Tracks which variables no recent frame has factors on; their linearisation points stay fixed.
 
-    One that is seen again later stays frozen: its new factors are linearised where it was.
+    A variable that is seen again later stays frozen: its new factors are linearised at its fixed point.
     """
 
     def __init__(self, frames: int) -> None:
@@ -31,28 +31,28 @@ class FrozenVariables:
 
     @property
     def others(self) -> Set[int]:
-        """Return the variables that recent frames have factors on, but for those that were frozen before."""
+        """Return the variables that recent frames have factors on, except those frozen before."""
         return self._used
 
     def unused_for(self, frames: int) -> list[int]:
-        """Return the listed keys that none of the last so many frames has factors on, or in view."""
+        """Return the listed keys that the last ``frames`` frames neither had in view nor have factors on."""
         oldest = self.count - frames
         return [key for key in self.keys if max(self._last_frame[key], self._last_view.get(key, 0)) < oldest]
 
     def see(self, landmarks: Iterable[int]) -> None:
-        """Note what the next frame has in view, whether or not there will be factors on it."""
+        """Note the landmarks in view of the next frame, whether or not it has factors on them."""
         self._last_view |= dict.fromkeys(landmarks, self.count)
 
     def leave(self, keys: Collection[int]) -> None:
-        """Take keys off the list, which stay frozen."""
+        """Remove keys from the list; they stay frozen."""
         self.keys = key_list(key for key in self.keys if key not in keys)
 
     def come_back(self, keys: Collection[int]) -> None:
-        """Put keys on the list again."""
+        """Return keys to the list."""
         self.keys = key_list([*self.keys, *keys])
 
     def add_frame(self, keys: Iterable[int]) -> None:
-        """Count a frame whose factors are on some variables; freeze those of none of the last frames."""
+        """Count a frame with factors on some variables; freeze the variables that no recent frame has factors on."""
         frame = set(keys)
         self._recent.append(frame)
         self._last_frame |= dict.fromkeys(frame, self.count)
@@ -68,7 +68,7 @@ class FrozenVariables:
 
 
 class RetiredVariables:
-    """The variables that left a tree, the factors that went with them, and the slots of these and their marginals."""
+    """The variables that left a tree, their factors, and the slots of these factors and of the marginals."""
 
     def __init__(self) -> None:
         self.keys: set[int] = set()
@@ -78,7 +78,7 @@ class RetiredVariables:
         self._latest, self._linearised_at = gtsam.Values(), gtsam.Values()
 
     def take(self, tree: gtsam.ISAM2, leaving: list[int]) -> None:
-        """Marginalise variables that nothing else in the tree hangs below; keep them and their factors."""
+        """Marginalise variables that are leaves of the tree; keep them and their factors."""
         before = gtsam.NonlinearFactorGraph(tree.getFactorsUnsafe())
         self._latest.insert(tree.calculateEstimate().extract(leaving))
         self._linearised_at.insert(tree.getLinearizationPoint().extract(leaving))
@@ -89,7 +89,7 @@ class RetiredVariables:
         self.slots = set(self._factors)
 
     def with_factors_of(self, tree: gtsam.ISAM2) -> gtsam.NonlinearFactorGraph:
-        """Return the factors of a tree and of what left it, each in its slot, and no marginals."""
+        """Return the factors of a tree and of the variables that left it, each in its slot, and no marginals."""
         factors = gtsam.NonlinearFactorGraph(tree.getFactorsUnsafe())
         for slot in self._marginals:
             factors.remove(slot)
@@ -98,16 +98,16 @@ class RetiredVariables:
         return factors
 
     def with_values(self, of_tree: gtsam.Values) -> gtsam.Values:
-        """Return a tree's values and those that what left it had last."""
+        """Return a tree's values, and the last values of the variables that left it."""
         return _joined(of_tree, self._latest)
 
     def with_linearisation_points(self, of_tree: gtsam.Values) -> gtsam.Values:
-        """Return where a tree's variables and those that left it are linearised."""
+        """Return the linearisation points of a tree's variables and of those that left it."""
         return _joined(of_tree, self._linearised_at)
 
 
 def key_list(keys: Iterable[int]) -> gtsam.KeyList:
-    """Return keys as GTSAM's updates take them."""
+    """Return keys in the form that GTSAM's updates take."""
     listed = gtsam.KeyList()
     for key in keys:
         listed.push_back(key)

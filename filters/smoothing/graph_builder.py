@@ -1,9 +1,9 @@
-"""What one packet adds to an incremental smoother's graph: new factors, first values, and the variables they are on.
+"""What one packet adds to an incremental smoother's graph: new factors, initial values, and the variables involved.
 
-Sightings of tracks that have gone over to another point are left out. Beside odometry, and where errors along tracks
-are correlated, a new state begins where its sightings of known landmarks put it, not where the measured motion alone
-does: the motion may be off by many times what is new in a sighting of a track, and linearised there a loss would weigh
-every sighting down as an outlier.
+Sightings of tracks that have jumped to another point are left out. With odometry, and with a track noise model, the
+initial value of a new state is the pose that best fits its sightings of known landmarks, not the prediction by the
+measured motion alone. The prediction may be off by many sigmas of a sighting's innovation, and linearised there the
+loss would give every sighting the weight of an outlier.
 """
 
 from collections.abc import Mapping
@@ -28,18 +28,19 @@ from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame
 
-# A frame tells what tracks count for once so many more have come: its landmarks are seen from enough by then.
+# A frame's residuals are used for the weight of tracks once this many frames have followed: its landmarks are then
+# seen from enough poses.
 LEARNT_AFTER_FRAMES = 5
-# Sightings in the graph may count for so many times as much as they are known to by now, or for so much less.
+# The largest ratio between the weight of sightings in the graph and their present weight, or its inverse.
 _MOST_OUTDATED = 1.25
 
 
 @dataclass
 class GraphExtension:
-    """New factors and values, and every state and landmark they are on.
+    """New factors and values, and every state and landmark they involve.
 
-    ``chained`` are the sightings of the frame, by its number, whose errors are correlated with earlier ones: factors of
-    them are the smoother's affair.
+    ``chained`` is the frame and its number if the errors of its sightings are correlated with earlier ones; the
+    smoother then makes their factors itself.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
@@ -50,19 +51,19 @@ class GraphExtension:
 
 
 class GraphBuilder:
-    """Turns packets into what they add to a graph; remembers which landmarks the graph has."""
+    """Turns packets into additions to a graph; remembers which landmarks the graph has."""
 
     def __init__(self, setup: Setup) -> None:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._tracks, self._used = DiscountedTracks(setup), dict[int, StereoFrame]()
         self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
-        # What the sightings counted for that are longest in the graph, and whether all others count for that too.
+        # The weight of the oldest sightings in the graph, and whether all others have the same weight.
         self._share_in_graph, self._count_alike = 1.0, True
-        # What is new in a sighting of a track whose noise is stated has the filters' gate, as their tracks have.
+        # With a track noise model, a sighting's innovation is tested by the filters' gate, not a multiple of it.
         if setup.rig.track_noise is not None:
             outliers = msgspec.structs.replace(outliers, smoother_gate_factor=1.0)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
-        # What an IMU predicts of pose and velocity goes together, and is near enough for white noise of tracks.
+        # An IMU's prediction keeps pose and velocity consistent, and is near enough for tracks with white noise.
         self._begins_there = setup.motion_kind != "imu" or setup.rig.track_noise is not None
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
@@ -75,7 +76,7 @@ class GraphBuilder:
         self._noise, self._predicted = MatchedNoise.of(setup), self.belief
 
     def extend(self, packet: Packet) -> GraphExtension:
-        """Return what a packet adds, the new state being predicted from the latest known."""
+        """Return what a packet adds; the new state is predicted from the latest one."""
         extension = GraphExtension()
         expected = self._add_state(self._noise.applied(packet), extension)
         there, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks, self._tracks.share)
@@ -91,7 +92,7 @@ class GraphBuilder:
         return extension
 
     def update(self, newest: Estimate, points: Mapping[int, Array]) -> None:
-        """Take over the newest state and landmarks (3,) m as the smoother has them after a packet."""
+        """Take the smoother's newest state and landmarks (3,) m after a packet."""
         self.belief = self.belief.at(newest)
         self._noise.learn(newest.t_ns, self._predicted, self.belief)
         if self._bridge is not None:
@@ -99,18 +100,18 @@ class GraphBuilder:
         self._landmarks.move(points)
 
     def learn(self, k: int, T_world_imu: Array) -> None:
-        """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
+        """Use frame k for the weight of tracks; ``T_world_imu`` (2, 4, 4) are present poses of frames k and k + 1."""
         known = self._landmarks.points
         points = {i: known[i] for i in seen_often(self._used.values()) if i in known}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
 
     @property
     def is_outdated(self) -> bool:
-        """Say whether sightings in the graph count for far more, or less, than they are known to by now."""
+        """Say whether the weight of sightings in the graph differs much from their present weight."""
         return not 1.0 / _MOST_OUTDATED < self._tracks.share / self._share_in_graph < _MOST_OUTDATED
 
     def brought_up_to_date(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Return a graph whose sightings all count for what they are known to by now; the rest is as it was."""
+        """Return the graph with all sightings at their present weight; other factors are unchanged."""
         if self._count_alike and self._tracks.share == self._share_in_graph:
             return graph
         factors = self._factors()
@@ -119,16 +120,16 @@ class GraphBuilder:
 
     @property
     def info(self) -> dict[str, float]:
-        """Return how the newest state was predicted, by the names an Estimate's info has."""
+        """Return the noise scale of the newest prediction, under its key in an Estimate's info."""
         return self._noise.info
 
     def window_brought_up_to_date(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> gtsam.NonlinearFactorGraph:
-        """Return the graph of a window so, with values of all its variables.
+        """Return a window's graph with all sightings at their present weight; ``values`` has all its variables.
 
-        Where sightings count for less than they did, what has left the window does so too: landmarks that their past
-        makes sure would stand against new ones, and the poses between them.
+        If the weight has fallen, the landmarks' part of the marginals is reduced by the same factor. Otherwise old
+        landmarks would be too certain and would outweigh new ones, and the poses between them.
         """
         before = self._share_in_graph
         graph = self.brought_up_to_date(graph)
@@ -136,21 +137,21 @@ class GraphBuilder:
         return discounted_past(graph, values, fallen) if fallen < 1.0 else graph
 
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the motion and the tracks that were taken in."""
+        """Return the log lines about motion noise and tracks."""
         return self._noise.messages + self._tracks.messages
 
     def contradicted(self) -> set[int]:
-        """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
+        """Return the landmarks to drop after a packet, because later sightings of their tracks contradict them."""
         assert self._refused is not None
         return self._refused_tracks.contradicted(*self._refused, self.belief.T_world_imu)
 
     def forget(self, landmark_ids: set[int]) -> None:
-        """Drop landmarks that have left the graph; seen again, they start anew."""
+        """Drop landmarks that have left the graph; if seen again, they are started again."""
         self._refused_tracks.forget(landmark_ids)
         self._landmarks.forget(landmark_ids)
 
     def _add_state(self, packet: Packet, extension: GraphExtension) -> Belief:
-        """Add the new state; return it as expected against the map."""
+        """Add the new state; return its prediction with the covariance relative to the map."""
         expected = relative_to_its_map(self.belief)
         if packet.motion is None:
             extension.factors.push_back(self.motion.hold(self.belief, packet.index))
@@ -185,7 +186,7 @@ class GraphBuilder:
         self._landmarks.see(used, placed, self.belief.T_world_imu, self._tracks.share)
 
     def _factors(self) -> StereoFactors:
-        """Return what makes factors of sightings that count for what they are known to count for now."""
+        """Return the maker of stereo factors at the present weight of sightings."""
         if self._share != self._tracks.share:
             rig, huber = self._tracks.now
             self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share

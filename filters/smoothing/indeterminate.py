@@ -1,15 +1,15 @@
-"""What to do when GTSAM finds a system indeterminate, which variable it names, and what makes a landmark one.
+"""Recovery where GTSAM finds a system indeterminate: which variable it names, and how a landmark becomes one.
 
-GTSAM's stereo factor has no gradient where its landmark is behind the camera. A landmark that is seen at too small a
-disparity first and at larger ones next is moved by a Gauss-Newton step in metres, taken with the slope of depth at the
-small disparity: it passes the camera where the right disparity is more than twice the first. Linearised there the
+GTSAM's stereo factor has no gradient where its landmark is behind the camera. Suppose a landmark is first seen at too
+small a disparity and then at larger ones. A Gauss-Newton step in metres uses the slope of depth at the small disparity,
+and moves the landmark behind the camera if the right disparity is more than twice the first. Linearised there, the
 landmark would be indeterminate.
 
-GTSAM also refuses a clique whose own variables, scaled to a unit diagonal, have a condition beyond 7e7. An IMU ties two
-states of neighbouring frames so well, and the world after a minute of driving so loosely, that both in one clique are
-beyond it; and the last two eliminated always are in one, for the one before the last hangs on all that is left. So the
-newest state is followed by a variable that means nothing and that only this state is tied to, by factors that weigh
-nothing.
+GTSAM also refuses a clique whose own variables, scaled to a unit diagonal, have a condition number beyond 7e7. An IMU
+ties the states of neighbouring frames so tightly, and after a minute of driving the world is known so loosely, that two
+states in one clique exceed it. The last two variables eliminated are always in one clique, because the one before the
+last depends on all that remains. So the newest state is followed by a dummy variable that is tied to this state alone,
+by factors with negligible weight.
 """
 
 import re
@@ -27,16 +27,16 @@ from toolkit.models.motion import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.sequence import StereoRig
 
-# What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
+# Sigma of the prior on a variable that nothing else determines: m for a landmark; rad, m, m/s for a state.
 WEAK_SIGMA = 1.0
-# The condition of a landmark's information, scaled to a unit diagonal, beyond which GTSAM refuses it.
+# The condition number of a landmark's information, scaled to a unit diagonal, beyond which GTSAM refuses it.
 MOST_CONDITION = 7e7
-# The variable that is eliminated last.
+# The dummy variable, which is eliminated last.
 LAST = gtsam.symbol("r", 0)
 
 
 class Recovery(NamedTuple):
-    """What had to be recovered, a line each, and the track ids of the landmarks that were dropped for it."""
+    """A log line for each recovery, and the track ids of the landmarks that were dropped."""
 
     log: list[str]
     dropped: set[int]
@@ -49,7 +49,7 @@ def behind_camera(points: Array, T_world_imu: Array, rig: StereoRig) -> BoolArra
 
 
 def variable_named(refusal: RuntimeError) -> int:
-    """Return the key of the variable GTSAM says it was working near; any other refusal is raised again."""
+    """Return the key of the variable near which GTSAM reports the failure; any other error is raised again."""
     named = re.search(r"near variable\s+(\d+)", str(refusal))
     if named is None:
         raise refusal
@@ -57,18 +57,17 @@ def variable_named(refusal: RuntimeError) -> int:
 
 
 def undetermined(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> list[int]:
-    """Return the landmarks whose factors do not determine them, of a graph without empty slots.
+    """Return the landmarks that their own factors do not determine; the graph must have no empty slots.
 
-    GTSAM names the first variable of a clique, which need not be the one that makes it indeterminate, and of many one
-    at a time.
+    GTSAM names the first variable of a clique, which need not be the indeterminate one, and it names one at a time.
     """
     return [key for key, condition in landmark_conditions(factors, at).items() if not condition <= MOST_CONDITION]
 
 
 def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> dict[int, float]:
-    """Return the condition of the information that factors have of each landmark, scaled to a unit diagonal.
+    """Return the condition number of each landmark's information from its factors, scaled to a unit diagonal.
 
-    That of one which went thousands of baselines away is beyond what GTSAM allows: its depth is not determined.
+    For a landmark thousands of baselines away it exceeds GTSAM's limit: its depth is not determined.
     """
     linear, information = factors.linearize(at), dict[int, Array]()
     size_of = {key: at.extract([key]).dim() for key in set(linear.keys())}
@@ -89,7 +88,7 @@ def _scaled(information: Array) -> Array:
 
 
 def weak_hold(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
-    """Return a factor that holds a variable loosely at its value."""
+    """Return a weak prior on a variable at its value."""
     at = values.extract([key])
     size = at.dim()
     noise = gtsam.noiseModel.Isotropic.Sigma(size, WEAK_SIGMA)
@@ -97,7 +96,7 @@ def weak_hold(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
 
 
 def ties_of_the_last(state: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
-    """Return the factors that tie the last variable to a state, whose keys have sizes, and tell nothing of it."""
+    """Return factors that tie the dummy variable to a state (keys with sizes), without information on the state."""
     ties, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
     for key, size in state.items():
         tie = gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), unit)
@@ -106,7 +105,7 @@ def ties_of_the_last(state: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
 
 
 def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of a graph whose slots may be empty."""
+    """Return the factors of a graph that may have empty slots, without these slots."""
     compact = gtsam.NonlinearFactorGraph()
     for slot in range(factors.size()):
         if factors.exists(slot):
@@ -117,7 +116,7 @@ def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGr
 def with_covariances(
     trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, motion: MotionModel
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Return the trajectory with the covariance of every state, or as it is and the reason."""
+    """Return the trajectory with the covariance of every state, or unchanged with the reason."""
     try:
         covs = state_covs(linear, motion, trajectory.T_world_imu)
     except RuntimeError as refusal:
@@ -126,7 +125,7 @@ def with_covariances(
 
 
 def no_covariances(refusal: RuntimeError) -> str:
-    """Return why there are no covariances where GTSAM refuses; another refusal is raised again."""
+    """Return the reason for missing covariances if GTSAM refused them; any other error is raised again."""
     if isinstance(refusal, RoundingError):
         return f"no covariances of the final states: {refusal}"
     name = gtsam.Symbol(variable_named(refusal)).string()

@@ -1,11 +1,11 @@
-"""iSAM2 that recovers where GTSAM's throws: it drops the landmark, or solves by QR, and returns what it did.
+"""iSAM2 that recovers where GTSAM's raises: it drops the landmark, or solves by QR, and returns what it did.
 
-Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation.
-Landmarks are eliminated first and states in the order of time, the newest last: new sightings then change few
-cliques, and the marginal of the newest state stands in the root. But a landmark eliminated first hangs on the first
-state that saw it, and each new sighting has all states since then eliminated anew: one that has long been in view goes
-last instead, beside the newest state, where a sighting of it changes the root alone. Behind the newest state comes a
-variable without a meaning, for the sake of the condition of the cliques (``indeterminate``).
+Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation. Landmarks
+are eliminated first and states in the order of time, the newest last: new sightings then change few cliques, and the
+marginal of the newest state stands in the root. But a landmark eliminated first depends on the first state that saw it,
+and each new sighting re-eliminates all states since then. A landmark that has long been in view is therefore eliminated
+last, beside the newest state, where a sighting of it changes the root alone. A dummy variable follows the newest state,
+for the condition number of the cliques (``indeterminate``).
 """
 
 from collections import deque
@@ -33,22 +33,22 @@ from toolkit.models.factors import L, kind_of
 from toolkit.models.motion import MotionModel
 from toolkit.sequence import StereoFrame
 
-# The states of so many frames are eliminated last, in the order of time, and behind them what has more sightings than
-# these: a state costs as much as two landmarks, so that a longer track is cheaper in the root than the states it spans.
+# The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings
+# than this: a state costs as much as two landmarks, so a longer track is cheaper in the root than the states it spans.
 RECENT_FRAMES, LONG_LIVED_SIGHTINGS = 100, 10
-# What none of the last so many frames has factors on stays linearised where it is, Python factors included: a heading
-# that turns a little moves the whole past, and a frame would cost as much as the run is long.
+# A variable on which no frame has had factors for this many frames keeps its linearisation point, as do Python factors
+# on it: a small change of heading moves the whole past, and a frame would cost as much as the run is long.
 FROZEN_AFTER_FRAMES = 30
-# What none of so many frames has factors on leaves the tree, every so many frames: each walks the whole of it. What is
-# tied to it later than that stays linearised where it is, too.
+# A variable on which no frame has had factors for this many frames leaves the tree; this is done every so many frames,
+# because each time traverses the whole tree. Variables with a marginal of it keep their linearisation points too.
 RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
-# So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
+# After rounding has made Cholesky factorisation fail, it is tried again this many frames with vision later.
 QR_FRAMES = 20
 MOST_RECOVERIES = 20
 
 
 class Isam2Tree:
-    """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
+    """A Bayes tree that adds frames, reads single variables and recovers from an indeterminate system."""
 
     def __init__(self, motion: MotionModel, baseline_m: float, chained: ChainedPast | None = None) -> None:
         self._motion, self._chained = motion, chained
@@ -60,11 +60,11 @@ class Isam2Tree:
         self._slot_count = 0
         self._cached: dict[int, CachedLinearisation] = {}
         self._sightings: dict[int, list[int]] = {}
-        # Where the factors are that tie the last variable to the newest state.
+        # The slots of the factors that tie the dummy variable to the newest state.
         self._tie_slots: list[int] = []
-        # Whether anything leaves at all, and whether what had left was taken back and leaves again with the next frame.
+        # Whether variables may leave, and whether those that had left were taken back and leave with the next frame.
         self._retired, self._retires, self._taken_back = RetiredVariables(), True, False
-        # The landmarks in the tree, and what is linearised anew next.
+        # The landmarks in the tree, and the variables to relinearise next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
@@ -74,10 +74,10 @@ class Isam2Tree:
         state_keys: list[int],
         seen: tuple[StereoFrame, int] | None = None,
     ) -> Recovery:
-        """Take in a frame whose new state has the given keys; return what had to be recovered.
+        """Add a frame whose new state has the given keys; return the recoveries.
 
-        ``seen`` are its sightings and its number where the tree is to chain them. Raises EstimatorError where the
-        system stays indeterminate whatever is dropped.
+        ``seen`` are its sightings and its number if the tree is to chain them. Raises EstimatorError where the system
+        stays indeterminate after all recoveries.
         """
         sees = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
@@ -95,14 +95,14 @@ class Isam2Tree:
             stale = list(renewal.replaced)
         factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
         added = self._update(factors, values, cached, moved, [*stale, *old_ties])
-        # Only now: a landmark that is dropped on the way back may be among those of the frame.
+        # Only after the update: a landmark dropped by the return to Cholesky may be one of the frame's.
         back = self._back_to_cholesky(sees)
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def _with_the_last_tied(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: list[int]
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
-        """Return what is added, the ties of the last variable among it, and the slots of their predecessors."""
+        """Return what is added, with the dummy variable's ties, and the slots of the ties they replace."""
         factors, values, old = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values), self._tie_slots
         if not self.isam.valueExists(LAST):
             values.insert(LAST, np.zeros(1))
@@ -113,7 +113,7 @@ class Isam2Tree:
         return factors, values, old
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Return all factors but chained sightings, of the Python ones themselves and not their linearisations."""
+        """Return all factors except chained sightings; Python factors themselves, not their linearisations."""
         factors = self._retired.with_factors_of(self.isam)
         for slot, cached in self._cached.items():
             factors.replace(slot, cached.factor)
@@ -122,16 +122,16 @@ class Isam2Tree:
         return without_gaps(factors)
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of all that means something."""
+        """Return the latest values of all variables except the dummy."""
         values = self._retired.with_values(self.isam.calculateBestEstimate())
         values.erase(LAST)
         return values
 
     def see(self, landmarks: list[int]) -> Recovery:
-        """Keep landmarks that the next frame has in view; take back what left the tree if any of them did.
+        """Keep landmarks that the next frame has in view; if any of them had left the tree, take all variables back.
 
-        From then on nothing leaves: where one track returns others will, and to build the tree anew for each would
-        cost more than it saves.
+        From then on none leaves: other tracks will return too, and rebuilding the tree for each would cost more than is
+        saved.
         """
         self._frozen.see(landmarks)
         if self._retired.keys.isdisjoint(landmarks):
@@ -140,7 +140,7 @@ class Isam2Tree:
         return self._restored()
 
     def _restored(self) -> Recovery:
-        """Build the tree anew, with all that left it; return what had to be recovered."""
+        """Rebuild the tree with all variables that had left it; return the recoveries."""
         points = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
         try:
             self._rebuild(self._retired.with_factors_of(self.isam), points)
@@ -149,9 +149,10 @@ class Isam2Tree:
         return Recovery([], set())
 
     def drop(self, landmarks: Iterable[int]) -> Recovery:
-        """Take landmarks out, with all their sightings; return what had to be recovered.
+        """Remove landmarks with all their sightings; return the recoveries.
 
-        Of one that some sightings had left the tree of, a marginal holds what they said: the tree is built anew.
+        If some sightings of a landmark had left the tree, a marginal contains their information, and the tree is
+        rebuilt.
         """
         landmarks = list(landmarks)
         if any(not self._retired.slots.isdisjoint(self._sightings[key]) for key in landmarks):
@@ -173,23 +174,23 @@ class Isam2Tree:
         return list(self._sightings)
 
     def read(self, keys: list[int]) -> gtsam.Values:
-        """Return the latest values of the keys of states, without copying the others'."""
+        """Return the latest values of states by their keys, without copying the other values."""
         return self._motion.latest(self.isam, keys)
 
     def points(self, landmarks: Iterable[int]) -> Array:
-        """Return the latest points (N, 3) of landmarks in the world."""
+        """Return the latest points (N, 3) m of landmarks in the world."""
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
 
     def linearised_at(self, ascending: list[int]) -> Array:
-        """Return the points (N, 3) in the world that landmarks, by ascending key, are linearised at."""
+        """Return the linearisation points (N, 3) m in the world of landmarks, by ascending key."""
         return gtsam.utilities.extractPoint3(self.isam.getLinearizationPoint().extract(ascending))
 
     def relinearise(self, landmarks: Iterable[int]) -> None:
-        """Have the next frame linearise landmarks anew, unless they are frozen; the others stay as they are."""
+        """Mark landmarks for relinearisation with the next frame, except frozen ones; others keep their points."""
         self._to_relinearise = set(landmarks)
 
     def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
-        """Return values of states and landmarks: the new, and the latest of what is in the tree."""
+        """Return values of states and landmarks: initial values of new ones, the latest values of those in the tree."""
         known = [key for key in keys if not new.exists(key)]
         values = self.read([key for key in known if kind_of(key) != "l"])
         for key in known:
@@ -199,7 +200,7 @@ class Isam2Tree:
         return values
 
     def _moved(self) -> set[int]:
-        """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
+        """Return the variables to relinearise in this frame; of recent states all or none, so that they agree."""
         fixed = {*self.isam.getFixedVariables(), *(self._chained.settled if self._chained is not None else ())}
         may_move = self._frozen.others - fixed
         landmarks = {key for key in self._to_relinearise & may_move if self.has(key)}
@@ -209,7 +210,7 @@ class Isam2Tree:
     def _linearisations(
         self, factors: gtsam.NonlinearFactorGraph, new: gtsam.Values
     ) -> tuple[dict[int, CachedLinearisation], dict[int, CachedLinearisation]]:
-        """Return those of Python factors: of new ones, by place, and of old ones linearised anew, by slot."""
+        """Return linearisations of Python factors: of new ones by index, of relinearised old ones by slot."""
         added = python_factors(factors)
         states = self._to_relinearise - self._landmarks
         stale = {slot: old for slot, old in self._cached.items() if not states.isdisjoint(old.keys)} if states else {}
@@ -221,14 +222,14 @@ class Isam2Tree:
         )
 
     def _places(self, keys: list[int], new: gtsam.Values) -> Places:
-        """Return values of states and landmarks, and where the tree linearises them from this frame on."""
+        """Return values of states and landmarks, and the tree's linearisation points of them from this frame on."""
         stay = [key for key in keys if not new.exists(key) and key not in self._to_relinearise]
         estimates, at = self._first_values(keys, new), self.isam.getLinearizationPoint().extract(stay)
         at.insert(estimates.extract([key for key in keys if not at.exists(key)]))
         return Places(estimates, at)
 
     def _held(self) -> gtsam.KeyList:
-        """Return what GTSAM is not to linearise anew: all but what is told by key."""
+        """Return the keys that GTSAM must not relinearise: all except those marked for it."""
         held = gtsam.KeyList(self._frozen.keys)
         for key in (*(self._frozen.others - self._to_relinearise), LAST):
             held.push_back(key)
@@ -246,9 +247,9 @@ class Isam2Tree:
         moved: dict[int, CachedLinearisation],
         dropped_slots: Iterable[int] = (),
     ) -> Recovery:
-        """Add factors, of which ``cached`` are linearisations, by place; replace those moved, by slot; take some out.
+        """Add factors (``cached`` linearises some, by index), replace those of ``moved``, by slot, and remove others.
 
-        The slots of new factors follow those of the old, in every case: after a refusal they are known too.
+        The slots of new factors always follow those of the old ones, so that they are known after a refusal as well.
         """
         for slot, renewal in moved.items():
             del self._cached[slot]
@@ -275,12 +276,12 @@ class Isam2Tree:
         return Recovery([], set())
 
     def _leaving(self) -> list[int]:
-        """Return the variables to be retired now: none in most frames, and none while it is solved by QR."""
+        """Return the variables to retire now: none in most frames, and none while solving by QR."""
         is_time = self._taken_back or self._frozen.count % RETIRING_EVERY_FRAMES == 0
         if not self._retires or self._factorization == "QR" or not is_time:
             return []
         unused = self._frozen.unused_for(RETIRED_AFTER_FRAMES)
-        # A bridge ties poses for longer than biases. A bias that left alone would take its pose's factors along.
+        # A gap bridge ties poses for longer than biases. A bias leaving alone would take its pose's factors along.
         stay = {key for keys in self._recent if not set(keys).issubset(unused) for key in keys}
         return [key for key in unused if key not in stay and self.has(key)]
 
@@ -295,7 +296,7 @@ class Isam2Tree:
             self._recent.popleft()
 
     def _order_before_retiring(self, new: gtsam.Values, leaving: list[int]) -> tuple[gtsam.KeyGroupMap, gtsam.KeyList]:
-        """Return the places of all variables, those to leave first, and the list of all, to be eliminated anew."""
+        """Return the elimination indices of all variables, leaving ones first, and the list of all, to re-eliminate."""
         gone = self._retired.keys.union(leaving)
         landmarks = [key for key in self._landmarks.difference(leaving) if self.has(key) or new.exists(key)]
         states = [keys for keys in self._recent if keys[0] not in gone]
@@ -307,16 +308,16 @@ class Isam2Tree:
         return groups, key_list(key for key in everything if not new.exists(key))
 
     def _solve_back(self) -> None:
-        """Read a variable, for which GTSAM solves for all: only here does QR refuse what it has eliminated."""
+        """Read a variable, for which GTSAM solves for all: only here does QR raise for a singular system."""
         self.read(self._recent[-1][:1])
 
     def _order(self, new: list[int], in_view: Iterable[int]) -> gtsam.KeyGroupMap:
-        """Return the place of each recent state, and each long-lived landmark in view, in the elimination.
+        """Return the elimination index of each recent state, and of each long-lived landmark in view.
 
-        All else comes first: the long-lived landmarks of a whole run behind its states would leave a dense system of
-        them. ``new`` are the keys of the factors that an update adds: CCOLAMD takes no place beyond the number of
-        variables it orders, of which these are the least; where some are only taken out, two at least are ordered, of
-        which one is the last variable.
+        All other variables come first: eliminated after its states, the long-lived landmarks of a whole run would leave
+        a dense system. ``new`` are the keys of the factors that an update adds. CCOLAMD accepts no index beyond the
+        number of variables it orders, which are at least these; an update that only removes factors orders at least
+        two, one of them the dummy.
         """
         groups, states = gtsam.KeyGroupMap(), list(self._recent)
         long_lived = [key for key in in_view if len(self._sightings.get(key, ())) > LONG_LIVED_SIGHTINGS]
@@ -327,7 +328,7 @@ class Isam2Tree:
         return groups
 
     def _recovered(self, refusal: RuntimeError) -> Recovery:
-        """Build the tree anew without undetermined landmarks, or the one named, or with a hold on the state named."""
+        """Rebuild the tree without undetermined landmarks, or the one named, or with a weak prior on a state named."""
         log, dropped = [], set()
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
@@ -358,7 +359,7 @@ class Isam2Tree:
         raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
     def _back_to_cholesky(self, sees: bool) -> Recovery:
-        """Go back from QR, ten times dearer, once vision has been back for some frames."""
+        """Return from QR, which costs ten times as much, once vision has been available again for some frames."""
         self._frames_by_qr += sees
         if self._factorization == "CHOLESKY" or self._frames_by_qr <= QR_FRAMES:
             return Recovery([], set())
@@ -366,10 +367,10 @@ class Isam2Tree:
         return self._restored()
 
     def _rebuild(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Build the tree anew of all factors, those of what had left it among them, and of the values they are on.
+        """Rebuild the tree from all factors, those of departed variables included, and the values they involve.
 
-        A landmark that was dropped with all its factors would be a variable without a place in it, and could not begin
-        anew.
+        A landmark that was dropped with all its factors is left out: it would be a variable without an elimination
+        index, and could not be started again.
         """
         kept = [slot for slot in range(factors.size()) if factors.exists(slot)]
         compact, slot_of = gtsam.NonlinearFactorGraph(), {old: new for new, old in enumerate(kept)}
@@ -391,7 +392,7 @@ class Isam2Tree:
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params = gtsam.ISAM2Params()
-        # What is linearised anew is told by key.
+        # Relinearisation is requested by key instead.
         params.setRelinearizeThreshold(0.0)
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)

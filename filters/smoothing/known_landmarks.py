@@ -1,7 +1,7 @@
-"""Where an incremental smoother has its landmarks, and how well their sightings so far tell where that is.
+"""The landmarks of an incremental smoother, and how well their sightings so far determine them.
 
-A landmark seen once, far away, is expected within many pixels of where it will be seen from near by; one seen often,
-within a fraction of one. Poses are taken for certain, for a landmark and what sees it share their error.
+The position of a landmark seen once, far away, in a later nearby image is uncertain by many pixels; that of one seen
+often, by a fraction of a pixel. Poses are taken as exact, because a landmark shares the error of the poses that saw it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,7 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 
 class KnownLandmarks:
-    """Points (3,) m in the world by track id, and of each the information (3, 3) 1/m^2 of its sightings."""
+    """Points (3,) m in the world by track id, and for each the information (3, 3) 1/m^2 of its sightings."""
 
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig
@@ -27,18 +27,18 @@ class KnownLandmarks:
 
     @property
     def points(self) -> Mapping[int, Array]:
-        """Return all of them."""
+        """Return all points by track id."""
         return self._points
 
     def among(self, track_ids: Iterable[int]) -> BoolArray:
-        """Say which of some tracks (N,) have a landmark."""
+        """Say which of the tracks (N,) have a landmark."""
         return np.array([i in self._points for i in track_ids], dtype=bool)
 
     def see(self, frame: StereoFrame, placed: Mapping[int, Array], T_world_imu: Array, share: float) -> None:
-        """Take in the sightings of a frame from a pose (4, 4), of landmarks that are known or ``placed`` here.
+        """Add the sightings of a frame from a pose (4, 4), of known landmarks and of those ``placed`` here.
 
-        Each counts for a share in (0, 1] of what its noise leaves it. Where noise of tracks is stated, errors are taken
-        along from sighting to sighting, and the newest alone tells how far a landmark is from the next.
+        Each has a weight in (0, 1], ``share``. With a track noise model, errors persist from sighting to sighting, and
+        only the newest sighting predicts how far the next one will be from the landmark.
         """
         if not frame.track_ids.size:
             return
@@ -51,16 +51,16 @@ class KnownLandmarks:
             self._points[i], self._information[i] = point, told if before is None else before + told
 
     def move(self, points: Mapping[int, Array]) -> None:
-        """Take over where landmarks are by now."""
+        """Update the points of landmarks."""
         self._points.update({i: point for i, point in points.items() if i in self._points})
 
     def keep(self, points: Mapping[int, Array]) -> None:
-        """Take over where landmarks are by now, and drop all others."""
+        """Update the points of landmarks, and drop all others."""
         self.forget([i for i in self._points if i not in points])
         self.move(points)
 
     def forget(self, track_ids: Iterable[int]) -> None:
-        """Drop landmarks; seen again, they start anew."""
+        """Drop landmarks; if seen again, they are started again."""
         for i in track_ids:
             self._points.pop(i, None)
             self._information.pop(i, None)

@@ -1,11 +1,11 @@
-"""Steps of landmarks, damped and taken in the image of the camera that saw each of them first.
+"""Steps of landmarks, damped and taken in the image of the camera that first saw each of them.
 
-A far landmark's depth depends on what is measured in such a curved way that a step in metres overshoots, where its
-disparity is nearly linear (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). One
-such landmark has Levenberg's damping grow, and with it all poses held: in the directions that tracks and motion say
-least of, the scale of the world and the way it drifts, a solve then creeps. So landmarks alone are damped, each by a
-share of what the sightings say of its own column, disparity and row (Marquardt 1963, "An algorithm for least-squares
-estimation of nonlinear parameters"), and they move by these.
+The measurement depends on a far landmark's depth so nonlinearly that a step in metres overshoots, while the disparity
+is nearly linear (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). One such landmark
+makes Levenberg's damping grow, which damps all poses as well; in the directions that tracks and motion determine the
+least, the scale of the world and its drift, a solve then converges slowly. So landmarks alone are damped, each by a
+share of the sightings' information on its own column, disparity and row (Marquardt 1963, "An algorithm for
+least-squares estimation of nonlinear parameters"), and they are moved in these coordinates.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.track_noise import CHANNELS
 
 _FROM_CHANNELS = np.linalg.inv(CHANNELS)
-# The logarithm of the depth grows by this much in a step at most: disparities stay positive.
+# Largest growth of the logarithm of the depth in one step; it keeps disparities positive.
 _MOST_FARTHER = 2.0
 _SMALL_DISPARITY_PX = 1.0
-# px^-2: by which a landmark is damped that sightings give less information.
+# px^-2: the least damping of a landmark, for one whose sightings have less information.
 _LEAST_INFORMATION = 1e-6
 
 
 class LandmarksSeen(NamedTuple):
-    """Each of M landmarks L(track id) in the frame (M,) that saw it first.
+    """M landmarks L(track id), each in the image of the frame (M,) that first saw it.
 
-    ``image`` (M, 3) is its (c, d, v) px there, ``by_pose`` (M, 3, 6) and ``by_point`` (M, 3, 3) how that changes.
+    ``image`` (M, 3) is its (c, d, v) px there, ``by_pose`` (M, 3, 6) and ``by_point`` (M, 3, 3) the Jacobians of these.
     """
 
     track_ids: IntArray
@@ -43,20 +43,20 @@ class LandmarksSeen(NamedTuple):
 
     @classmethod
     def at(cls, values: gtsam.Values, track_ids: IntArray, first: IntArray, rig: StereoRig) -> "LandmarksSeen":
-        """Return what the values say of landmarks (M,) and of the frames (M,) that saw them first."""
+        """Predict the images of landmarks (M,) in the frames (M,) that first saw them, at values."""
         points = np.array([values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
         seen = stereo.predict(points, _poses(values, first), rig)
         by_pose, by_point = (in_channels(CHANNELS, slope) for slope in (seen.d_uv_d_pose, seen.d_uv_d_point))
         return cls(track_ids, first, seen.uv_px @ CHANNELS.T, by_pose, by_point)
 
     def moved(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
-        """Return the values a step on; what it has for a landmark is the change of (c, d, v) px with the point."""
+        """Return the values after a step whose landmark parts are changes of (c, d, v) px due to the point."""
         return self._moved_by(_of_landmarks(step, self.track_ids), values, step, rig)
 
     def moved_with_points(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
-        """Return the values a step on; what it has for a landmark is metres in the world, as a graph's own step has.
+        """Return the values after a step whose landmark parts are metres in the world, as in a graph's own step.
 
-        A landmark that is not in front of its camera has no image there, and takes its metres.
+        A landmark that is not in front of its camera has no image there, and is moved in metres.
         """
         change = np.einsum("mij,mj->mi", self.by_point, _of_landmarks(step, self.track_ids))
         in_front = self.image[:, 1] > 0.0
@@ -67,7 +67,7 @@ class LandmarksSeen(NamedTuple):
         return LandmarksSeen(ids[rows], first[rows], image[rows], by_pose[rows], by_point[rows])
 
     def _moved_by(self, change: Array, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
-        """Return the values a step on, with the change of (c, d, v) px (M, 3) that the points' own steps make."""
+        """Return the values after a step, given the change of (c, d, v) px (M, 3) due to the points' own steps."""
         frames, row = np.unique(self.first, return_inverse=True)
         of_poses = step.vector([X(k) for k in frames.tolist()]).reshape(-1, 6)[row]
         change = change + np.einsum("mij,mj->mi", self.by_pose, of_poses)
@@ -82,10 +82,10 @@ class LandmarksSeen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSteps:
-    """How sightings and landmarks take part in one step from some values.
+    """The linear system of one step, in poses and landmark images, at some values.
 
-    ``sightings`` are linear in the steps of poses and in the change of each landmark's (c, d, v) px;
-    ``information`` (M, 3) px^-2 is what they say of each of the three, all else being given.
+    ``sightings`` are linear in the steps of poses and in the change of each landmark's (c, d, v) px; ``information``
+    (M, 3) px^-2 is their information on each of the three, given all other variables.
     """
 
     values: gtsam.Values
@@ -95,10 +95,10 @@ class LandmarkSteps:
     rig: StereoRig
 
     def damping(self, share: float) -> gtsam.GaussianFactorGraph:
-        """Return factors that hold (c, d, v) of each landmark by a share of the information on each of the three.
+        """Return factors that damp (c, d, v) of each landmark by a share of the information on each of the three.
 
-        A disparity that is nearly none is held by its size too: of a landmark that should be beyond infinity the linear
-        system promises what no step keeps.
+        A disparity near zero is also damped by its size: for a landmark whose best disparity is negative, beyond
+        infinity, the linear system predicts a decrease that no step achieves.
         """
         held, disparity_px = share * np.maximum(self.information, _LEAST_INFORMATION), np.abs(self.seen.image[:, 1])
         held[:, 1] += np.where(disparity_px < _SMALL_DISPARITY_PX, np.square(0.5 / disparity_px), 0.0)
@@ -111,18 +111,18 @@ class LandmarkSteps:
         return graph
 
     def taken(self, step: gtsam.VectorValues) -> gtsam.Values:
-        """Return the values the step leads to."""
+        """Return the values after a step."""
         return self.seen.moved(self.values, step, self.rig)
 
 
 @dataclass(frozen=True, eq=False)
 class FirstImages:
-    """Which M landmarks a graph has, L(track id) of ``track_ids`` (M,), and the frame X(``first``) that saw each first.
+    """The M landmarks of a graph, L(track id) of ``track_ids`` (M,), and the frame X(``first``) that first saw each.
 
-    GTSAM steps by a pose's own axes and by a landmark's metres in the world. Where a step turns a stretch of road by
-    0.01 rad and shifts it by 12 m, the two part by 6 cm, pixels at a near landmark: such a step raises the error,
-    however well the linear system is solved. Landmarks that stay in the image of a pose go along with it. ``at_once``
-    says that they are to do so from the first step on.
+    GTSAM moves a pose in its own axes and a landmark in metres of the world. Where a step turns a stretch of road by
+    0.01 rad and shifts it by 12 m, the two separate by 6 cm, which is pixels for a near landmark. Such a step raises
+    the error, however well the linear system is solved. Landmarks that keep their place in the image of a pose move
+    with it. ``at_once`` says that they do so from the first step on.
     """
 
     track_ids: IntArray
@@ -139,7 +139,7 @@ class FirstImages:
 
     @classmethod
     def in_graph(cls, graph: gtsam.NonlinearFactorGraph, rig: StereoRig) -> "FirstImages":
-        """Return the landmarks that factors of sightings in a graph see; what only linear factors hold is left out."""
+        """Return the landmarks that stereo factors of a graph see; those with linear factors alone are left out."""
         first: dict[int, int] = {}
         for factor in map(graph.at, range(graph.size())):
             if isinstance(factor, gtsam.GenericStereoFactor3D | gtsam.GenericProjectionFactorCal3_S2):
@@ -149,13 +149,13 @@ class FirstImages:
         return cls(np.array(ids, dtype=np.int64), np.array([first[i] for i in ids], dtype=np.int64), rig)
 
     def taken(self, values: gtsam.Values, step: gtsam.VectorValues) -> gtsam.Values:
-        """Return the values that a graph's own step leads to."""
+        """Return the values after a graph's own step."""
         seen = LandmarksSeen.at(values, self.track_ids, self.first, self.rig)
         return seen.moved_with_points(values, step, self.rig)
 
 
 def _of_landmarks(step: gtsam.VectorValues, track_ids: IntArray) -> Array:
-    """Return the parts (M, 3) of a step that concern landmarks."""
+    """Return the landmarks' parts (M, 3) of a step."""
     return np.asarray(step.vector([L(i) for i in track_ids.tolist()])).reshape(-1, 3)
 
 

@@ -1,20 +1,21 @@
 """Levenberg-Marquardt, one iteration at a time, with the ways a solve can go wrong checked.
 
-GTSAM's optimizer returns unchanged values without a message when an error is not a number, so the error is looked at
-first. And it hands a Python factor a copy of all values at each call, which makes a thousand twist factors take ten
-times as long as sixty thousand stereo factors: where there are any, the steps are taken here, and those of one form
-are linearised and evaluated all at once where a stack of them is given. The damping is Levenberg's multiple of the
-identity either way: a tenth of it after a step that lowered the error, ten times as much after one that did not.
+GTSAM's optimizer returns unchanged values without a message when an error is not a number, so the error is checked
+first. GTSAM also passes a Python factor a copy of all values at each call, which makes a thousand twist factors take
+ten times as long as sixty thousand stereo factors. Graphs with Python factors are therefore solved here, and factors of
+one form are linearised and evaluated at once if a stack of them is given. The damping is Levenberg's multiple of the
+identity in both cases: it is divided by ten after a step that lowered the error, and multiplied by ten after one that
+did not.
 
-A step of GTSAM's turns a pose about itself and moves a landmark straight on, and the two part where it is long: what
-is weakly determined, as the drift of a long drive, is then damped as what overshoots, and a solve creeps or stops far
-from the minimum (37 m from it, in the mean of the 1010 frames of Dataset 03). From the first step on that raises the
-error, landmarks therefore move in images (:class:`~filters.smoothing.landmark_steps.FirstImages`), with hardly any
-damping.
+A step of GTSAM's turns a pose about itself and moves a landmark along a straight line, and the two separate where the
+step is long. A weakly determined direction, such as the drift of a long drive, is then damped as if it overshot, and a
+solve converges slowly or stops far from the minimum (37 m from it, in the mean of the 1010 frames of Dataset 03). From
+the first step on that raises the error, landmarks are therefore moved in images
+(:class:`~filters.smoothing.landmark_steps.FirstImages`), with hardly any damping.
 
-Where sightings are beside the graph, their landmarks alone are damped
-(:mod:`filters.smoothing.landmark_steps`); the rest, in Levenberg's way, only where that does not help. Such a solve has
-converged when a step gains little that was neither damped much nor shortened much.
+If sightings are evaluated outside the graph, only their landmarks are damped (:mod:`filters.smoothing.landmark_steps`);
+the other variables are damped, in Levenberg's way, only if that is not enough. Such a solve has converged when a step
+gains little although it was neither damped nor shortened much.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,27 +34,30 @@ from toolkit.models.factors import kind_of
 from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
-# Of steps in images, which overshoot little; with less, GTSAM finds far landmarks undetermined.
+# Damping of steps in images, which overshoot little; with less, GTSAM finds far landmarks undetermined.
 _IN_IMAGES = 1e-7
-# Of the error, half a sum of squared sigmas: with exact measurements it is near zero, and no share of it is small.
+# Least decrease of the error, half a sum of squares in sigma: with exact measurements the error is near zero, and a
+# relative criterion is never met.
 _LEAST_DECREASE = 1e-12
-# Landmarks are damped by shares of their own information. Beyond the last, which nearly holds them, so is all else.
+# Landmarks are damped by these shares of their own information. Beyond the last one, which nearly fixes them, all other
+# variables are damped as well.
 _FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
-# A step that raises the error by less than this share of it stands at a minimum.
+# If a step raises the error by less than this share of it, the solve is at a minimum.
 _NEXT_TO_NOTHING = 1e-5
-# A step that keeps less than this of what the linear system promises is shortened.
+# A step that achieves less than this share of the decrease predicted by the linear system is shortened.
 _KEPT = 0.5
-# A step that gains little is the last one only if it was damped by no more than this, and shortened to no less.
+# A step that gains little ends the solve only if it was damped by at most this, and not shortened below this part.
 _FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
 
 @dataclass(frozen=True)
 class Stopping:
-    """When to stop: a decrease of the error that is small, in itself or relative to it, or too many iterations.
+    """When to stop: at a small decrease of the error, absolute or relative to it, or after too many iterations.
 
-    ``at_overshoot`` ends a solve that needs no end at the first step that raises the error after one that lowered it,
-    where steps are taken here: to damp it until it lowers the error, too, takes an elimination each time. A solve that
-    has used up its iterations has converged all the same where the last gained no more than a share ``enough``.
+    ``at_overshoot`` is for a solve that need not reach the minimum: it ends at the first step that raises the error
+    after one that lowered it, where steps are taken here, because damping that step until it lowers the error takes an
+    elimination for each attempt. A solve that has used up its iterations still counts as converged if the last one
+    gained no more than a share ``enough`` of the error.
     """
 
     relative_decrease: float = 1e-5
@@ -64,16 +68,16 @@ class Stopping:
 
 
 class Beside(Protocol):
-    """Measurements beside the graph, evaluated and linearised in Python for all at once."""
+    """Measurements outside the graph, evaluated and linearised in Python for all at once."""
 
     def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares, or of a loss."""
+        """Return half the sum of squares, or the sum of losses."""
 
     def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return linear factors about the values."""
 
     def landmark_steps(self, values: gtsam.Values) -> LandmarkSteps:
-        """Return how its landmarks step from some values."""
+        """Return the system of a step at some values."""
 
 
 class Solution(NamedTuple):
@@ -100,12 +104,12 @@ def solve(
 ) -> Solution:
     """Minimise the error of a graph from a start; ``progress`` is called at every iteration with the stage's name.
 
-    ``landmarks`` are sightings beside the graph, or the images in which the graph's own landmarks move once a step in
-    metres has raised the error. ``ordering`` is that of elimination where nothing is beside the graph, COLAMD's by
-    default.
+    ``landmarks`` are either sightings outside the graph, or the images in which the graph's own landmarks are moved
+    once a step in metres has raised the error. ``ordering`` is the elimination order if no sightings are outside the
+    graph, by default COLAMD's.
 
-    Where no step, however short, lowers the error, the start is a minimum. Raises EstimatorError where the error at the
-    start is not finite: some measurement or initial value is NaN.
+    If no step, however short, lowers the error, the start is a minimum. Raises EstimatorError if the error at the start
+    is not finite: some measurement or initial value is NaN.
     """
     beside = None if isinstance(landmarks, FirstImages) else landmarks
     mixed = graph if isinstance(graph, MixedGraph) else MixedGraph(graph)
@@ -123,7 +127,7 @@ def solve(
 
 
 class _Reached(Protocol):
-    """Where a solve has come to: its error, and whether damping kept its last step short."""
+    """The state of a solve: its error, and whether damping kept its last step short."""
 
     @property
     def error(self) -> float: ...
@@ -139,10 +143,10 @@ class _Solver(Protocol[Reached]):
     """Takes the steps of one solve."""
 
     def started(self, values: gtsam.Values, error: float) -> Reached:
-        """Return where the solve begins."""
+        """Return the initial state of the solve."""
 
     def advanced(self, here: Reached) -> Reached:
-        """Return where the next step that lowers the error leads; the same place, where none does."""
+        """Return the state after the next step that lowers the error; the same state if none does."""
 
 
 def _solved(
@@ -164,7 +168,7 @@ def _solved(
 
 
 class _OfGtsam(NamedTuple):
-    """Where a solve has come to: GTSAM's optimizer, which has the values and the damping, and their error."""
+    """The state of a solve by GTSAM's optimizer, which has the values and the damping, and its error."""
 
     optimizer: gtsam.LevenbergMarquardtOptimizer
     error: float
@@ -172,16 +176,16 @@ class _OfGtsam(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Return that of the next step."""
+        """Return the damping of the next step."""
         return self.optimizer.lambda_()
 
     def values(self) -> gtsam.Values:
-        """Return a copy: GTSAM hands out its own, which do not outlive the next iteration."""
+        """Return a copy of the values: GTSAM's own do not outlive the next iteration."""
         return gtsam.Values(self.optimizer.values())
 
 
 class _Damped(NamedTuple):
-    """Where a solve has come to, its error, and the damping of its next step."""
+    """The state of a solve: its values, its error, and the damping of its next step."""
 
     reached: gtsam.Values
     error: float
@@ -194,7 +198,7 @@ class _Damped(NamedTuple):
 
 
 class _GraphSolver:
-    """Takes the steps of a solve of factors alone: GTSAM's optimizer does, where none of them is Python's."""
+    """Takes the steps of a solve of factors alone: by GTSAM's optimizer if none of them is a Python factor."""
 
     def __init__(self, graph: MixedGraph, ordering: gtsam.Ordering, ends_at_overshoot: bool = False) -> None:
         self._graph, self._ordering, self._ends_at_overshoot = graph, ordering, ends_at_overshoot
@@ -203,7 +207,7 @@ class _GraphSolver:
         self._held: dict[float, gtsam.GaussianFactorGraph] = {}
 
     def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
-        """Return where the solve begins."""
+        """Return the initial state of the solve."""
         if self._graph.has_python:
             return _Damped(values, error, _FIRST_DAMPING)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph.native, values, self._params())
@@ -212,7 +216,7 @@ class _GraphSolver:
     def _params(self) -> gtsam.LevenbergMarquardtParams:
         params = gtsam.LevenbergMarquardtParams()
         params.setOrdering(self._ordering)
-        # On one thread, elimination variable by variable takes three quarters of the time of elimination by cliques.
+        # On one thread, elimination by variables takes three quarters of the time of elimination by cliques.
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
         params.setlambdaInitial(_FIRST_DAMPING)
         params.setlambdaUpperBound(_MOST_DAMPING)
@@ -220,7 +224,7 @@ class _GraphSolver:
         return params
 
     def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
-        """Return where the next step that lowers the error leads; the same place, where none does."""
+        """Return the state after the next step that lowers the error; the same state if none does."""
         tried, there = here.damping, self._stepped_in_metres(here)
         self.overshot |= there.damping >= tried
         return there
@@ -237,9 +241,10 @@ class _GraphSolver:
         taken: Callable[[gtsam.Values, gtsam.VectorValues], gtsam.Values],
         least_damping: float,
     ) -> _Damped:
-        """Return where the least damped step that lowers the error leads; ``taken`` says where a step leads.
+        """Return the state after the least damped step that lowers the error; ``taken`` applies a step to values.
 
-        One that raises the error by next to nothing is at a minimum: more damping would gain no more (GTSAM's rule).
+        If a step raises the error only negligibly the state is at a minimum: more damping would gain no more (GTSAM's
+        rule).
         """
         linear, damping = self._graph.linear(here.reached), here.damping
         while damping < _MOST_DAMPING:
@@ -258,29 +263,29 @@ class _GraphSolver:
     def _step(
         self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
     ) -> gtsam.VectorValues | None:
-        """Return the damped step from some values; none where the linear system does not determine it."""
+        """Return the damped step from some values; None if the linear system does not determine it."""
         if damping not in self._held:
             self._held[damping] = _held(values.dims(), damping)
         return _eliminated(_joined(linear, self._held[damping]), self._ordering)
 
 
 class _ImageSolver:
-    """Takes steps in metres until one raises the error, and from there on steps whose landmarks move in images.
+    """Takes steps in metres until one raises the error, and from then on steps whose landmarks move in images.
 
-    That one step was damped says nothing of how near the minimum is: it is never the last.
+    The rejected step's damping does not show how near the minimum is, so that step never ends the solve.
     """
 
     def __init__(self, in_metres: _GraphSolver, images: FirstImages) -> None:
         self._in_metres, self._images = in_metres, images
 
     def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
-        """Return where the solve begins."""
+        """Return the initial state of the solve."""
         if self._images.at_once:
             return _Damped(values, error, _IN_IMAGES)
         return self._in_metres.started(values, error)
 
     def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
-        """Return where the next step that lowers the error leads; the same place, where none does."""
+        """Return the state after the next step that lowers the error; the same state if none does."""
         if self._images.at_once or self._in_metres.overshot:
             assert isinstance(here, _Damped)
             return self._in_metres.stepped(here, self._images.taken, _IN_IMAGES)
@@ -291,7 +296,7 @@ class _ImageSolver:
 
 
 class _WithLandmarks(NamedTuple):
-    """Where a solve has come to, its error, the share its next step is damped by, and whether the last was short."""
+    """The state of a solve: values, error, the damping share of its next step, and whether the last was short."""
 
     reached: gtsam.Values
     error: float
@@ -304,21 +309,21 @@ class _WithLandmarks(NamedTuple):
 
 
 class _LandmarkSolver:
-    """Takes the steps of a solve with sightings beside the graph, of which the landmarks alone are damped."""
+    """Takes the steps of a solve with sightings outside the graph, of which only the landmarks are damped."""
 
     def __init__(self, graph: MixedGraph, start: gtsam.Values, beside: Beside) -> None:
         self._graph, self._beside = graph, beside
         self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
 
     def started(self, values: gtsam.Values, error: float) -> _WithLandmarks:
-        """Return where the solve begins."""
+        """Return the initial state of the solve."""
         return _WithLandmarks(values, error, _FIRST_SHARE, held_back=False)
 
     def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
         return _joined(self._graph.linear(values), steps.sightings)
 
     def advanced(self, here: _WithLandmarks) -> _WithLandmarks:
-        """Return where the next step that lowers the error leads; the same place, where none does."""
+        """Return the state after the next step that lowers the error; the same state if none does."""
         steps = self._beside.landmark_steps(here.reached)
         linear = self._linear(here.reached, steps)
         share = here.share
@@ -332,14 +337,14 @@ class _LandmarkSolver:
     def _tried(
         self, here: _WithLandmarks, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
     ) -> _WithLandmarks | None:
-        """Return where a step damped by a share leads, in full or in part; nothing where that has a larger error."""
+        """Return the state after a step damped by a share, taken in full or in part; None if its error is larger."""
         step = self._step(linear, steps, share)
         if step is None:
             return None
         promised = here.error - linear.error(step)
         there = self._at(steps, step, share)
         if here.error - there.error < _KEPT * promised:
-            # As long as a parabola says with the slope promised and the error found: far residuals bend the valley.
+            # The minimum along the step of the parabola with the predicted slope and the error found at its end.
             part = promised / (2.0 * promised - (here.error - there.error))
             shorter = self._at(steps, step.scale(part), share, held_back=part < _LEAST_PART)
             there = shorter if shorter.error < there.error or np.isnan(there.error) else there
@@ -354,7 +359,7 @@ class _LandmarkSolver:
         return _WithLandmarks(there, error, next_share, held_back or share > _FREE_SHARE)
 
     def _step(self, linear: gtsam.GaussianFactorGraph, steps: LandmarkSteps, share: float) -> gtsam.VectorValues | None:
-        """Return the damped step; none where the linear system does not determine it."""
+        """Return the damped step; None if the linear system does not determine it."""
         damped = _joined(linear, steps.damping(share))
         if share > _LANDMARKS_ALONE:
             dims = steps.values.dims()
@@ -370,7 +375,7 @@ def _joined(one: gtsam.GaussianFactorGraph, other: gtsam.GaussianFactorGraph) ->
 
 
 def _eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues | None:
-    """Return what solves a linear system; none where that is indeterminate."""
+    """Return the solution of a linear system; None if it is indeterminate."""
     try:
         return linear.eliminateSequential(ordering).optimize()
     except RuntimeError as refusal:
@@ -379,7 +384,7 @@ def _eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> 
 
 
 def _held(sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """Return factors that hold variables, whose keys have sizes, where they are."""
+    """Return factors that damp variables, whose keys have sizes, at their values."""
     graph = gtsam.GaussianFactorGraph()
     of_size = {size: np.sqrt(damping) * np.eye(size) for size in set(sizes.values())}
     for key, size in sizes.items():

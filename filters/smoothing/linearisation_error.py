@@ -1,7 +1,8 @@
-"""How far variables may move from where they are linearised: states by thresholds, landmarks until their image is off.
+"""How far variables may move from their linearisation points: states by thresholds, landmarks by their image.
 
-What a metre changes in an image goes with the square of the depth. A threshold in metres that keeps near landmarks
-sound has far ones, whose depth a disparity of some pixels tells to a metre, linearised anew in every frame.
+The effect of a metre on an image falls with the square of the depth. A threshold in metres that is small enough for
+near landmarks would relinearise far ones in every frame: a disparity of some pixels determines their depth only to
+metres.
 """
 
 from collections.abc import Mapping
@@ -15,33 +16,36 @@ from toolkit.models.factors import kind_of
 from toolkit.models.motion import MotionModel
 from toolkit.sequence import StereoRig
 
-# How far states may move from where they are linearised: rad; m/s, or the unit of a rate; m/s^2 and rad/s of a bias;
-# and multiples of the baseline, the length that sets the scale of what stereo sees: the image of a point 20 baselines
-# away is then off by a tenth of a pixel. A velocity and a bias of the accelerometer that all states share change no
-# residual but by the turn between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1
-# baselines and 0.01 of the rest made a flight of two minutes five times less accurate.
+# How far states may move from their linearisation points: rad; m/s, or the unit of a rate; m/s^2 and rad/s for a bias;
+# and multiples of the baseline, which is the length scale of stereo: the image of a point 20 baselines away is then
+# off by a tenth of a pixel. A change of velocity or accelerometer bias common to all states affects residuals only by
+# the rotation between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1 baselines and
+# 0.01 for the rest made a flight of two minutes five times less accurate.
 ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
 POSITION_THRESHOLD_BASELINES = 0.3
-# Sigma of a sighting. A tenth of it is what linearised sightings of a chain are renewed beyond, too.
+# In sigmas of a sighting; linearised sightings of a chain are renewed beyond a tenth of a sigma, too.
 LANDMARK_BEYOND_SIGMA = 0.1
 
 
 def state_thresholds(motion: MotionModel, baseline_m: float) -> dict[str, Array]:
-    """Return how far a state's variables may move, (6,) or (3,) by their kind, in GTSAM's tangent spaces."""
+    """Return how far a state's variables may move from their linearisation points, (6,) or (3,) by kind.
+
+    In GTSAM's tangent spaces.
+    """
     pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * baseline_m], 3)
     at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
     return {kind: at_most[kind][-size:] for kind, size in motion.variable_sizes.items()}
 
 
 def any_moved_beyond(at_most: Mapping[str, Array], steps: gtsam.VectorValues, keys: list[int]) -> bool:
-    """Say whether a variable of states is beyond the thresholds, a step in its tangent space from its linearisation."""
+    """Say whether a state variable is beyond its threshold, given its step from the linearisation point."""
     if not keys:
         return False
     return bool((np.abs(steps.vector(keys)) >= np.concatenate([at_most[kind_of(key)] for key in keys])).any())
 
 
 def linearised_badly(now: Array, linearised_at: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
-    """Say of which points (N, 3) m in the world the image in a pose (4, 4), linear about others (N, 3), is off too far.
+    """Say for which points (N, 3) m in the world the linearised image in a pose (4, 4) is off by too much.
 
     With image h, depth z and a point moved by dp, ``h(p) + h'(p) dp - h(p + dp)`` is ``(h(p + dp) - h(p)) dz / z``.
     """

@@ -1,4 +1,4 @@
-"""A graph of GTSAM's own factors and of Python's, linearised and evaluated in stacks or one by one."""
+"""A graph of GTSAM's own factors and of Python factors, linearised and evaluated in stacks or one by one."""
 
 from collections.abc import Sequence
 
@@ -10,9 +10,9 @@ from toolkit.models.stacked_factors import StackedFactors, linear_factors
 
 
 class MixedGraph:
-    """A graph as a solver takes it; ``stacks`` take the places of its Python factors on the same variables.
+    """A graph in the form a solver takes; ``stacks`` replace its Python factors on the same variables.
 
-    GTSAM hands a Python factor a copy of all values at each call, and calls one at a time.
+    GTSAM passes a Python factor a copy of all values at each call, and calls them one at a time.
     """
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, stacks: Sequence[StackedFactors] = ()) -> None:
@@ -26,11 +26,11 @@ class MixedGraph:
 
     @property
     def has_python(self) -> bool:
-        """Say whether there are factors of Python's."""
+        """Say whether the graph has Python factors."""
         return bool(self._stacks or self._single)
 
     def linear(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """Return the graph, linear about some values."""
+        """Return the graph linearised at some values."""
         linear = self.native.linearize(values)
         for stack in self._stacks:
             for factor in linear_factors(stack, values):
@@ -40,7 +40,7 @@ class MixedGraph:
         return linear
 
     def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares, or of losses."""
+        """Return half the sum of squares, or the sum of losses."""
         stacked = sum(0.5 * float(np.square(stack.residuals(values)).sum()) for stack in self._stacks)
         one_by_one = sum(factor.error(values.extract(factor.keys())) for factor in self._single)
         return self.native.error(values) + stacked + one_by_one

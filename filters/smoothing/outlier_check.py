@@ -1,12 +1,12 @@
-"""Which sightings are outliers to a smoother, far from where it expects their landmark; and which landmarks are wrong.
+"""Which sightings are outliers to a smoother, far from their landmark's predicted image, and which landmarks are wrong.
 
-Expected is what the newest state sees of the smoother's own landmarks, once the measured motion and all of the frame's
-sightings have put it in its place: a gate that has to let all pass that the motion may be off by lets a car pass, too,
-that moves slowly through the image. No filter beside the smoother takes part: one whose covariance is too small
-diverges, and would reject every sound sighting.
+The prediction is the image of the smoother's own landmarks in the newest state, after the measured motion and all of
+the frame's sightings have corrected that state. A gate around the uncorrected state would have to allow for the error
+of the motion, and would accept a car that moves slowly through the image. No filter runs beside the smoother: a filter
+whose covariance is too small diverges, and would reject every sound sighting.
 
-A landmark that begins far too far away may refuse all that its track shows for as long as it lives. It is wrong where
-more sightings of its track are refused than were taken, and these agree with each other.
+A landmark whose first estimate is far too distant may cause all later sightings of its track to be rejected. It is
+wrong if more sightings of its track are rejected than were accepted, and the rejected ones agree with each other.
 """
 
 from collections import Counter
@@ -25,20 +25,21 @@ from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.settings import Outliers
 
-# One mismatch is refused, and another by chance; three in succession that see the same point elsewhere are not chance.
+# One sighting may be rejected as a mismatch and another by chance; three in a row that agree on another point are not
+# chance.
 FEWEST_REFUSED = 3
-# Gauss-Newton with weights of the step before: a turn of three pixels is within a tenth of one after these.
+# Gauss-Newton with the weights of the step before: a rotation by three pixels is corrected to a tenth after these.
 _STEPS = 5
-# A step (in the mean over its sightings, by their noise) that changes no residual to speak of is the last.
+# A step that changes residuals by less than this, in sigma and as a root mean square, is the last.
 _LEAST_STEP = 0.01
-# As batch has it, between its first solve and its last.
+# The loss of batch between its first and its last solve.
 _LOSS = Cauchy(2.0)
 
 
 def relative_to_its_map(belief: Belief) -> Belief:
-    """Return the belief with its pose taken for certain.
+    """Return the belief with a pose covariance of zero.
 
-    Landmarks are known from the pose, and share its error: how far both are off in the world shows in no sighting.
+    Landmarks were estimated from the pose and share its error; no sighting depends on the common error.
     """
     cov = belief.cov.copy()
     cov[POSE], cov[:, POSE] = 0.0, 0.0
@@ -47,7 +48,7 @@ def relative_to_its_map(belief: Belief) -> Belief:
 
 @dataclass(frozen=True, eq=False)
 class OutlierCheck:
-    """Leaves sightings out that are beyond the gate of an outlier policy, or a multiple of it."""
+    """Removes sightings beyond the gate of an outlier policy, or a multiple of it."""
 
     rig: StereoRig
     policy: Outliers
@@ -55,20 +56,20 @@ class OutlierCheck:
     def placed(
         self, expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, share: float = 1.0
     ) -> tuple[Belief, StereoFrame]:
-        """Return the state where a frame puts it, and the frame without what is an outlier there.
+        """Return the state corrected by a frame, and the frame without its outliers at that state.
 
-        ``expected`` is the state as predicted, its covariance that of its motion relative to the map, ``share`` what
-        sightings count for. There the error of the motion no longer enters the gate.
+        ``expected`` is the predicted state, with the covariance of its motion relative to the map; ``share`` is the
+        weight of sightings. At the corrected state the error of the motion no longer enters the gate.
         """
         known = _KnownSightings.of(frame, landmarks)
         there = _aligned(expected, known, self.rig, share)
         return there, frame.select(~self._outliers(known, relative_to_its_map(there)))
 
     def outliers(self, frame: StereoFrame, landmarks: KnownLandmarks, expected: Belief) -> BoolArray:
-        """Say which sightings (N,) of a frame are not of the landmarks that their tracks have.
+        """Say which sightings (N,) of a frame do not fit the landmarks of their tracks.
 
-        ``expected`` is the state as predicted, its covariance that of its motion relative to the map. A sighting of an
-        unknown landmark is no outlier. Where most are outliers the state is wrong, and none is returned.
+        ``expected`` is the predicted state, with the covariance of its motion relative to the map. A sighting of an
+        unknown landmark is no outlier. If most sightings are outliers the state is wrong, and none is returned.
         """
         return self._outliers(_KnownSightings.of(frame, landmarks), expected)
 
@@ -91,7 +92,7 @@ class OutlierCheck:
 
 
 class _KnownSightings(NamedTuple):
-    """Which of a frame's sightings (N,) are of known landmarks, these (n, 3) px, and the landmarks.
+    """The sightings of known landmarks: which (N,) of a frame's they are, (n, 3) px, and the landmarks.
 
     ``points`` (n, 3) are in m, ``covs`` (n, 3, 3) in m^2.
     """
@@ -108,14 +109,14 @@ class _KnownSightings(NamedTuple):
 
 
 class _Refused(NamedTuple):
-    """Where the first of some refused sightings was (3,) m in the world, and how many there are."""
+    """The point (3,) m in the world of the first of some agreeing rejected sightings, and their number."""
 
     point: Array
     sightings: int
 
 
 class RefusedTracks:
-    """Counts, track by track, successive sightings that are refused and agree."""
+    """Counts, for each track, successive sightings that are rejected and agree."""
 
     def __init__(self, rig: StereoRig, gate_probability: float | None) -> None:
         self._rig, self._bound = rig, chi2_bound(3, gate_probability)
@@ -123,12 +124,12 @@ class RefusedTracks:
         self._taken = Counter[int]()
 
     def forget(self, track_ids: Iterable[int]) -> None:
-        """Begin to count anew for tracks whose landmarks are gone."""
+        """Restart the count of tracks whose landmarks are gone."""
         for i in track_ids:
             self._taken.pop(i, None)
 
     def contradicted(self, frame: StereoFrame, refused: BoolArray, T_world_imu: Array) -> set[int]:
-        """Take in a frame, of which some sightings (N,) were refused, and its pose; return the tracks to begin anew."""
+        """Add a frame, which of its sightings (N,) were rejected, and its pose; return the tracks to start again."""
         self._taken.update(frame.track_ids[~refused].tolist())
         seen = frame.select(refused & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
         if not seen.track_ids.size:
@@ -138,7 +139,7 @@ class RefusedTracks:
         before = [self._refused.get(i) for i in seen.track_ids.tolist()]
         expected = np.array([point if one is None else one.point for one, point in zip(before, points, strict=True)])
         off_px = seen.uvs_px - stereo.images(transform(se3_inverse(T_world_imu), expected), self._rig)[0]
-        # Both sightings err.
+        # Twice the covariance, because the predicted sighting has noise as well.
         covs_px2 = np.broadcast_to(2.0 * self._rig.cov_uv_px2, (len(points), 3, 3))
         agree = mahalanobis_squared(off_px, covs_px2) <= self._bound
         found = zip(seen.track_ids.tolist(), before, points, agree.tolist(), strict=True)
@@ -151,17 +152,17 @@ class RefusedTracks:
 
 
 def _carried(H: Array, cov: Array) -> Array:
-    """Return what a covariance, one or one each, comes to in images by Jacobians (n, 3, d): (n, 3, 3) px^2."""
+    """Return covariances propagated to images by Jacobians (n, 3, d): (n, 3, 3) px^2."""
     return np.asarray(H @ cov @ np.swapaxes(H, 1, 2))
 
 
 def aligned(
     expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, rig: StereoRig, share: float = 1.0
 ) -> Belief:
-    """Return the belief at the pose that a frame's sightings of known landmarks and the expected pose agree on.
+    """Return the belief with its pose corrected by a frame's sightings of known landmarks.
 
-    Each sighting counts for a share of what it tells by itself, with the noise of the pixels; what is far is so by all
-    of it. The covariance stays as it is.
+    Each sighting has a weight ``share`` and the noise of the pixels; whether it is an outlier is decided by its full
+    residual. The covariance is not changed.
     """
     return _aligned(expected, _KnownSightings.of(frame, landmarks), rig, share)
 

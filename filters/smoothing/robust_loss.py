@@ -1,4 +1,4 @@
-"""Losses of the lengths of whitened residuals, for many at once, by the formulas GTSAM has for one."""
+"""Losses of the norms of whitened residuals, vectorised, by the formulas of GTSAM's robust losses."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -9,7 +9,7 @@ from toolkit.geometry import Array
 
 
 class Loss(Protocol):
-    """What residuals of given lengths (N,) cost, and what the squares of such ones count for there."""
+    """The costs of residuals with given norms (N,), and the weights of their squares."""
 
     def cost(self, norms: Array) -> Array:
         """Return the costs (N,)."""
@@ -48,7 +48,7 @@ class Huber:
 
 @dataclass(frozen=True)
 class Cauchy:
-    """Logarithmic far beyond a scale: what is far off loses its pull."""
+    """Grows logarithmically beyond a scale, so that the weight of large residuals vanishes."""
 
     scale: float
 

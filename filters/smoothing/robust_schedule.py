@@ -1,9 +1,9 @@
-"""The robust schedule of a batch solve: a convex loss to get near, a redescending one to settle, then the rest alone.
+"""The robust schedule of a batch solve: a convex loss first, then a redescending one, then inliers without a loss.
 
-The last solve takes the sightings that chance explains at the solution, and these at their full weight: a redescending
-loss weighs good sightings down as well, and what it returns is neither efficient nor does its curvature tell a
-covariance. The filters' gate would not do: to keep the 95 % that agree best with a solution is to choose the
-measurements by their agreement, a sixth of the squared error gone, and made a simulated drive 1.7 times less accurate.
+The last solve uses the sightings that are plausible at the solution, with their full weight. A redescending loss gives
+inliers less weight too; its solution is not efficient, and its curvature is not an information matrix. The filters'
+gate would not do here: keeping the 95 % that agree best with a solution selects measurements by their agreement,
+removes a sixth of the squared error, and made a simulated drive 1.7 times less accurate.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,35 +29,35 @@ from toolkit.progress import Progress
 from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.settings import Outliers
 
-# Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go. The last solve
-# starts where these end.
-# Solves along the tracks begin near the solution. The scale of the world depends on differences of small residuals, so
-# that the last of them stops by how much the error falls, not by which share of it.
+# Huber's loss first brings every landmark near its minimum, mismatched or not; Cauchy's then gives mismatches no
+# weight. The last solve starts from that solution.
+# Solves along the tracks start near the solution. The scale of the world depends on differences of small residuals, so
+# the last of them stops at an absolute decrease of the error, not at a relative one.
 _JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 120, decrease=0.01)
-# A scale of disparities under white noise depends on them too, but converges soon; far landmarks take long.
+# A scale of disparities under white noise depends on them too, but converges quickly; far landmarks converge slowly.
 _SCALE_STOPPING = Stopping(1e-5, 60)
-# Huber's solve is to bring landmarks near, not to an end; Cauchy's, whose weights converge slowly, to tell what is an
-# outlier. Both were chosen by looking at recordings that are scored with them.
+# Huber's solve need not converge, it only brings landmarks near; Cauchy's, whose weights converge slowly, only decides
+# what is an outlier. Both thresholds were chosen by looking at recordings that are scored with them.
 _HUBER_STOPPING, _CAUCHY_STOPPING = Stopping(1e-2, 20, at_overshoot=True), Stopping(3e-3, 60)
 _LAST_STOPPING = Stopping(1e-4, 60)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionFactors:
-    """The factors of motion, and stacks of those among them that are written in Python."""
+    """The motion factors, and stacks of those among them that are written in Python."""
 
     graph: gtsam.NonlinearFactorGraph
     stacks: Sequence[StackedFactors] = ()
 
     @property
     def mixed(self) -> MixedGraph:
-        """Return them as a solver takes them."""
+        """Return the factors in the form a solver takes."""
         return MixedGraph(self.graph, self.stacks)
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """The last solution, the graph it solves, and the frames (K,) with the sightings that are in it."""
+    """The last solution, its graph, and the frames (K,) with the sightings in it."""
 
     solution: Solution
     graph: gtsam.NonlinearFactorGraph
@@ -75,16 +75,16 @@ def solve_robustly(
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
-    Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
-    it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
-    A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
-    tracks count for the share that their residuals leave them by then.
+    Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on, because a sighting
+    of it has no gradient and would leave it there. The result is that of the last solve, and so is whether it
+    converged. A scale of disparities among the values stays fixed until outliers have been decided. In the last solve
+    tracks have the weight that their residuals give them by then.
     """
     values, order_of, overshot = start, cheaper_order(motion.graph, frames), False
     for robust, stopping, stage in _stages(outliers):
         graph = _with_sightings(motion.graph, frames, StereoFactors(rig, robust))
         values = _only_seen(values, frames)
-        # Huber's solve is to bring landmarks near, not to an end: to its minimum it takes twice as long for nothing.
+        # Huber's solve need not reach its minimum, which would take twice as long without a gain.
         images = None if stopping is _HUBER_STOPPING else FirstImages.of(frames, rig, at_once=overshot)
         order = order_of(graph, frames)
         solved = solve(MixedGraph(graph, motion.stacks), values, stopping, progress, stage, images, order)
@@ -120,12 +120,12 @@ def _solve_chained(
     outliers: Outliers,
     progress: Progress,
 ) -> Smoothed:
-    """Solve with sightings whose errors are correlated along their tracks, from the answer of those that do not.
+    """Solve with correlated errors along tracks, starting from the solution with uncorrelated ones.
 
-    First under Cauchy's loss of what is new in each sighting, a track being Student-t distributed as a whole; then
-    without those innovations that chance does not explain there: after such a jump a track may be anywhere, and its
-    next steps still count. In the last solve each track weighs what it does at its start, so that what is solved, and
-    what the covariance is of, are least squares.
+    The first solve has Cauchy's loss of the innovations, with each track's remaining error Student-t distributed as a
+    whole. The second leaves out implausible innovations: after such a jump the track may have a new error, and its
+    following innovations are still used. In this last solve each track keeps the weight it has at the start, so that
+    the problem, and its covariance, are those of least squares.
     """
     values = _only_seen(start, frames)
     sightings = ChainedSightings.of(frames, rig)
@@ -163,7 +163,7 @@ def _cut_bound(outliers: Outliers, dof: int | IntArray) -> Array:
 
 
 def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Base, Stopping, str]]:
-    """Yield the losses before the last solve, with when to stop and what it is called."""
+    """Yield the losses before the last solve, with their stopping criteria and stage names."""
     huber, cauchy = huber_loss(outliers.batch_huber), outliers.batch_cauchy
     if huber is not None:
         yield huber, _HUBER_STOPPING, "solving with Huber's loss"
@@ -173,7 +173,7 @@ def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Ba
 
 
 def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:
-    """Return the ids (M,) of the known landmarks seen often and near enough."""
+    """Return the ids (M,) of the known landmarks that are seen often enough and from near enough."""
     ids = np.concatenate([f.track_ids for f in frames])
     disparities_px = np.concatenate([stereo.disparity_px(f.uvs_px) for f in frames])
     unique_ids, row_of, counts = np.unique(ids, return_inverse=True, return_counts=True)
@@ -225,7 +225,7 @@ def _poses(values: gtsam.Values, count: int) -> Array:
 
 
 def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
-    """Return the frames without the left image's sightings of landmarks that no sighting in both images is left of."""
+    """Return the frames without left-only sightings of landmarks that no sighting in both images sees any more."""
     if not any(is_left_only(frame.uvs_px).any() for frame in frames):
         return frames
     placed = np.unique(np.concatenate([frame.track_ids[~is_left_only(frame.uvs_px)] for frame in frames]))

@@ -1,8 +1,8 @@
-"""The scale of all disparities as a variable of a smoother's graph: its prior, its covariance, what is said of it.
+"""The scale of all disparities as a variable of a smoother's graph: its prior, its covariance, its log line.
 
-The tracks alone do not tell it: with it the whole world, path and landmarks, grows and shrinks. What is measured of the
-motion does, so the scale takes up what vision and motion samples differ by on the whole. It cannot tell which of both
-is right, but by its prior.
+The tracks alone do not observe it: a change of scale scales the whole world, path and landmarks. Measured motion does
+observe it, so the scale absorbs the overall disagreement between vision and motion samples. Only its prior says which
+of the two is more likely to be wrong.
 """
 
 from dataclasses import dataclass, replace
@@ -16,13 +16,13 @@ from toolkit.models.factors import SCALE
 from toolkit.models.motion import MotionModel
 from toolkit.models.state_covariances import covs_beside
 
-# A standard deviation above this share of the prior's is that of something the measurements say nothing of.
+# With a standard deviation above this share of the prior's, the measurements do not determine the scale.
 _UNTOLD = 0.95
 
 
 @dataclass(frozen=True)
 class ScaleState:
-    """A scale of disparities that is 0 but for a standard deviation."""
+    """The scale of disparities, 0 with a prior standard deviation."""
 
     prior_sigma: float
 
@@ -39,9 +39,9 @@ class ScaleState:
         motion: MotionModel,
         scale: float,
     ) -> tuple[Trajectory, tuple[str, ...]]:
-        """Return the trajectory with the covariance of every state, and what came of the scale; or why there is none.
+        """Return the trajectory with the covariance of every state and a line about the scale; or why there is none.
 
-        The states are as uncertain as the scale makes them.
+        The covariances include the uncertainty of the scale.
         """
         try:
             covs, of_scale = covs_beside(linear, motion, trajectory.T_world_imu, (SCALE,))
@@ -50,7 +50,7 @@ class ScaleState:
         return replace(trajectory, cov=covs), (self.message_of(scale, float(np.sqrt(of_scale[0, 0]))),)
 
     def message_of(self, scale: float, sigma: float) -> str:
-        """Say what came of the scale."""
+        """Return the log line about the scale."""
         message = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
         if sigma > _UNTOLD * self.prior_sigma:
             return f"{message}: the measurements do not tell, and that is the prior"

@@ -1,9 +1,9 @@
 """Sightings of many landmarks from many poses as information on the poses alone: the landmarks are eliminated.
 
 Each track is a smart factor (Carlone, Kira, Beall, Indelman & Dellaert 2014, "Eliminating conditionally independent
-sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur
-complement, for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does the same for one noise only, equal
-and independent in uL, uR and v; this takes the rig's whole covariance and weighs each sighting by Huber's loss.
+sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur complement,
+for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does the same only for noise that is equal and
+independent in uL, uR and v; here the rig's full covariance is used, and each sighting has its weight by Huber's loss.
 """
 
 from collections.abc import Sequence
@@ -19,33 +19,30 @@ from toolkit.models import left_only, stereo
 from toolkit.models.correlated_noise import Chain, channels_of, in_channels
 from toolkit.sequence import StereoRig, is_left_only
 
-# A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
+# Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
 _BEHIND_NORM = 100.0
 # A threshold of Huber's loss, in standard deviations, that no sighting reaches: no loss.
 _NO_LOSS = 1e6
-# Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
+# Added to a landmark's 3x3 block so that it is never singular; far below the information of any sighting.
 _LEAST_INFORMATION_PER_M2 = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class RobustCamera:
-    """A rig, and the threshold of Huber's loss by which its whitened sightings are weighed."""
+    """A rig, and the threshold of Huber's loss of whitened sightings."""
 
     rig: StereoRig
     huber: float
 
     @classmethod
     def of(cls, rig: StereoRig, huber: float | None) -> "RobustCamera":
-        """Return a camera whose loss begins at a threshold, or none."""
+        """Return a camera with a threshold of the loss; None for no loss."""
         return cls(rig, _NO_LOSS if huber is None else huber)
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """N sightings: rows of their poses (N,), of their points (N,), measurements (N, 3) px, ages (N,) of the tracks.
-
-    They are in the order of time.
-    """
+    """N sightings in the order of time: rows of poses (N,) and points (N,), measurements (N, 3) px, ages (N,)."""
 
     pose: IntArray
     point: IntArray
@@ -53,13 +50,13 @@ class Sightings:
     ages: IntArray
 
     def of_points(self, points: IntArray) -> "Sightings":
-        """Return the sightings of some points (M,), which keep their rows."""
+        """Return the sightings of some points (M,); their row numbers stay."""
         rows = np.isin(self.point, points)
         return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows], self.ages[rows])
 
 
 class PointsInView(NamedTuple):
-    """Where N sightings' points are: attitudes (N, 3, 3) of the IMU, the points (N, 3) there, depths (N,) m."""
+    """The points of N sightings: attitudes (N, 3, 3) of the IMU, points (N, 3) m in its frame, depths (N,) m."""
 
     R_world_imu: Array
     points_imu: Array
@@ -73,7 +70,7 @@ class PointsInView(NamedTuple):
 
 
 class ReducedVision(NamedTuple):
-    """Information (6K, 6K) and its vector (6K,) on the poses, and what gives the points' step back."""
+    """Information matrix (6K, 6K) and vector (6K,) on the poses, and the matrices for back-substitution of points."""
 
     information: Array
     vector: Array
@@ -82,13 +79,13 @@ class ReducedVision(NamedTuple):
     point_vector: Array
 
     def point_steps(self, pose_steps: Array) -> Array:
-        """Return the steps (M, 3) of the points that go with steps (6K,) of the poses."""
+        """Return the steps (M, 3) of the points for steps (6K,) of the poses."""
         whitened = self.point_vector - (self.coupling.T @ pose_steps).reshape(-1, 3)
         return (self.root @ whitened[..., None])[..., 0]
 
 
 def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> PointsInView:
-    """Return where the points (M, 3) of sightings are, seen from their poses (K, 4, 4) of the IMU in the world."""
+    """Return the points (M, 3) of sightings relative to their poses (K, 4, 4) of the IMU in the world."""
     T_imu_world = se3_inverse(poses)[sightings.pose]
     with np.errstate(invalid="ignore"):
         points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
@@ -118,7 +115,7 @@ class Vision:
 
     @property
     def loss_of_points(self) -> Array:
-        """The part (M,) of the loss that the sightings of each point have."""
+        """The part (M,) of the loss due to the sightings of each point."""
         return np.asarray(np.bincount(self.sightings.point, self._losses, minlength=self.counts[1]), dtype=np.float64)
 
     @property
@@ -139,13 +136,13 @@ class Vision:
 
     @property
     def _root_weights(self) -> Array:
-        """The roots of what Huber's loss makes of each residual (N,); 0 behind the camera."""
+        """The roots of Huber's weights (N,); 0 behind the camera."""
         huber = self.camera.huber
         return np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
-        """The points as predicted; those behind the camera from a place that has an image."""
+        """The predicted images; points behind the camera are replaced by one that has an image."""
         in_front, somewhere = self.seen.in_front, transform(self.camera.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
         points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
         return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
@@ -161,13 +158,13 @@ class Vision:
 
 
 class ChainedVision(Vision):
-    """Sightings whose errors are correlated along their tracks: what is new in each is a residual of two poses.
+    """Sightings whose errors are correlated along their tracks: the innovation of each is a residual of two poses.
 
-    Huber's loss is that of what is new.
+    Huber's loss is that of the innovations.
     """
 
     def reduced(self) -> ReducedVision:
-        """Linearise and eliminate the points, as for sightings that stand each for itself."""
+        """Linearise and eliminate the points, as for independent sightings."""
         chain, weights, channels = self._chain, self._root_weights[:, None, None], channels_of(self.sightings.uv_px)
         to_pose, to_point = self._predicted.d_uv_d_pose, self._predicted.d_uv_d_point
         own = weights * chain.whitened(in_channels(channels, to_pose), np.zeros_like(to_pose))
@@ -175,7 +172,7 @@ class ChainedVision(Vision):
         J_point = weights * chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point))
         seen, left, of_poses = self.sightings, is_left_only(self.sightings.uv_px), []
         of_poses.append(_OfPoses(np.arange(seen.pose.size), seen.pose, own))
-        # Of a pair and of a sighting by the left image alone the same one may be that before.
+        # A stereo sighting and a left-only sighting may have the same preceding sighting.
         for kind in (~left, left) if left.any() else (~left,):
             follow = np.flatnonzero((chain.before >= 0) & kind)
             of_poses.append(_OfPoses(follow, seen.pose[chain.before[follow]], before[follow]))
@@ -189,15 +186,15 @@ class ChainedVision(Vision):
 
     @cached_property
     def _residual(self) -> Array:
-        """What is new in measured less predicted, whitened (N, 3)."""
+        """Whitened innovations (N, 3) of measured less predicted."""
         residuals_px = left_only.residuals_px(self.sightings.uv_px, self._predicted.uv_px)
         return self._chain.innovations(residuals_px, channels_of(self.sightings.uv_px))
 
 
 class _OfPoses(NamedTuple):
-    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on.
+    """Jacobians (n, 3, 6) of some residuals, given by rows (n,), to one pose (n,) that each depends on.
 
-    No two of them are of the same pose and the same point.
+    No two of them share both pose and point.
     """
 
     rows: IntArray
@@ -230,7 +227,7 @@ def _eliminated(
 
 
 def _add_of_poses(information: Array, of_poses: Sequence[_OfPoses]) -> None:
-    """Add what residuals say of their poses to the information (K, 6, K, 6) on all of them."""
+    """Add the residuals' information on their poses to the information (K, 6, K, 6) on all of them."""
     count = len(information)
     for one in of_poses:
         for other in of_poses:
@@ -242,5 +239,5 @@ def _add_of_poses(information: Array, of_poses: Sequence[_OfPoses]) -> None:
 
 
 def _summation(groups: IntArray, count: int) -> csc_array:
-    """Return the matrix (count, N) that adds up the rows (N, d) of each group."""
+    """Return the matrix (count, N) that sums the rows (N, d) of each group."""
     return csc_array((np.ones(groups.size), groups, np.arange(groups.size + 1)), shape=(count, groups.size))

@@ -1,7 +1,7 @@
-"""The minimum of a window of states, the covariance of each of them, and the window without its oldest.
+"""The minimum of a window of states, the covariance of each of them, and the window without its oldest states.
 
-What leaves is marginalised by a Schur complement, with the whole of every track it saw, so that each sighting counts
-once (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
+States that leave are marginalised by a Schur complement, together with every track they saw, so that each sighting is
+used once (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
 """
 
 from dataclasses import dataclass, replace
@@ -17,27 +17,27 @@ from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 
 MOST_ITERATIONS = 5
-# Newton's method doubles its digits: after a step of so few sigmas of all states together the next is of a tenth of
-# one, and is taken with the next frame. Where a step gains hardly anything, the rest gain nothing.
+# Newton's method converges quadratically: after a step of so few sigmas of all states together the next is of a tenth
+# of one, and is taken with the next frame. If a step gains hardly anything, further ones gain nothing.
 LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
-# Only for a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than there
-# is on position and heading in the world, and would hold them where they were.
+# Used only after a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than
+# the information on position and heading in the world, and would fix these.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
-# How far along its step a landmark may go where the window's would cost more. No damping of the poses shortens it.
+# Parts of a landmark's step that are tried if the window's step raises the cost; damping the poses does not shorten it.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedWindow:
-    """A window at its minimum and the root of the information it was last linearised to, a step short of that."""
+    """A window at its minimum, and the root of its information, linearised one step before the minimum."""
 
     window: SmartWindow
     root: Array
 
     def cov(self, i: int) -> Array:
-        """Return the marginal covariance (d, d) of state i, in GTSAM's spaces.
+        """Return the marginal covariance (d, d) of state i, in GTSAM's tangent spaces.
 
-        With the root's rows in the order of time, those before the state say nothing of it.
+        The root's rows are in the order of time, and rows before the state do not involve it.
         """
         d = self.window.size
         later = self.root[i * d :, i * d :]
@@ -67,7 +67,7 @@ def solve_window(window: SmartWindow, camera: RobustCamera) -> SolvedWindow:
 
 
 def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> SmartWindow:
-    """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
+    """Marginalise the ``count`` oldest states with every track they saw; the row numbers of other points stay."""
     seen = window.sightings
     leaving_points = np.unique(seen.point[seen.pose < count])
     leaving = replace(_only(window, leaving_points), motion=window.motion[: count + 1])
@@ -95,7 +95,7 @@ def _only(window: SmartWindow, points: IntArray) -> SmartWindow:
 
 
 class _DescentStep(NamedTuple):
-    """Where a step leads, how long it is in standard deviations of all states together, and how it was damped."""
+    """The window after a step, the step's length in standard deviations of all states together, and its damping."""
 
     there: Evaluated
     sigmas: float
@@ -103,7 +103,7 @@ class _DescentStep(NamedTuple):
 
 
 def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _DescentStep:
-    """Return a step that costs no more, damped as far as that takes, or one of no length."""
+    """Return the least damped step that does not raise the cost, or a step of length zero."""
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
@@ -120,9 +120,9 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
 
 
 def _each_landmark_by_itself(moved: SmartWindow, before: Array, camera: RobustCamera) -> SmartWindow:
-    """Return the window with each landmark (M,) only so far on from where it was before as its sightings cost least.
+    """Return the window with each landmark (M,) moved by the part of its step with the lowest cost of its sightings.
 
-    A landmark that comes nearer by metres may overshoot to behind a camera: it alone would refuse every step.
+    A landmark that comes nearer by metres may overshoot to behind a camera, and alone would make every step fail.
     """
     places = np.array([before + share * (moved.points - before) for share in _SHARES])
     costs = [Vision.at(moved.poses, points, moved.sightings, camera).loss_of_points for points in places]
@@ -131,7 +131,7 @@ def _each_landmark_by_itself(moved: SmartWindow, before: Array, camera: RobustCa
 
 
 def _moved(window: SmartWindow, system: System, step: Array) -> SmartWindow:
-    """Return the window a step (D,) of its states on, its landmarks with them."""
+    """Return the window after a step (D,) of its states and the corresponding steps of its landmarks."""
     delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
     for key in window.all_keys:
         delta.insert(key, step[start : start + dims[key]])

@@ -1,7 +1,7 @@
-"""The window of `smart`: states held by motion factors and a linear prior, tracks without landmark variables.
+"""The window of `smart`: states with motion factors and a linear prior, tracks without landmark variables.
 
-A :class:`SmartWindow` is the problem, a :class:`TrackedWindow` knows which track each of its points is, and
-:class:`Evaluated` turns it into normal equations, which ``smart_solver`` solves.
+A :class:`SmartWindow` is the problem, a :class:`TrackedWindow` adds the track id of each point, and :class:`Evaluated`
+computes the normal equations, which ``smart_solver`` solves.
 
 Everything is dense: a window has a few hundred unknowns.
 """
@@ -23,7 +23,7 @@ from toolkit.sequence import StereoFrame, StereoRig
 
 @dataclass(frozen=True, eq=False)
 class MarginalPrior:
-    """Information (D, D) and vector (D,) on the first D unknowns of the window, about values of their states."""
+    """Information matrix (D, D) and vector (D,) on the first D unknowns of the window, linearised at ``about``."""
 
     information: Array
     vector: Array
@@ -37,7 +37,7 @@ class MarginalPrior:
 
 @dataclass(frozen=True, eq=False)
 class SmartWindow:
-    """States in the order of time, their keys (each [pose, velocity, bias] or [pose, bias]) and what holds them.
+    """States in the order of time: their keys (each [pose, velocity, bias] or [pose, bias]), factors and sightings.
 
     ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
     """
@@ -61,7 +61,7 @@ class SmartWindow:
 
     @property
     def size(self) -> int:
-        """Return the unknowns of one state."""
+        """Return the number of unknowns of one state."""
         return int(self.values.extract(list(self.keys[0])).dim())
 
 
@@ -84,9 +84,9 @@ class TrackedWindow:
         return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
 
     def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
-        """Add what the newest state, at a pose (4, 4), sees: known tracks go on, new ones start where stereo puts them.
+        """Add the sightings of the newest state, at a pose (4, 4): known tracks continue, new ones are triangulated.
 
-        Of new tracks those of enough disparity alone.
+        New tracks of too small a disparity are left out.
         """
         known = np.isin(frame.track_ids, self.track_ids)
         new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
@@ -105,13 +105,13 @@ class TrackedWindow:
         return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
 
     def newest(self, frame: StereoFrame) -> StereoFrame:
-        """Return of the frame of the newest state what is in the window."""
+        """Return the newest state's frame without the sightings that are not in the window."""
         seen = self.window.sightings
         taken = self.track_ids[seen.point[seen.pose == len(self.window.keys) - 1]]
         return frame.select(np.isin(frame.track_ids, taken))
 
     def compacted(self) -> "TrackedWindow":
-        """Let the points go that nothing sees any more."""
+        """Drop the points without sightings."""
         seen = self.window.sightings
         kept, rows = np.unique(seen.point, return_inverse=True)
         sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px, seen.ages)
@@ -120,7 +120,7 @@ class TrackedWindow:
         )
 
     def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
-        """Let the points go that are behind a camera that saw them; return the rest, and the ids (n,) of those gone."""
+        """Drop the points that are behind a camera that saw them; return the window and the ids (n,) of these."""
         seen = self.window.sightings
         in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
         behind = np.unique(seen.point[~in_front])
@@ -144,7 +144,7 @@ class System:
         return _lower_factor(self.information)
 
     def damped_root(self, damping: float) -> Array:
-        """Return the lower Cholesky factor (D, D), a share of the diagonal added; raises LinAlgError as ``root``."""
+        """Return the lower Cholesky factor (D, D) with a share of the diagonal added; raises as ``root`` does."""
         if damping == 0.0:
             return self.root
         damped = self.information.copy()
@@ -154,7 +154,7 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """A window and what it costs where it is: half the squared errors, Huber's losses, the prior's."""
+    """A window and its cost at its values: half the squared errors of motion and prior, and Huber's losses."""
 
     window: SmartWindow
     motion: gtsam.GaussianFactorGraph
@@ -163,13 +163,13 @@ class Evaluated:
 
     @classmethod
     def of(cls, window: SmartWindow, camera: RobustCamera) -> "Evaluated":
-        """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
+        """Evaluate a window. Its motion is linearised at once: Python factors cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
         return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
 
     @cached_property
     def error(self) -> float:
-        """What the window costs."""
+        """The cost of the window."""
         prior, off = self.window.prior, self.off_prior
         held = float(0.5 * off @ prior.information @ off - prior.vector @ off)
         return held + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
@@ -187,14 +187,14 @@ class Evaluated:
         return System(information, vector, vision)
 
     def _of_motion(self, size: int) -> tuple[Array, Array]:
-        """Return the normal equations of the motion, which ties the first states of the window, or all."""
+        """Return the normal equations of the motion factors, which involve the first states of the window, or all."""
         tied, ordering = set(self.motion.keyVector()), gtsam.Ordering()
         for key in self.window.all_keys:
             if key in tied:
                 ordering.push_back(key)
         information, vector = np.zeros((0, 0)), np.zeros(0)
         if tied:
-            # Symmetric, and in GTSAM's order of columns: its transpose is the same and in NumPy's.
+            # The matrix is symmetric and column-major, so its transpose is the same matrix in NumPy's row-major order.
             augmented = self.motion.augmentedHessian(ordering).T
             information, vector = augmented[:-1, :-1], augmented[-1, :-1]
         rest = size - len(vector)
@@ -209,7 +209,7 @@ def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFa
 
 
 def _off_prior(window: SmartWindow) -> Array:
-    """Return how far (D,) the prior's states are from the values it is about."""
+    """Return the deviation (D,) of the prior's states from its linearisation point."""
     about = window.prior.about
     held = [key for key in window.all_keys if about.exists(key)]
     if not held:
@@ -219,5 +219,5 @@ def _off_prior(window: SmartWindow) -> Array:
 
 
 def _lower_factor(matrix: Array) -> Array:
-    # LAPACK takes columns where NumPy has rows: of a symmetric matrix the transpose is the same and need not be copied.
+    # LAPACK is column-major and NumPy row-major: a symmetric matrix is its own transpose and need not be copied.
     return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))

@@ -1,10 +1,10 @@
 """Sightings whose errors are correlated along their tracks, as linear factors on two poses and a landmark each.
 
-A sighting's error follows from that of the sighting before it (:class:`toolkit.models.correlated_noise.Chain`), so what
-is new in it is a residual of both poses and of the landmark. GTSAM has no such factor, and one written in Python is
-slow: here all of them are evaluated and linearised at once, and take part in a solve by their linearisation. A scale
-of all disparities is a variable of every sighting where the values have one, which no factor of GTSAM's knows either;
-sightings that err each by itself are then chains without memory.
+A sighting's error is predicted from that of the sighting before it (:class:`toolkit.models.correlated_noise.Chain`), so
+its innovation is a residual of both poses and of the landmark. GTSAM has no such factor, and a Python factor is slow:
+here all of them are evaluated and linearised at once, and take part in a solve by their linearisation. If the values
+have a scale of disparities, it is a variable of every sighting, which no factor of GTSAM's has either; independent
+sightings are then chains without correlation.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,17 +25,18 @@ from toolkit.models.stereo import d_uv_d_scale, scaled_rig
 from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.track_noise import TrackNoise
 
-# Of Student's t over tracks, as fitted to all real recordings (docs/tracks.md); Gaussian ones lose a few percent by it.
+# Degrees of freedom of Student's t over tracks, fitted to all real recordings (docs/tracks.md); with Gaussian errors it
+# costs a few percent of accuracy.
 FREEDOM_OF_TRACKS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class ChainedSightings:
-    """N sightings: frame and track (N,), both by number, (uL, uR, v) (N, 3) px, and how their errors are correlated.
+    """N sightings: frame and track numbers (N,), (uL, uR, v) (N, 3) px, and the correlation of their errors.
 
-    ``counted`` (N,) says which of the innovations count: an outlying one leaves the track free to be anywhere else from
-    there on. ``track_ids`` (M,) ascending are the tracks; ``channels`` (3, 3), or
-    one each (N, 3, 3), is what makes channels of (uL, uR, v).
+    ``counted`` (N,) says which innovations are used; an outlying one is left out, and the track's error is free to take
+    any value from there on. ``track_ids`` (M,) ascending are the tracks; ``channels`` (3, 3), or one each (N, 3, 3),
+    maps (uL, uR, v) to channels.
     """
 
     pose: IntArray
@@ -48,7 +49,7 @@ class ChainedSightings:
 
     @classmethod
     def of(cls, frames: list[StereoFrame], rig: StereoRig) -> "ChainedSightings":
-        """Return the sightings of frames (K,), with the noise of tracks if the rig states it."""
+        """Return the sightings of frames (K,), with the rig's track noise model if it has one."""
         pose = np.repeat(np.arange(len(frames)), [frame.track_ids.size for frame in frames])
         ids, point = np.unique(np.concatenate([frame.track_ids for frame in frames]), return_inverse=True)
         ages, uv_px = np.concatenate([f.ages for f in frames]), np.concatenate([f.uvs_px for f in frames])
@@ -68,7 +69,7 @@ class ChainedSightings:
 
 @dataclass(frozen=True, eq=False)
 class SightingRows:
-    """N sightings in the order of time: frame (N,) by number, its stamp, track id, (uL, uR, v) (N, 3) px, age.
+    """N sightings in the order of time: frame number (N,), stamp, track id, (uL, uR, v) (N, 3) px, age.
 
     ``begins`` (N,) says which were the first of a landmark in the graph.
     """
@@ -87,7 +88,7 @@ class SightingRows:
         return cls(empty, empty, empty, np.empty((0, 3)), empty, np.empty(0, dtype=bool))
 
     def followed_by(self, frame: StereoFrame, k: int) -> "SightingRows":
-        """Return the rows with those of frame k behind them."""
+        """Return the rows with those of frame k appended."""
         count = frame.track_ids.size
         return SightingRows(
             np.concatenate([self.pose, np.full(count, k)]),
@@ -104,7 +105,7 @@ class SightingRows:
 
     @classmethod
     def joined(cls, parts: Iterable["SightingRows"]) -> "SightingRows":
-        """Return several in one."""
+        """Return several concatenated."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def keys(self) -> list[int]:
@@ -112,7 +113,10 @@ class SightingRows:
         return [*map(X, np.unique(self.pose).tolist()), *map(L, np.unique(self.track_id).tolist())]
 
     def chained(self, noise: TrackNoise) -> ChainedSightings:
-        """Return all sightings as one chain a track; what is new counts where it is known what came before."""
+        """Return all sightings as one chain per track; an innovation is used only if the sighting before it is known.
+
+        The first sighting of a landmark in the graph is used as well.
+        """
         ids, point = np.unique(self.track_id, return_inverse=True)
         chain = Chain.of(noise, point.astype(np.int64), self.age, is_left_only(self.uv_px))
         counted = self.begins | (chain.before >= 0)
@@ -123,10 +127,10 @@ class SightingRows:
 def without_jumps(
     sightings: ChainedSightings, frames: list[StereoFrame], jumped: BoolArray
 ) -> tuple[ChainedSightings, list[StereoFrame]]:
-    """Return the sightings of frames (K,) less the innovations (N,) that jumped, and the frames with those left.
+    """Return the sightings of frames (K,) without the innovations (N,) that jumped, and the frames with those left.
 
-    A track that jumped at its beginning is left out: where its landmark is, the rest of it hardly says. So is one of
-    which no sighting in both images is left.
+    A track whose first sighting jumped is left out, because the rest of it hardly determines its landmark. So is a
+    track that has no sighting in both images left.
     """
     began_with = jumped & (sightings.chain.before < 0)
     kept = ~np.isin(sightings.point, sightings.point[began_with])
@@ -149,11 +153,11 @@ def without_jumps(
 
 @dataclass(frozen=True, eq=False)
 class ChainedFactors:
-    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' lengths.
+    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' norms.
 
-    With ``freedom`` what is left of a track is Student-t distributed as a whole, with so many degrees of freedom: one
-    that errs more than the others throughout, as on a vehicle, counts less throughout (Lange, Little & Taylor 1989,
-    "Robust statistical modeling using the t distribution", eq. 3).
+    With ``freedom``, the remaining error of a track is Student-t distributed as a whole, with so many degrees of
+    freedom: a track with larger errors than the others throughout, such as one on a vehicle, has a smaller weight
+    throughout (Lange, Little & Taylor 1989, "Robust statistical modeling using the t distribution", eq. 3).
     """
 
     sightings: ChainedSightings
@@ -163,9 +167,9 @@ class ChainedFactors:
 
     @classmethod
     def of(cls, rows: SightingRows, rig: StereoRig, huber: float | None) -> "ChainedFactors":
-        """Return the factors of an incremental smoother, with Huber's loss and that of whole tracks, or with neither.
+        """Return an incremental smoother's factors, with Huber's loss and Student's t over tracks, or with neither.
 
-        The rig must state the noise of tracks.
+        The rig must have a track noise model.
         """
         assert rig.track_noise is not None
         sightings = rows.chained(rig.track_noise)
@@ -174,19 +178,19 @@ class ChainedFactors:
         return cls(sightings, rig, Huber(huber), FREEDOM_OF_TRACKS)
 
     def in_front(self, values: gtsam.Values) -> "ChainedFactors":
-        """Return the chains without sightings of landmarks behind the camera, or behind that of the sighting before."""
+        """Return the chains without sightings whose landmark is behind their camera or that of the sighting before."""
         seen, in_front = self.sightings, self.predicted(values).depth_m > 0.0
         in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
         return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
     def held(self, values: gtsam.Values) -> "ChainedFactors":
-        """Return the chains as least squares: each innovation keeps the weight that it has at the values."""
+        """Return the chains as least squares: each innovation keeps its weight at the values."""
         seen = self.sightings
         sigma_px = seen.chain.sigma_px / np.sqrt(self.weights(self.innovations(values)))[:, None]
         return ChainedFactors(replace(seen, chain=replace(seen.chain, sigma_px=sigma_px)), self.rig, Squares())
 
     def error(self, values: gtsam.Values) -> float:
-        """Return the sum of the losses, half a square each where there is none."""
+        """Return the sum of the losses; without a loss, half the sum of squares."""
         costs = self.loss.cost(np.linalg.norm(self.innovations(values), axis=1))
         if self.freedom is None:
             return float(costs[self.sightings.counted].sum())
@@ -194,7 +198,7 @@ class ChainedFactors:
         return float((0.5 * (self.freedom + self._dof) * np.log1p(2.0 * of_tracks / self.freedom)).sum())
 
     def weights(self, innovation: Array) -> Array:
-        """Return what the squares of innovations (N, 3) count for (N,)."""
+        """Return the weights (N,) of the squares of innovations (N, 3)."""
         norms = np.linalg.norm(innovation, axis=1)
         weights = self.loss.weight(norms)
         if self.freedom is None:
@@ -205,29 +209,29 @@ class ChainedFactors:
         )
 
     def _of_tracks(self, costs: Array) -> Array:
-        """Return the sum of the costs (N,) of each track (M,) that count."""
+        """Return the sum (M,) of each track's used costs (N,)."""
         seen = self.sightings
         counted = np.where(seen.counted, costs, 0.0)
         return np.asarray(np.bincount(seen.point, counted, seen.track_ids.size), dtype=float)
 
     @cached_property
     def _dof(self) -> Array:
-        """The degrees of freedom (M,) that the innovations of each track have: its first one places the landmark."""
+        """The degrees of freedom (M,) of each track's innovations; its first sighting determines the landmark."""
         seen = self.sightings
         dof = left_only.degrees_of_freedom(seen.uv_px)
         follows = np.where(seen.counted & (seen.chain.before >= 0), dof, 0)
         return np.asarray(np.bincount(seen.point, follows, seen.track_ids.size), dtype=float)
 
     def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
-        """Return the innovations that count as linear factors about the values, weighed as the loss does there.
+        """Return the used innovations as linear factors about the values, with the weights of the loss there.
 
-        Their Jacobians are those at the same values, or at others.
+        Their Jacobians are taken at the same values, or at ``jacobians_at``.
         """
         linear = self.linear(values, jacobians_at)
         return self.factors(linear, values, self.sightings.counted, self._to_scale(values))
 
     def landmark_steps(self, values: gtsam.Values) -> LandmarkSteps:
-        """Return the innovations that count as they take part in a step from the values, weighed as the loss does."""
+        """Return the system of a step from the values, of the used innovations with the weights of the loss."""
         seen, linear = self.sightings, self.linear(values)
         _, begins = np.unique(seen.point, return_index=True)
         landmarks = LandmarksSeen.at(values, seen.track_ids, seen.pose[begins], self.rig)
@@ -244,7 +248,7 @@ class ChainedFactors:
         return LandmarkSteps(values, landmarks, graph, np.column_stack(information), self.rig)
 
     def innovations(self, values: gtsam.Values) -> Array:
-        """Return what is new in each sighting (N, 3), in sigmas."""
+        """Return the innovation of each sighting (N, 3), in sigmas."""
         return self._innovations(self.predicted(values))
 
     def _innovations(self, predicted: stereo.StereoPrediction) -> Array:
@@ -252,7 +256,7 @@ class ChainedFactors:
         return seen.chain.innovations(left_only.residuals_px(seen.uv_px, predicted.uv_px), seen.channels)
 
     def linear(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> "LinearInnovations":
-        """Return what is new in each sighting, and how it changes with what it depends on, without a loss."""
+        """Return the innovations and their Jacobians, without a loss."""
         chain = self.sightings.chain
         predicted = self.predicted(values)
         innovation = self._innovations(predicted)
@@ -268,13 +272,13 @@ class ChainedFactors:
         )
 
     def predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
-        """Return what the values say of each sighting (N,)."""
+        """Return the predicted image of each sighting (N,)."""
         poses, points = self.sightings.places(values)
         rig = scaled_rig(self.rig, scale_in(values)) if values.exists(SCALE) else self.rig
         return stereo.predict(points, poses, rig)
 
     def _to_scale(self, values: gtsam.Values) -> Array | None:
-        """Return how the innovations change with the scale (N, 3, 1) where the values have one."""
+        """Return the derivative (N, 3, 1) of the innovations by the scale if the values have one."""
         if not values.exists(SCALE):
             return None
         seen = self.sightings
@@ -285,9 +289,9 @@ class ChainedFactors:
     def factors(
         self, linear: "LinearInnovations", values: gtsam.Values, rows: BoolArray, to_scale: Array | None = None
     ) -> gtsam.NonlinearFactorGraph:
-        """Return innovations of a mask (N,), linear about the values, as factors weighed by the loss.
+        """Return innovations of a mask (N,), linear about the values, as factors with the weights of the loss.
 
-        ``to_scale`` (N, 3, 1) is how they change with a scale of disparities among the values.
+        ``to_scale`` (N, 3, 1) is their derivative by a scale of disparities among the values.
         """
         roots = np.sqrt(self.weights(linear.innovation))
         graph = gtsam.NonlinearFactorGraph()
@@ -314,7 +318,7 @@ class ChainedFactors:
 
 
 class LinearInnovations(NamedTuple):
-    """Innovations (N, 3) in sigmas, and what they are less by a step of their pose, the one before, and their point.
+    """Innovations (N, 3) in sigmas, and their decrease per step of the pose, of the pose before, and of the point.
 
     ``own`` and ``before`` are (N, 3, 6), ``point`` (N, 3, 3).
     """
@@ -333,5 +337,5 @@ class LinearInnovations(NamedTuple):
 
 
 def scale_in(values: gtsam.Values) -> float:
-    """Return the scale of disparities among values, 0 where they have none."""
+    """Return the scale of disparities among values, 0 if they have none."""
     return float(values.atVector(SCALE)[0]) if values.exists(SCALE) else 0.0
