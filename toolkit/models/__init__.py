@@ -3,8 +3,8 @@
 Read ``stereo`` (the measurement, linearised) with ``left_only`` (where the right image is missing), ``state`` (layout,
 belief, prediction), ``motion`` (what a motion model offers filters and graphs) with its implementations ``twist``,
 ``imu`` and ``smooth_twist`` (nothing measured), then ``factors`` (keys, stereo factors, priors, marginals),
-``stacked_factors`` (Python's of one form, all at once), ``state_covariances`` (of all states of a graph), ``gating``
-(thresholds and their sources) and ``noise`` (for files that state none).
+``stacked_factors`` (Python factors of one form, evaluated at once), ``state_covariances`` (of all states of a graph),
+``gating`` (thresholds and their sources) and ``noise`` (for files that state none).
 
 For some settings and recordings: ``correlated_noise`` (errors along tracks), ``gap_bridge`` (no common tracks),
 ``moving_tracks`` (vehicles). From the tracks alone: ``camera_motion``. To judge an estimate: ``motion.predicted_steps``

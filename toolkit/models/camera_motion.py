@@ -49,7 +49,7 @@ class CameraMotion(NamedTuple):
     known: BoolArray
 
     def first(self, intervals: int) -> "CameraMotion":
-        """Return the motion over so many intervals from the first one on."""
+        """Return the motion over the first ``intervals`` intervals."""
         return CameraMotion(self.w_radps[:intervals], self.v_mps[:intervals], self.known[:intervals])
 
 
@@ -110,7 +110,7 @@ def usable_pairs(sequence: Sequence) -> Neighbours:
 def camera_motion(sequence: Sequence, start: Array | None = None) -> CameraMotion:
     """Estimate the camera's twist over every interval between frames.
 
-    ``start`` (K - 1, 4, 4) is the first guess, "at rest" by default; large motions need a better one.
+    ``start`` (K - 1, 4, 4) is the initial value, "at rest" by default; large motions need a better one.
     """
     intervals = max(sequence.frame_count - 1, 0)
     views = _two_views(sequence, intervals)
@@ -129,7 +129,7 @@ def camera_motion(sequence: Sequence, start: Array | None = None) -> CameraMotio
 
 
 def _stretches(first: IntArray) -> Iterator[slice]:
-    """Yield the intervals that have pairs, some at a time; ``first`` (K,) is where the pairs of each begin."""
+    """Yield slices of the intervals that have pairs; ``first`` (K,) is the row of each interval's first pair."""
     begin, last = 0, first.size - 1
     while begin < last and first[begin] < first[-1]:
         full = int(np.searchsorted(first, first[begin] + PAIRS_AT_A_TIME, side="right")) - 1
@@ -139,7 +139,7 @@ def _stretches(first: IntArray) -> Iterator[slice]:
 
 
 def _motion_over(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return the motion (K, 4, 4) over every interval, from a first guess, and the sum of its weights (K,)."""
+    """Return the motion (K, 4, 4) over every interval, from an initial value, and the sum of its weights (K,)."""
     support = np.zeros(views.first.size - 1)
     for _ in range(ITERATIONS):
         step, support, points = _gauss_newton(views, T_before_after, rig)
@@ -164,7 +164,7 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     T_after_before = np.take(_last(se3_inverse(T_before_after)), views.interval, axis=-1)
     rotation = T_after_before[:3, :3]
     moved = _applied(rotation, views.points) + T_after_before[:3, 3]
-    moved[2] = np.maximum(moved[2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
+    moved[2] = np.maximum(moved[2], LEAST_DEPTH_M)  # makes a point behind the camera a gross outlier
     d_point_d_uv, d_after = triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
     d_uv_d_before = _product(_product(d_after, rotation), d_point_d_uv)
     before_px = views.uv_before_px - project(views.points.T, rig).T
@@ -175,10 +175,10 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     weight = _cauchy_weights((white**2).sum(axis=0), views)
     root = np.sqrt(weight)
     normal = _normal_by_interval(_equations(root * _product(whitener, d_after), moved, root * white), views.first)
-    # The ridge keeps an interval without tracks where it is; it is far below one sighting's information.
+    # The ridge gives an interval without tracks a step of zero; it is far below one sighting's information.
     hessian = np.moveaxis(_ridged(normal[:6, :6]), -1, 0) + 1e-6 * np.eye(6)
     step = np.asarray(np.linalg.solve(hessian, np.moveaxis(normal[:6, 6:], -1, 0))[..., 0], dtype=np.float64)
-    # The best point for both views is the first view's, corrected by its share of the residual.
+    # The least-squares point of both views is the first view's, corrected by its share of the residual.
     share_px = np.einsum("jip,jp->ip", _product(whitener, spread), white)
     points = views.points + _applied(d_point_d_uv, before_px + share_px)
     points[2] = np.clip(points[2], LEAST_DEPTH_M, MOST_DEPTH_M)
@@ -187,7 +187,7 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
 
 
 def _equations(d_white: Array, moved: Array, white: Array) -> Array:
-    """Return the equations (7, 3, P) of a step [phi, rho] on the right of the motion, and what they lack.
+    """Return the whitened equations (7, 3, P) of a step [phi, rho] on the right of the motion: Jacobian and residual.
 
     The step moves a point p of the later view, one of ``moved`` (3, P), by [p]x phi - rho.
     """
@@ -246,7 +246,7 @@ def _whitener(cov: Array) -> Array:
 def _cauchy_weights(chi2: Array, views: _TwoViews) -> Array:
     """Return the weights (P,) of squared residuals (P,), scaled by the median of their own interval."""
     tracks = np.diff(views.first)
-    # One row an interval, filled up with NaN, which comes after all else in the order.
+    # One row per interval, padded with NaN, which sorts last.
     by_interval = np.full((tracks.size, tracks.max()), np.nan)
     by_interval[views.interval, np.arange(chi2.size) - views.first[views.interval]] = chi2
     by_interval.sort(axis=1)
@@ -257,7 +257,10 @@ def _cauchy_weights(chi2: Array, views: _TwoViews) -> Array:
 
 
 def _normal_by_interval(equations: Array, first: IntArray) -> Array:
-    """Return A^T A (d, d, K - 1) of the equations (d, 3, P) of each interval, which are consecutive; zero of none."""
+    """Return A^T A (d, d, K - 1) of the equations (d, 3, P) of each interval, zero for one that has none.
+
+    The equations of an interval are consecutive.
+    """
     normal, seen = np.zeros((len(equations), len(equations), first.size - 1)), np.diff(first) > 0
     for k, row in enumerate(equations):
         products = np.einsum("ip,jip->jp", row, equations[k:])

@@ -1,8 +1,8 @@
 """Correlated noise of tracks: residuals of a track's sightings are transformed so that they are independent.
 
-A track's error in each channel (:data:`toolkit.track_noise.CHANNELS`) is ``white + b``, where ``b`` begins as the
-offset, with the walk to the first sighting at hand, and walks on from frame to frame. With the covariance C = L L^T of
-a channel over the sightings of a track, ``L^-1`` takes its residuals to independent ones of unit variance.
+A track's error in each channel (:data:`toolkit.track_noise.CHANNELS`) is ``white + b``. At the first sighting used,
+``b`` is the offset plus the walk up to its age; from there it is a random walk from frame to frame. With the covariance
+C = L L^T of a channel over the sightings of a track, ``L^-1`` maps its residuals to independent ones of unit variance.
 """
 
 from dataclasses import dataclass, replace
@@ -15,20 +15,19 @@ from toolkit.models.left_only import applied, left_whitener
 from toolkit.sequence import StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# White noise (px) that every sighting has, whatever is stated: a fiftieth of a tracker's resolution. It keeps
-# covariances positive definite.
+# Least white noise (px) of a sighting, a fiftieth of a tracker's resolution. It keeps covariances positive definite.
 LEAST_WHITE_PX = 0.01
 _TO_UV = np.linalg.inv(CHANNELS)
 
 
 def white_rig(noise: TrackNoise, rig: StereoRig) -> StereoRig:
-    """Return a rig whose sightings have the white part of the noise alone."""
+    """Return a rig whose sightings have only the white part of the noise."""
     to_uv = np.linalg.inv(CHANNELS) * np.maximum(noise.white_px, LEAST_WHITE_PX)
     return replace(rig, cov_uv_px2=to_uv @ to_uv.T, track_noise=None)
 
 
 def walked_variance(noise: TrackNoise, ages: IntArray) -> Array:
-    """Return the variance (N, 3) px^2 that the walk and the offset have at ages (N,), with the least white noise."""
+    """Return the variance (N, 3) px^2 of walk, offset and least white noise at ages (N,)."""
     walked = np.square(noise.walk_px) * ages[:, None].astype(float)
     return np.asarray(np.square(noise.offset_px) + walked + LEAST_WHITE_PX**2)
 
@@ -39,9 +38,9 @@ def decorrelation(
     """Return matrices (F, 3 W, 3 W) that make the residuals of F tracks independent; sightings (F, W) have given ages.
 
     They apply to residuals whitened as if the sightings were independent (``StereoRig.whitener``), stacked by sighting,
-    and to their Jacobians. Rows of sightings that were not made mix with no other rows, nor do rows of uR where a
-    sighting is ``left_only`` (F, W). In a ``left_only`` sighting no channel but v is measured: there C is the
-    covariance of uL, uR and v together.
+    and to their Jacobians. Rows of unseen places are not mixed with other rows, nor are rows of uR where a sighting is
+    ``left_only`` (F, W). In a ``left_only`` sighting no channel but v is measured: there C is the covariance of uL, uR
+    and v together.
     """
     tracks, window = seen.shape
     to_channels = CHANNELS @ np.linalg.inv(rig.whitener)
@@ -69,7 +68,7 @@ class LastError(NamedTuple):
 def error_of_the_last(
     noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
 ) -> LastError:
-    """Return the error by walk and offset of F tracks at the last of W places, where all tracks are seen.
+    """Return the error due to walk and offset of F tracks at the last of W places, where all tracks are seen.
 
     ``ages`` (F, W) in frames; ``seen`` and ``left_only`` (F, W).
     """
@@ -89,14 +88,14 @@ def error_of_the_last(
 
 
 def _inverse_roots(noise: TrackNoise, ages: IntArray, seen: BoolArray) -> Array:
-    """Return the inverse Cholesky factors (F, 3, W, W) of the sightings' covariances, a channel each."""
+    """Return the inverse Cholesky factors (F, 3, W, W) of the sightings' covariances, one per channel."""
     both = seen[:, None, :, None] & seen[:, None, None, :]
     cov = np.where(both, _cov_of_channels(noise, ages), np.eye(seen.shape[1]))
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
 def _cov_of_channels(noise: TrackNoise, ages: IntArray) -> Array:
-    """Return the covariances (F, 3, W, W) px^2 of sightings of given ages (F, W), a channel each."""
+    """Return the covariances (F, 3, W, W) px^2 of sightings of given ages (F, W), one per channel."""
     white = np.maximum(LEAST_WHITE_PX**2 - noise.white_px**2, 0.0)[:, None, None] * np.eye(ages.shape[1])
     return np.asarray(noise.cov(ages.astype(float)) + white)
 
@@ -107,7 +106,7 @@ def _with_any(left_only: BoolArray | None) -> IntArray:
 
 
 def _inverse_root_of_all(noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray) -> Array:
-    """Return the inverse Cholesky factors (F, 3 W, 3 W) of what is measured of (uL, uR, v) in all sightings."""
+    """Return the inverse Cholesky factors (F, 3 W, 3 W) of the measured ones of (uL, uR, v) in all sightings."""
     tracks, window = seen.shape
     cov = np.einsum("ic,fcwv,jc->fwivj", _TO_UV, _cov_of_channels(noise, ages), _TO_UV)
     measured = np.repeat(seen[:, :, None], 3, axis=2)
@@ -119,14 +118,14 @@ def _inverse_root_of_all(noise: TrackNoise, ages: IntArray, seen: BoolArray, lef
 
 
 def _together(mixing: Array, units: Array) -> Array:
-    """Return (F, 3 W, 3 W) times what each sighting (F, W, 3, 3) is multiplied by before."""
+    """Return matrices (F, 3 W, 3 W) multiplied by the matrix (F, W, 3, 3) of each sighting."""
     tracks, window = units.shape[:2]
     by_sighting = mixing.reshape(tracks, 3 * window, window, 3)
     return np.asarray(np.einsum("frwi,fwij->frwj", by_sighting, units).reshape(mixing.shape))
 
 
 def channels_of(uv_px: Array) -> Array:
-    """Return the channels of sightings (N, 3): (3, 3), or (N, 3, 3) with uL, nothing and v where uR is missing."""
+    """Return the channels of sightings (N, 3): (3, 3), or (N, 3, 3) with uL, zero and v where uR is missing."""
     left = is_left_only(uv_px)
     every: Array = np.where(left[:, None, None], np.diag([1.0, 0.0, 1.0]), CHANNELS)
     return every if left.any() else CHANNELS
@@ -138,7 +137,7 @@ def in_channels(channels: Array, values: Array) -> Array:
 
 
 def _as_seen(variance: Array, left: BoolArray, of_none: float = 0.0) -> Array:
-    """Return variances (N, 3) of the channels c, d, v, where only left sees as those of uL = c + d / 2, none, and v."""
+    """Return variances (N, 3) of the channels c, d, v, or for left-only rows of uL = c + d / 2, ``of_none``, v."""
     if not left.any():
         return variance
     of_left = np.stack([variance[:, 0] + 0.25 * variance[:, 1], np.full(len(left), of_none), variance[:, 2]], axis=1)
@@ -157,7 +156,7 @@ def _row_before(track: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """How the errors of N sightings follow from those before them in their tracks, a channel each.
+    """The Markov chain of the errors of N sightings along their tracks, one per channel.
 
     ``e_k = carried_k e_before + n_k`` with independent n_k of standard deviations ``sigma_px``; ``before`` (N,) is the
     row of the sighting before, -1 where there is none, ``carried`` and ``sigma_px`` are (N, 3).
@@ -171,9 +170,9 @@ class Chain:
     def of(cls, noise: TrackNoise, track: IntArray, ages: IntArray, left_only: BoolArray | None = None) -> "Chain":
         """Return the chain of sightings of tracks (N,) with ages (N,), those of a track in the order of time.
 
-        It is the Markov chain whose sightings have their variances, and whose successive ones their covariances: exact
-        for noise that is all white, and for a walk and an offset without white noise. In between, it forgets at every
-        step a part of the offset: the share of the white variance in that of the sighting.
+        The Markov chain has the right variance of every sighting and the right covariance of every two successive ones.
+        It is exact for purely white noise, and for a walk and an offset without white noise. In between it loses a part
+        of the offset at every step: the share of the white variance in that of the sighting.
 
         A ``left_only`` (N,) sighting follows the sighting before it in uL and v (:func:`channels_of`). A sighting by
         both images follows the last one by both, because no disparity was measured in between. The walk of uL over such
@@ -200,16 +199,19 @@ class Chain:
         return Chain(rows[self.before[kept]], self.carried[kept], self.sigma_px[kept])
 
     def innovations(self, residual_px: Array, channels: Array = CHANNELS) -> Array:
-        """Return residuals (N, 3) of (uL, uR, v), px, as independent ones of unit variance, in channels."""
+        """Return the independent innovations of unit variance, in channels, of residuals (N, 3) px in (uL, uR, v)."""
         return self.whitened(in_channels(channels, residual_px), self.of_before(channels, residual_px))
 
     def of_before(self, channels: Array, values: Array) -> Array:
-        """Return values (N, 3, ...) of the sightings before, in the channels, (3, 3) or (N, 3, 3), of those after."""
+        """Return values (N, 3, ...) of the preceding sightings, in the channels of the sightings that follow them.
+
+        ``channels`` is (3, 3) or (N, 3, 3).
+        """
         if channels.ndim == 2:
             return np.asarray(in_channels(channels, values)[self.before])
         return np.asarray(in_channels(channels, values[self.before]))
 
     def whitened(self, own: Array, before: Array) -> Array:
-        """Return values (N, 3, ...) in the channels, less their prediction from the sighting before, in sigmas."""
+        """Return values (N, 3, ...) in the channels, minus their prediction from the preceding sighting, in sigmas."""
         shape = (-1, 3) + (1,) * (own.ndim - 2)
         return np.asarray((own - self.carried.reshape(shape) * before) / self.sigma_px.reshape(shape))

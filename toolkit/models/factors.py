@@ -15,15 +15,16 @@ from toolkit.sequence import StereoFrame, StereoRig
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 # The scale of all disparities, a vector (1,).
 SCALE: int = gtsam.symbol("s", 0)
-# A key is a character above an index of so many bits (gtsam/inference/Symbol.h); a Symbol takes several times as long.
+# A key is a character above an index of this many bits (gtsam/inference/Symbol.h); making a Symbol takes several times
+# as long as the arithmetic here.
 _INDEX_BITS = 56
 _FIRST_LANDMARK = ord("l") << _INDEX_BITS
-# GTSAM's Python wraps linear factors on up to this many variables; on more, only conditionals, which are factors too.
+# GTSAM's Python wraps linear factors on up to this many variables; for more, only conditionals, which are factors too.
 _MOST_TERMS = 3
 
 
 def kind_of(key: int) -> str:
-    """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
+    """Return the kind of variable of a key: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
     return chr(key >> _INDEX_BITS)
 
 
@@ -80,7 +81,7 @@ class StereoFactors:
                 yield self._by_both(gtsam.StereoPoint2(*uv_px), pose, L(track_id))
 
     def remade(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Return a graph whose sightings have this noise and loss, and whose other factors are as they were."""
+        """Return the graph with this noise and loss in its stereo factors, and its other factors unchanged."""
         made = gtsam.NonlinearFactorGraph()
         for i in range(graph.size()):
             factor = graph.at(i)
@@ -107,9 +108,9 @@ def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> g
 
 
 def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam.NonlinearFactorGraph:
-    """Return the factor that holds several variables jointly at their values.
+    """Return a joint prior on several variables at their values.
 
-    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces and ``blocks`` says where each key's stand in it.
+    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces; ``blocks`` gives the slice of each key in it.
     """
     root_information = np.linalg.inv(np.linalg.cholesky(cov))
     terms = [(key, root_information[:, block]) for key, block in blocks.items()]

@@ -1,10 +1,10 @@
 """A factor for frames without a common track: the body's twist there is close to the twist before and after.
 
 Across such a gap only the measured twist connects the poses, and its error in heading turns all later poses. A car's
-twist changes more slowly than a noisy sensor shows: between neighbouring intervals it is constant but for white noise
-on its change (Barfoot, "State estimation for robotics" (2017), section 3.4). The factor is on the three poses of two
-intervals, at least one of them a gap, beside the measured twist of both. Everywhere else the tracks determine the
-motion better than this prior, which would damp turns and speeds and shrink the map.
+twist changes more slowly than measurements with noise suggest: between neighbouring intervals it is constant except for
+white noise on its change (Barfoot, "State estimation for robotics" (2017), section 3.4). The factor is on the three
+poses of two intervals, at least one of them a gap, beside the measured twist of both. Everywhere else the tracks
+determine the motion better than this prior, which would damp turns and speeds and shrink the map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from toolkit.models.factors import X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import StereoFrame
 
-# The first guess of the change, from the scatter of the measured twists, has the weight of this many intervals.
+# The initial value of the change, from the scatter of the measured twists, has the weight of this many intervals.
 _STATED_FOR = 10
 # Larger changes are clipped to this many standard deviations: they are revisions of the estimate, not motion.
 _MOST_SIGMAS = 3.0
@@ -31,17 +31,17 @@ _ROUNDING = 1e-6
 
 
 def gaps(frames: Sequence[StereoFrame]) -> IntArray:
-    """Return the places k of the frames (K,) that have no track in common with the frame before, k - 1."""
+    """Return the indices k of the frames (K,) that have no track in common with frame k - 1."""
     pairs = ((one.track_ids, other.track_ids) for one, other in pairwise(frames))
     common = [np.intersect1d(*ids, assume_unique=True).size for ids in pairs]
     return 1 + np.flatnonzero(np.array(common, dtype=np.int64) == 0)
 
 
 class TwistChange:
-    """Learns how much the twist changes from one interval to the next, from poses between which tracks continue.
+    """Estimates how much the twist changes from one interval to the next, from poses between which tracks continue.
 
-    The first value follows from the white noise of two measured twists; a bridge then has little weight. Errors of the
-    poses count as change as well, so that the change is overestimated.
+    The initial value follows from the white noise of two measured twists; a bridge then has little weight. Errors of
+    the poses count as change as well, so that the change is overestimated.
     """
 
     def __init__(self, measured: TwistNoise) -> None:
@@ -50,7 +50,7 @@ class TwistChange:
         self._stated = np.zeros(6)
 
     def learn(self, t_ns: IntArray, poses: Array, measured: Array) -> None:
-        """Learn from three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks continue.
+        """Add three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks continue.
 
         ``measured`` (2, 6) are the twists [rad/s, m/s] that were measured between them.
         """
@@ -73,7 +73,7 @@ class TwistChange:
 
     @property
     def noise(self) -> TwistChangeNoise | None:
-        """Return the noise on the change; None before the first change was learnt."""
+        """Return the noise on the change; None before the first change was added."""
         if not self._count:
             return None
         density = np.sqrt(self._mean_squares)
@@ -85,9 +85,9 @@ class TwistChange:
 
 
 class KeptTwist(NamedTuple):
-    """The constraint that two successive intervals, with durations in seconds, have the same twist but for noise.
+    """The constraint that two successive intervals, with durations in seconds, have the same twist up to noise.
 
-    The noise is white noise on the change over the time between the middles of the intervals.
+    It is white noise on the change over the time between the midpoints of the intervals.
     """
 
     before_s: float
@@ -101,12 +101,12 @@ class KeptTwist(NamedTuple):
         return np.asarray(density * np.sqrt(0.5 * (self.before_s + self.after_s)))
 
     def change(self, poses: Array) -> Array:
-        """Return the twist (6,) [rad/s, m/s] from the second to the third of three poses, less that to the second."""
+        """Return the twist (6,) [rad/s, m/s] from the second to the third of three poses minus that to the second."""
         before, after = (se3_log(step) / dt_s for step, dt_s in self._steps(poses))
         return np.asarray(after - before)
 
     def derivatives(self, poses: Array) -> Array:
-        """Return those (6, 18) of the change by three poses (3, 4, 4), each moved in its own frame."""
+        """Return the Jacobian (6, 18) of the change to three poses (3, 4, 4), each perturbed in its own frame."""
         (by_first, by_second), (by_second_too, by_third) = (_by_ends(*step) for step in self._steps(poses))
         return np.hstack([-by_first, by_second_too - by_second, by_third])
 
@@ -116,7 +116,7 @@ class KeptTwist(NamedTuple):
 
 
 class GapBridge:
-    """Decides frame by frame where a bridge is added; its noise is learnt from the frames before.
+    """Decides frame by frame where a bridge is added; its noise is estimated from the frames before.
 
     For estimators that keep states for a limited number of seconds.
     """
@@ -124,7 +124,7 @@ class GapBridge:
     def __init__(self, window_s: float, measured: TwistNoise) -> None:
         self._window_s, self._change = window_s, TwistChange(measured)
         self._frames: list[StereoFrame] = []
-        # Whether no track leads over the last two intervals.
+        # For each of the last two intervals, whether no track spans it.
         self._blind: list[bool] = []
         self._poses: list[Array] = []
         self._twists: list[Array] = []
@@ -135,7 +135,7 @@ class GapBridge:
         return self._change.noise if self._change.is_below_that_measured else None
 
     def added(self, frame: StereoFrame, motion: Motion | None) -> KeptTwist | None:
-        """Return the bridge over the last two intervals that a frame and the motion before it call for, or None."""
+        """Return the bridge over the last two intervals that a frame and the motion before it require, or None."""
         self._frames = [*self._frames[-2:], frame]
         self._blind = [*self._blind[-1:], bool(gaps(self._frames[-2:]).size)]
         if isinstance(motion, TwistMotion):
@@ -151,7 +151,7 @@ class GapBridge:
         return KeptTwist(before_s, after_s, noise) if before_s <= self._window_s else None
 
     def learn(self, T_world_imu: Array) -> None:
-        """Learn from the pose (4, 4) that was found for the last frame."""
+        """Add the estimated pose (4, 4) of the last frame."""
         self._poses = [*self._poses[-2:], T_world_imu]
         if len(self._poses) == 3 and not any(self._blind):
             t_ns = np.array([frame.t_ns for frame in self._frames])
@@ -159,12 +159,12 @@ class GapBridge:
 
 
 def gap_bridge_for(measured: MotionNoise, window_s: float) -> GapBridge | None:
-    """Return the bridge of an estimator that keeps states for some seconds; None where no twists are measured."""
+    """Return the bridge of an estimator that keeps states for ``window_s``; None where no twists are measured."""
     return GapBridge(window_s, measured) if isinstance(measured, TwistNoise) else None
 
 
 def bridges(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> dict[int, KeptTwist]:
-    """Return the constraints over the gaps of frames (K,), by the last of the three frames that each concerns."""
+    """Return the constraints over the gaps of frames (K,), by the index of the last of their three frames."""
     ends = sorted({k for place in gaps(frames).tolist() for k in (place, place + 1) if 2 <= k < len(frames)})
     return {k: KeptTwist(*_durations_s(frames[k - 2 : k + 1]), noise) for k in ends}
 
@@ -180,8 +180,8 @@ def bridged(over: Mapping[int, KeptTwist]) -> gtsam.NonlinearFactorGraph:
 def kept_twist(kept: KeptTwist, k: int) -> gtsam.NonlinearFactor:
     """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist.
 
-    It is :meth:`KeptTwist.change` with its derivatives in GTSAM's arithmetic: single matrices are slow in NumPy, and a
-    solve asks for thousands of them.
+    It is :meth:`KeptTwist.change` with its Jacobian in GTSAM's arithmetic: single matrices are slow in NumPy, and a
+    solve evaluates thousands of them.
     """
     lasting_s = (kept.before_s, kept.after_s)
 
@@ -201,7 +201,7 @@ def kept_twist(kept: KeptTwist, k: int) -> gtsam.NonlinearFactor:
 
 
 def _durations_s(frames: Sequence[StereoFrame]) -> tuple[float, float]:
-    """Return how many seconds the two intervals of three frames last."""
+    """Return the durations (s) of the two intervals of three frames."""
     before_s, after_s = (np.diff([one.t_ns for one in frames]) / NS_PER_S).tolist()
     return before_s, after_s
 

@@ -1,6 +1,6 @@
-"""Which sightings may inform an estimate: the tests every estimator shares, and their thresholds, each with its source.
+"""Which sightings may correct an estimate: the tests every estimator shares, and their thresholds with sources.
 
-What a user may choose among them is a setting (:class:`toolkit.settings.Outliers`). Two places have constants of their
+Thresholds that a user may choose are settings (:class:`toolkit.settings.Outliers`). Two places have constants of their
 own, which do not change with those of the estimators: the search for a start, which triangulates each frame by itself,
 and the held-out metric, which must be the same for all estimators.
 """
@@ -53,15 +53,15 @@ def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
 
 
 def huber_threshold(dof: IntArray | int, sigma: float) -> Array:
-    """Return the threshold (N,) for residuals of ``dof`` (N,) that is exceeded as often as ``sigma`` by three."""
+    """Return the threshold (N,) for residuals of ``dof`` (N,) that is exceeded as often as ``sigma`` is for three."""
     return np.asarray(np.sqrt(chdtri(dof, chdtrc(3, sigma**2))), dtype=float)
 
 
 def huber_weights(distances_squared: Array, threshold: Array | float | None) -> Array:
     """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,); 1 without a loss.
 
-    A whitened (uL, uR, v) has a norm of 1.54 in the median (chi distribution): a threshold of 1.5 weighs down the
-    larger half of sound sightings a little and a mismatch in inverse proportion to its norm.
+    A whitened (uL, uR, v) has a norm of 1.54 in the median (chi distribution): a threshold of 1.5 lowers the weight of
+    the larger half of sound sightings a little, and that of a mismatch in inverse proportion to its norm.
     """
     if threshold is None:
         return np.ones_like(distances_squared)

@@ -1,8 +1,8 @@
 """Motion by raw IMU samples, through one preintegration that filter and smoother share.
 
-The preintegration is GTSAM's ``PreintegratedCombinedMeasurements``: the filter predicts with it, the smoother makes its
-``CombinedImuFactor`` of the same object, so both have the same residual, Jacobians and noise (Forster et al. 2017, eqs.
-26-38). The state is pose, velocity and both biases.
+The preintegration is GTSAM's ``PreintegratedCombinedMeasurements``: the filter predicts with it, and the smoother makes
+its ``CombinedImuFactor`` from the same object, so that both have the same residual, Jacobians and noise (Forster et al.
+2017, eqs. 26-38). The state is pose, velocity and both biases.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from toolkit.sequence import Prior
 IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)
 
-# GTSAM wants a position-integration noise of its own (m/s/sqrt(Hz)); this one is far below any accelerometer's.
+# GTSAM requires a noise of position integration (m/s/sqrt(Hz)); this one is far below any accelerometer's effect.
 INTEGRATION_DENSITY = 1e-6
 
 Preintegration = gtsam.PreintegratedCombinedMeasurements
@@ -50,7 +50,10 @@ def preintegrate(motion: ImuMotion, bias: Array, params: gtsam.PreintegrationCom
 
 
 def _from_mid_step(dt_s: Array, gyro_radps: Array, accel_mps2: Array, bias: Array) -> Array:
-    """Return specific forces (n, 3) turned to the starts of their steps, less and with a bias (6,) or one each."""
+    """Return specific forces (n, 3) rotated to the starts of their steps, with the bias taken off and added back.
+
+    The bias is (6,), or one each (n, 6).
+    """
     half_turns = so3_exp(0.5 * dt_s[:, None] * (gyro_radps - bias[..., 3:]))
     return np.asarray((half_turns @ (accel_mps2 - bias[..., :3])[..., None])[..., 0] + bias[..., :3])
 
@@ -66,7 +69,7 @@ def _preintegrated(
 
 
 def predict(preintegration: Preintegration, T_world_imu: Array, v_world: Array, bias: Array) -> Prediction:
-    """Carry a state (pose (4, 4), velocity (3,) m/s, bias (6,)) over the preintegrated interval."""
+    """Predict a state (pose (4, 4), velocity (3,) m/s, bias (6,)) over the preintegrated interval."""
     state = gtsam.NavState(gtsam.Pose3(T_world_imu), v_world)
     d_state, d_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
     predicted = preintegration.predict(state, constant_bias(bias), d_state, d_bias)
@@ -108,7 +111,7 @@ def transition_over(dt_s: float, gravity_world: Array, start: Belief, end: Predi
 
 
 def mean_noise_scale(motion: ImuMotion) -> tuple[float, float]:
-    """Return how many times its stated standard deviation the white noise of accelerometer and gyro has on average."""
+    """Return the mean factors on the stated standard deviation of the accelerometer's and the gyro's white noise."""
     assert motion.noise_scale is not None
     accel, gyro = np.sqrt(motion.dt_s @ motion.noise_scale**2 / motion.dt_s.sum()).tolist()
     return accel, gyro
@@ -123,7 +126,7 @@ class ImuIncrement:
     gravity_world: Array
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state over the interval."""
+        """Predict a state over the interval."""
         return predict(self.preintegration, start.T_world_imu, start.v_world, start.bias)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
@@ -148,7 +151,7 @@ class ImuModel:
         self._params = preintegration_params(noise, gravity_world)
 
     def initial_belief(self, prior: Prior) -> Belief:
-        """Return the belief at the first frame: all of the prior."""
+        """Return the belief at the first frame: the whole prior."""
         return Belief.of_prior(prior, self.layout)
 
     def integrate(self, motion: Motion, bias: Array) -> ImuIncrement:
@@ -158,7 +161,7 @@ class ImuModel:
         return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
 
     def integrate_each(self, motions: Sequence[Motion], biases: Sequence[Array]) -> list[ImuIncrement]:
-        """Preintegrate the samples of some intervals, each about its own bias (6,): half their turns in one go."""
+        """Preintegrate the samples of some intervals, each about its own bias (6,), half-step rotations all at once."""
         imu = [motion for motion in motions if isinstance(motion, ImuMotion)]
         sizes = [motion.dt_s.size for motion in imu]
         accel_mps2 = _from_mid_step(
@@ -178,7 +181,7 @@ class ImuModel:
         ]
 
     def _params_over(self, motion: ImuMotion) -> gtsam.PreintegrationCombinedParams:
-        """Return the parameters over an interval: a preintegration has one noise, its mean over a bridged piece."""
+        """Return the parameters over an interval; a preintegration has one noise, the mean over a bridged piece."""
         if motion.noise_scale is None:
             return self._params
         accel, gyro = mean_noise_scale(motion)
@@ -206,7 +209,7 @@ class ImuModel:
         return Estimate(t_ns, pose.matrix(), v_world=velocity, bias=bias.vector())
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors that hold state k at a belief."""
+        """Return the prior on state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)

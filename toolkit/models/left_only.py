@@ -1,9 +1,9 @@
 """Sightings by the left image alone: which of (uL, uR, v) are measured then, and with which noise.
 
 A missing uR (NaN) is treated as measured with an infinite variance: its rows of residual and Jacobian are zero, the
-noise of uL and v does not depend on it, and the sighting has two degrees of freedom. A sighting so keeps three rows,
-one of them zero, and code that works on whole frames needs no second path. Every function returns the rig's one noise,
-and three degrees of freedom, where no right image is missing.
+noise of uL and v does not depend on it, and the sighting has two degrees of freedom. A sighting thus keeps three rows,
+one of them zero, and code that works on whole frames needs no second path. Where no right image is missing, every
+function returns the rig's noise, and three degrees of freedom.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ def any_missing(uvs_px: Array) -> bool:
 
 
 def degrees_of_freedom(uvs_px: Array) -> int | IntArray:
-    """Return how many coordinates sightings (..., 3) px have: 3 of all, or 2 or 3 of each (...)."""
+    """Return how many coordinates sightings (..., 3) px have: 3 if all are complete, else 2 or 3 for each (...)."""
     missing = is_left_only(uvs_px)
     return 3 - missing.astype(np.int64) if missing.any() else 3
 
 
 def residuals_px(uvs_px: Array, predicted_px: Array) -> Array:
-    """Return measured less predicted (..., 3) px, zero where uR is missing."""
+    """Return measured minus predicted (..., 3) px, zero where uR is missing."""
     residuals: Array = uvs_px - predicted_px
     missing = is_left_only(uvs_px)
     if missing.any():
@@ -48,17 +48,17 @@ def seen_rows(uvs_px: Array, jacobian: Array) -> Array:
 
 
 def noise_px2(uvs_px: Array, rig: StereoRig) -> Array:
-    """Return the noise of sightings: the rig's (3, 3), or each one's (..., 3, 3), which keeps a missing uR apart.
+    """Return the noise of sightings: the rig's (3, 3), or one each (..., 3, 3), uncorrelated with a missing uR.
 
-    The row of uR is to be taken with those of :func:`residuals_px` and :func:`seen_rows`, which are zero.
+    It is to be used with the rows of :func:`residuals_px` and :func:`seen_rows`, which are zero for a missing uR.
     """
     return _each(uvs_px, rig.cov_uv_px2, left_noise_px2, rig)
 
 
 def whitener(uvs_px: Array, rig: StereoRig) -> Array:
-    """Return the matrices, (3, 3) or (..., 3, 3), that whiten residuals and Jacobians and make a missing row zero.
+    """Return the matrices, (3, 3) or (..., 3, 3), that whiten residuals and Jacobians and set a missing row to zero.
 
-    They do not make a row zero that is NaN: residuals are those of :func:`residuals_px`.
+    They do not set a row of NaN to zero: residuals must be those of :func:`residuals_px`.
     """
     return _each(uvs_px, rig.whitener, left_whitener, rig)
 
@@ -71,12 +71,12 @@ def left_whitener(rig: StereoRig) -> Array:
 
 
 def whitened_residuals(uvs_px: Array, predicted_px: Array, rig: StereoRig) -> Array:
-    """Return measured less predicted (..., 3) in standard deviations, zero where uR is missing."""
+    """Return measured minus predicted (..., 3) in standard deviations, zero where uR is missing."""
     return applied(whitener(uvs_px, rig), residuals_px(uvs_px, predicted_px))
 
 
 def applied(matrix: Array, values: Array) -> Array:
-    """Return a matrix (3, 3), or one each (..., 3, 3), times values (..., 3)."""
+    """Return the product of a matrix (3, 3), or one each (..., 3, 3), with values (..., 3)."""
     return np.asarray(values @ matrix.T if matrix.ndim == 2 else (matrix @ values[..., None])[..., 0])
 
 
@@ -86,7 +86,7 @@ def left_cov_px2(rig: StereoRig) -> Array:
 
 
 def left_noise_px2(rig: StereoRig) -> Array:
-    """Return the noise (3, 3) with uR apart. Where v is the mean of two rows, one row alone errs more: as uL does."""
+    """Return the noise (3, 3) with uR uncorrelated. If v is the mean of two rows, one row has the variance of uL."""
     cov_px2 = rig.cov_uv_px2.copy()
     cov_px2[_U_RIGHT, [0, 2]] = cov_px2[[0, 2], _U_RIGHT] = 0.0
     cov_px2[2, 2] = max(cov_px2[2, 2], cov_px2[0, 0])
@@ -94,6 +94,6 @@ def left_noise_px2(rig: StereoRig) -> Array:
 
 
 def _each(uvs_px: Array, whole: Array, left: Callable[[StereoRig], Array], rig: StereoRig) -> Array:
-    """Return ``whole`` where no right image is missing, else one each: what ``left`` gives for the rig where it is."""
+    """Return ``whole`` if no right image is missing; else one each, for left-only sightings that of ``left``."""
     missing: BoolArray = is_left_only(uvs_px)
     return np.where(missing[..., None, None], left(rig), whole) if missing.any() else whole

@@ -1,7 +1,7 @@
-"""The motion of the IMU between two frames, for filters and smoothers alike; no other file asks for the kind of motion.
+"""The motion of the IMU between two frames, for filters and smoothers; no other file asks for the kind of motion.
 
-A motion model integrates what was measured between two frames, once, about a bias. A filter predicts from that
-increment (mean, F, Q), a smoother makes its factors of the same one. There is one implementation a file:
+A motion model integrates the measurements between two frames once, about a bias. A filter predicts from that increment
+(mean, F, Q), a smoother makes its factors from the same one. Each implementation is a file:
 :mod:`toolkit.models.twist`, :mod:`toolkit.models.imu` and, where nothing was measured,
 :mod:`toolkit.models.smooth_twist`. ``predicted_steps`` predicts each step of a given trajectory.
 """
@@ -29,13 +29,13 @@ class Increment(Protocol):
     """The measured motion between two frames, integrated about a bias."""
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state, whose bias is the increment's, over the interval."""
+        """Predict a state, whose bias is the increment's, over the interval."""
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (d, d) linearised at other states than ``end`` was predicted from.
+        """Return the transition (d, d) linearised at other states than those of the prediction.
 
-        From the mean of ``start`` to that of ``end``: with the first estimates of both instants, errors
-        of the unobservable heading and position stay unobservable (Li & Mourikis 2013, section 4).
+        It leads from the mean of ``start`` to that of ``end``: with the first estimates of both instants, errors of the
+        unobservable heading and position stay unobservable (Li & Mourikis 2013, section 4).
         """
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
@@ -43,11 +43,11 @@ class Increment(Protocol):
 
 
 class MotionModel(Protocol):
-    """The state that one kind of motion needs, and how it moves."""
+    """The state that a kind of motion needs, and its prediction."""
 
     @property
     def layout(self) -> Layout:
-        """Return where the blocks of the error state stand."""
+        """Return the layout of the error state."""
 
     def initial_belief(self, prior: Prior) -> Belief:
         """Return the belief at the first frame."""
@@ -57,10 +57,10 @@ class MotionModel(Protocol):
 
     @property
     def variable_sizes(self) -> Mapping[str, int]:
-        """Return the dimensions of a state's variables by the kind that their keys name, in the error state's order."""
+        """Return the dimensions of a state's variables by the letters of their keys, in the error state's order."""
 
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
-        """Return the latest values of some states' variables, without copying all others out of the tree."""
+        """Return the latest values of some states' variables, without copying all others from the tree."""
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""
@@ -69,12 +69,12 @@ class MotionModel(Protocol):
         """Return state k, without a covariance."""
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors that hold state k at a belief: one linear factor on all its variables."""
+        """Return the prior on state k at a belief: one linear factor on all its variables."""
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
-        """Return the covariance (d, d) of a state's variables in GTSAM's tangent spaces as that of an Estimate.
+        """Return a covariance (d, d) in GTSAM's tangent spaces in the form that an Estimate has.
 
-        A velocity is a vector in the world to GTSAM and an error in the body frame to an Estimate; ``R_world_imu``
+        GTSAM's velocity is a vector in the world; an Estimate's velocity error is in the body frame. ``R_world_imu``
         (3, 3) is the state's own attitude.
         """
 
@@ -96,7 +96,7 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
 def integrated(
     model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
 ) -> abc.Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,), all at once where the model can."""
+    """Return the motions between frames, each integrated about its own bias (6,), vectorised if the model allows it."""
     if isinstance(model, TwistModel | ImuModel) and motions:
         return model.integrate_each(motions, biases)
     return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
@@ -111,14 +111,14 @@ def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Ar
 
 
 def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:
-    """Return the belief carried over a measured motion; unchanged where there is none, at the first frame."""
+    """Return the belief predicted over a measured motion; unchanged if there is none, at the first frame."""
     if motion is None:
         return belief
     return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
 
 
 def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
-    """Return a state of the trajectory as a belief; velocity and biases it lacks are zero, and so is its covariance."""
+    """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
     d = model.layout.size
     v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
     bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
@@ -126,7 +126,7 @@ def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
 
 
 class PredictedStep(NamedTuple):
-    """A step between the rows ``start`` and ``end``: the state at its start, its length and what the motion predicts.
+    """A step between the rows ``start`` and ``end``: the state at its start, its length and the predicted motion.
 
     The belief has no covariance, because that of the trajectory may have another layout.
     """
@@ -139,16 +139,16 @@ class PredictedStep(NamedTuple):
 
 
 def layout_of(sequence: Sequence) -> Layout:
-    """Return where the blocks of the error state stand that the kind of motion of a sequence needs."""
+    """Return the layout of the error state for a sequence's kind of motion."""
     return motion_model(sequence.noise, sequence.gravity_world).layout
 
 
 def predicted_steps(
     trajectory: Trajectory, sequence: Sequence, noise_scale: Array | None = None
 ) -> Iterator[PredictedStep]:
-    """Yield the steps between neighbouring frames of which the trajectory has both. Its stamps must be frames'.
+    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames.
 
-    ``noise_scale`` (N,) is how many times its stated variance the noise of the motion up to each row is taken for.
+    ``noise_scale`` (N,) is the factor on the stated variance of the motion up to each row.
     """
     model = motion_model(sequence.noise, sequence.gravity_world)
     intervals = list(_intervals(trajectory, sequence))
@@ -161,7 +161,7 @@ def predicted_steps(
 
 
 def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
-    """Yield the motions between neighbouring frames of which the trajectory has both, with the rows of these."""
+    """Yield the motions between neighbouring frames if the trajectory has both, with the rows of these."""
     row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
     for before, packet in pairwise(sequence.packets()):
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)

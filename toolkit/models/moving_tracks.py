@@ -31,7 +31,7 @@ from toolkit.models.state import POSE, Belief, Prediction
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.sequence import Packet, Prior, Sequence, StereoRig, is_held_out, is_left_only
 
-# Of sound sightings one in a thousand is refused, of correct motions one in a thousand taken for impossible.
+# One in a thousand sound sightings is rejected, and one in a thousand correct motions is taken to be impossible.
 PROBABILITY = 0.999
 # A track refused in this many successive frames stays out; a single bad sighting spoils one frame.
 REFUSALS = 3
@@ -48,7 +48,7 @@ _NEGLIGIBLE_SIGMAS = 0.2
 
 
 class LeftOut(NamedTuple):
-    """How many sightings and tracks are left out, of how many; frames in which too few tracks agreed."""
+    """How many sightings and tracks are left out, and of how many; frames in which too few tracks agreed."""
 
     sightings: int
     of_sightings: int
@@ -58,7 +58,7 @@ class LeftOut(NamedTuple):
 
 
 def without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, LeftOut]:
-    """Return the sequence less the sightings that move against the rest, and how many these are.
+    """Return the sequence without the sightings that move against the rest, and the counts of these.
 
     Tracks that are held out of estimation stay as they are. Raises DataError where the sequence cannot be run.
     """
@@ -73,14 +73,14 @@ def without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, L
 
 
 class MovingTracks:
-    """Says of each packet's sightings which are sound, from this packet and those before."""
+    """Decides which of each packet's sightings are sound, from this packet and those before."""
 
     def __init__(self, sequence: Sequence, prior: Prior) -> None:
         self._rig, self._model = sequence.rig, motion_model(sequence.noise, sequence.gravity_world)
         self._belief: Belief = self._model.initial_belief(prior)
         self._rng = np.random.default_rng(0)
         self._tracks = _Tracks.begun(np.empty(0, dtype=np.int64), np.empty((0, 3)), -1)
-        # The pose at each of the last frames, by the motions found; and the covariance of the last of these.
+        # The pose at each of the last frames, by the estimated motions; and the covariance of the last of these.
         self._path = {-1: np.eye(4)}
         self._step_cov = np.zeros((6, 6))
         self.undecided_frames = 0
@@ -102,7 +102,7 @@ class MovingTracks:
         return sound
 
     def _take(self, step: "_Step", prediction: Prediction, seen: "_Tracks") -> BoolArray | None:
-        """Update the filter with the motion that the tracks agree on; return which agree, None where too few do.
+        """Update the filter with the motion that the tracks agree on; return which agree, None if too few do.
 
         Tracks that are not tested count as agreeing.
         """
@@ -126,7 +126,7 @@ class MovingTracks:
         return agree
 
     def _pairs(self, seen: "_Tracks", begun: "_Begun", which: BoolArray) -> "_Pairs":
-        """Return some tracks as points (N, 3) m in the body at the frame before, by their earlier sightings."""
+        """Return some tracks as points (N, 3) m in the body at the previous frame, from their earlier sightings."""
         before, rig = seen.now - 1, self._rig
         frames, row = np.unique(begun.frames[which], return_inverse=True)
         T_before_begun = np.array([se3_inverse(self._path[before]) @ self._path[i] for i in frames.tolist()])
@@ -138,7 +138,7 @@ class MovingTracks:
 
 
 class _Begun(NamedTuple):
-    """The sightings (N, 3) px that tracks are predicted from, and their frames (N,)."""
+    """The sightings (N, 3) px from which tracks are predicted, and their frames (N,)."""
 
     uvs_px: Array
     frames: IntArray
@@ -148,7 +148,7 @@ class _Begun(NamedTuple):
         return np.asarray((self.frames < now) & _deep(self.uvs_px))
 
     def with_those(self, others: "_Begun", rows: IntArray, places: IntArray) -> "_Begun":
-        """Return these with rows (M,) of others in some places (M,)."""
+        """Return the sightings with rows (M,) of others at some indices (M,)."""
         uvs_px, frames = self.uvs_px.copy(), self.frames.copy()
         uvs_px[places], frames[places] = others.uvs_px[rows], others.frames[rows]
         return _Begun(uvs_px, frames)
@@ -162,9 +162,9 @@ class _Begun(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """The tracks of frame ``now``: ids (N,) ascending, sightings (N, 3) px, and how often each was refused running.
+    """The tracks of frame ``now``: ids (N,) ascending, sightings (N, 3) px, successive rejections (N,).
 
-    ``recent`` and ``early`` are what they are predicted from.
+    ``recent`` and ``early`` are the sightings from which they are predicted.
     """
 
     now: int
@@ -181,7 +181,7 @@ class _Tracks:
         return cls(k, ids, uvs_px, here, here, np.zeros(ids.size, dtype=np.int64))
 
     def continuing(self, before: "_Tracks") -> "_Tracks":
-        """Return the tracks with what is known of those that were in the frame before."""
+        """Return the tracks, with the history of those that were in the frame before."""
         _, old, new = np.intersect1d(before.ids, self.ids, assume_unique=True, return_indices=True)
         recent, early = self.recent.with_those(before.recent, old, new), self.early.with_those(before.early, old, new)
         refusals = self.refusals.copy()
@@ -189,7 +189,7 @@ class _Tracks:
         return replace(self, recent=recent, early=early, refusals=refusals)
 
     def checked(self, agree: BoolArray | None) -> "_Tracks":
-        """Return the tracks updated by which of them (N,) agree; None where that is not decided."""
+        """Return the tracks updated by which of them (N,) agree; None if that is undecided."""
         refusals = self.refusals
         if agree is not None:
             refusals = np.where((refusals < REFUSALS) & agree, 0, np.minimum(refusals + 1, REFUSALS))
@@ -212,7 +212,7 @@ class _Found(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A predicted motion (4, 4), the covariance (6, 6) of its error at its end, and with the state there (d, 6)."""
+    """A predicted motion (4, 4), its error's covariance (6, 6) at its end, and that with the state there (d, 6)."""
 
     T_start_end: Array
     cov: Array
@@ -220,7 +220,7 @@ class _Step(NamedTuple):
 
     @classmethod
     def of(cls, start: Belief, end: Prediction) -> "_Step":
-        """Return the motion that a prediction has, its error being that of the end less that of the start, carried."""
+        """Return the motion of a prediction; its error is that of the end minus the propagated error of the start."""
         T_start_end = se3_inverse(start.T_world_imu) @ end.T_world_imu
         d_step = end.transition[POSE].copy()
         d_step[:, POSE] -= se3_adjoint(se3_inverse(T_start_end))
@@ -231,15 +231,15 @@ class _Step(NamedTuple):
         return cls(T_start_end, 0.5 * (cov + cov.T), end.transition @ carried + end.noise[:, POSE])
 
     def conditioned(self, end: Belief, found: _Found) -> Belief:
-        """Return the belief at the end after the error of the motion was found."""
+        """Return the belief at the end, given the estimated error of the motion."""
         gain = np.linalg.solve(self.cov, self.cov_with_state.T).T
         return end.moved(gain @ found.error, end.cov - gain @ (self.cov - found.cov) @ gain.T)
 
 
 class _Pairs(NamedTuple):
-    """Points (N, 3) m in the body at the start of a step, their derivatives (N, 3, 3) by the sighting they are of.
+    """Points (N, 3) m in the body at the start of a step, their derivatives (N, 3, 3) by their first sightings.
 
-    ``uvs_px`` (N, 3) are their sightings at its end, ``path_cov`` (N, 6, 6) what the way to the start adds.
+    ``uvs_px`` (N, 3) are their sightings at its end, ``path_cov`` (N, 6, 6) the covariance of the path to the start.
     """
 
     points: Array
@@ -265,9 +265,9 @@ class _Pairs(NamedTuple):
 
 
 class _Linear(NamedTuple):
-    """Residuals (N, 3) px, their covariances (N, 3, 3), and derivatives (N, 3, 6) of what is predicted.
+    """Residuals (N, 3) px, their covariances (N, 3, 3), and Jacobians (N, 3, 6) of the predictions.
 
-    The derivatives are those by an error on the right of the motion.
+    The Jacobians are to an error on the right of the motion.
     """
 
     residual_px: Array
@@ -275,7 +275,7 @@ class _Linear(NamedTuple):
     d_uv_d_motion: Array
 
     def chi2(self, error: Array, error_cov: Array) -> Array:
-        """Return the squared residuals (N,) about a motion of a given error (6,), known to a covariance (6, 6)."""
+        """Return the squared residuals (N,) about a motion with the given error (6,) and its covariance (6, 6)."""
         spread = self.cov + self.d_uv_d_motion @ error_cov @ transposed(self.d_uv_d_motion)
         return mahalanobis_squared(self.residual_px - self.d_uv_d_motion @ error, spread)
 
@@ -291,7 +291,7 @@ def _found(pairs: _Pairs, step: _Step, rig: StereoRig, rng: np.random.Generator)
         best = _searched(problem, best, bound, most, rng)
     error = root @ best
     moved_px = np.abs(linear.d_uv_d_motion @ error).max(initial=0.0)
-    # What a linear model neglects of a shift is about its square over the focal length.
+    # The error of the linear model is about the square of the shift over the focal length.
     if moved_px**2 > _NEGLIGIBLE_SIGMAS * np.sqrt(rig.cov_uv_px2[0, 0]) * rig.fx_px:
         linear = pairs.linear(step.T_start_end @ se3_exp(error), rig)
         linear = linear._replace(residual_px=linear.residual_px + linear.d_uv_d_motion @ error)
@@ -309,7 +309,7 @@ class _Problem(NamedTuple):
 
     @classmethod
     def of(cls, linear: _Linear, root: Array) -> "_Problem":
-        """Return the problem in units of the motion's uncertainty, whose covariance has the root (6, 6)."""
+        """Return the problem in units of the motion's uncertainty; ``root`` (6, 6) is that of its covariance."""
         whitener = np.linalg.inv(np.linalg.cholesky(linear.cov))
         return cls((whitener @ linear.residual_px[..., None])[..., 0], whitener @ (linear.d_uv_d_motion @ root))
 
@@ -323,14 +323,14 @@ class _Problem(NamedTuple):
         return np.asarray((errors**2).sum(axis=1) + np.minimum(self.chi2(errors), bound).sum(axis=1))
 
     def solution(self, weights: Array | BoolArray) -> tuple[Array, Array]:
-        """Return the most probable error (6,) where tracks (N,) have weights, and its covariance (6, 6)."""
+        """Return the most probable error (6,) for weights of tracks (N,), and its covariance (6, 6)."""
         weighted = (self.jacobians * np.asarray(weights, dtype=float)[:, None, None]).reshape(-1, 6).T
         cov = np.linalg.inv(np.eye(6) + weighted @ self.jacobians.reshape(-1, 6))
         return cov @ (weighted @ self.residuals.reshape(-1)), cov
 
 
 def _softened(problem: _Problem, bound: float) -> Array:
-    """Return the error (6,) found from zero on, with the weights of large residuals lowered step by step."""
+    """Return the error (6,) found starting from zero, with the weights of large residuals lowered step by step."""
     error = np.zeros(6)
     for factor in _SOFTENED:
         error, _ = problem.solution((1.0 + problem.chi2(error[None])[0] / (factor * bound)) ** -2)
@@ -338,7 +338,7 @@ def _softened(problem: _Problem, bound: float) -> Array:
 
 
 def _searched(problem: _Problem, best: Array, bound: float, most: float, rng: np.random.Generator) -> Array:
-    """Return the error (6,) of least cost: the given one, zero, or a possible one that three tracks determine."""
+    """Return the error (6,) of least cost: the given one, zero, or a possible one determined by three tracks."""
     size = min(_SAMPLE, len(problem.residuals))
     rows = rng.random((_SAMPLES, len(problem.residuals))).argpartition(size - 1, axis=1)[:, :size]
     of_samples = problem.jacobians[rows].reshape(_SAMPLES, -1, 6)

@@ -1,4 +1,4 @@
-"""Noise for files that state none: estimated from the samples, or a documented rule. Never a per-file constant."""
+"""Noise for files that state none: estimated from the samples, or by a documented rule. Never a per-file constant."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ TRACKED_PIXEL_SIGMA_PX = 0.5
 # Least noise of an odometer, even where its samples look free of noise: pairing, wheel slip, lever arm.
 LEAST_VELOCITY_SIGMA_MPS = 0.05
 LEAST_GYRO_SIGMA_RADPS = 0.005
-# Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: moves it by 2e-4 rad/s in 100 s.
+# Random walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: it moves by 2e-4 rad/s in 100 s.
 GYRO_RANDOM_WALK = 2e-5
 # White noise (m/s^2/sqrt(Hz), rad/s/sqrt(Hz)) and accelerometer walk (m/s^3/sqrt(Hz)) of such a unit in motion, where
 # vibration and scale count for more than its data sheet: as on EuRoC's recordings (io/euroc_calibration), rounded up.

@@ -50,7 +50,7 @@ class SmoothIncrement:
     noise: TwistChangeNoise
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state over the interval, moved by the twist of its mean."""
+        """Predict a state over the interval, moved by the twist of its mean."""
         xi = self.dt_s * _twist(start.T_world_imu, start.v_world, start.bias[3:])
         T_start_end = se3_exp(xi)
         v_body = start.T_world_imu[:3, :3].T @ start.v_world
@@ -82,7 +82,7 @@ def _transition(T_start_end: Array, d_end_d_xi: Array, v_body: Array, dt_s: floa
     """Return F (12, 12): an error of the start's pose, velocity (body) and turn rate, carried to the end."""
     F = np.zeros((12, 12))
     F[POSE, POSE] = se3_adjoint(se3_inverse(T_start_end))
-    # The body's velocity changes with the velocity in the world and with the axes it is seen in.
+    # The velocity in the body frame depends on the velocity in the world and on the body's attitude.
     F[POSE, ROTATION] += dt_s * d_end_d_xi[:, 3:] @ skew(v_body)
     F[POSE, _VELOCITY] = dt_s * d_end_d_xi[:, 3:]
     F[POSE, _TURN] = -dt_s * d_end_d_xi[:, :3]
@@ -96,8 +96,8 @@ def _transition(T_start_end: Array, d_end_d_xi: Array, v_body: Array, dt_s: floa
 def smooth_factor(dt_s: float, noise: TwistChangeNoise, k: int) -> gtsam.NonlinearFactor:
     """Return the factor from X, V, B(k - 1) to X, V, B(k); B (3,) is the turn rate with the sign changed.
 
-    The residual (12,) is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``, then what the
-    twist has changed by [rad/s, m/s].
+    The residual (12,) is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``, then the change
+    of the twist [rad/s, m/s].
     """
     covariance = gtsam.noiseModel.Gaussian.Covariance(twist_change_cov(noise, dt_s))
     keys = [X(k - 1), V(k - 1), B(k - 1), X(k), V(k), B(k)]
@@ -120,7 +120,7 @@ def smooth_factor(dt_s: float, noise: TwistChangeNoise, k: int) -> gtsam.Nonline
 def _fill(
     jacobians: list[Array], start: tuple[Array, Array], end: tuple[Array, Array], off: gtsam.Pose3, dt_s: float
 ) -> None:
-    """Put the derivatives of the residual by X, V, B at both ends, poses (4, 4) with twists (6,), into a list."""
+    """Write the Jacobians of the residual to X, V, B at both ends, poses (4, 4) with twists (6,), to a list."""
     before = start[1]
     d_error_d_end = gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Logmap(off))
     d_error_d_step = -d_error_d_end @ off.inverse().AdjointMap()
@@ -172,7 +172,7 @@ class SmoothTwist:
         return Estimate(t_ns, values.atPose3(X(k)).matrix(), v_world=values.atVector(V(k)), bias=bias)
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors that hold state k at a belief."""
+        """Return the prior on state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)

@@ -22,7 +22,7 @@ Keys = tuple[int, ...]
 
 
 class Linearised(NamedTuple):
-    """Whitened residuals (N, 6) and their derivatives (N, 6, d) by each of the variables of a factor, in its order."""
+    """Whitened residuals (N, 6) and their Jacobians (N, 6, d) to each variable of a factor, in its order."""
 
     residuals: Array
     derivatives: tuple[Array, ...]
@@ -33,7 +33,7 @@ class StackedFactors(Protocol):
 
     @property
     def keys(self) -> Sequence[Keys]:
-        """Return the keys of each factor, by which it is known in a graph that has it one by one."""
+        """Return the keys of each factor, by which it is found in a graph of single factors."""
 
     def residuals(self, values: gtsam.Values) -> Array:
         """Return the whitened residuals (N, 6)."""
@@ -43,14 +43,14 @@ class StackedFactors(Protocol):
 
 
 def linear_factors(stack: StackedFactors, values: gtsam.Values) -> Iterator[gtsam.JacobianFactor]:
-    """Yield the factors, linear about some values."""
+    """Yield the factors, linearised at some values."""
     residuals, derivatives = stack.linearised(values)
     for row, keys in enumerate(stack.keys):
         yield linear_factor([(key, of[row]) for key, of in zip(keys, derivatives, strict=True)], -residuals[row])
 
 
 def stacked(increments: Mapping[int, Increment], over: Mapping[int, KeptTwist]) -> list[StackedFactors]:
-    """Return stacks of those steps and bridges whose factors are in Python, given by the number of their last state."""
+    """Return stacks of the steps and bridges whose factors are in Python, given by the index of their last state."""
     steps = {k: increment for k, increment in increments.items() if isinstance(increment, TwistIncrement)}
     stacks = list[StackedFactors]()
     if steps:
@@ -64,7 +64,7 @@ def stacked(increments: Mapping[int, Increment], over: Mapping[int, KeptTwist]) 
 class StackedSteps:
     """The steps to N states ``k`` (N,), each integrated about its gyro bias (N, 3) rad/s: T_start_end (N, 4, 4).
 
-    ``d_step_d_bias`` (N, 6, 3) is as a step has it, ``whitening`` (N, 6, 6) makes its noise one of unit covariance.
+    ``d_step_d_bias`` (N, 6, 3) is as in a step; ``whitening`` (N, 6, 6) maps its noise to unit covariance.
     """
 
     k: IntArray
@@ -75,7 +75,7 @@ class StackedSteps:
 
     @classmethod
     def of(cls, increments: Mapping[int, TwistIncrement]) -> "StackedSteps":
-        """Return the steps to states by their numbers."""
+        """Return the steps to states by their indices."""
         steps = [increment.step for increment in increments.values()]
         return cls(
             np.array(list(increments), dtype=np.int64),
@@ -87,7 +87,7 @@ class StackedSteps:
 
     @property
     def keys(self) -> Sequence[Keys]:
-        """Return the keys of the pose and the gyro bias at the start and of the pose at the end, as a factor has."""
+        """Return the keys of pose and gyro bias at the start and of the pose at the end, in a factor's order."""
         return [(X(k - 1), X(k), B(k - 1)) for k in self.k.tolist()]
 
     def residuals(self, values: gtsam.Values) -> Array:
@@ -125,7 +125,7 @@ class StackedBridges:
 
     @classmethod
     def of(cls, bridges: Mapping[int, KeptTwist]) -> "StackedBridges":
-        """Return the bridges by the number of their last state."""
+        """Return the bridges by the index of their last state."""
         kept = list(bridges.values())
         return cls(
             np.array(list(bridges), dtype=np.int64),
@@ -135,7 +135,7 @@ class StackedBridges:
 
     @property
     def keys(self) -> Sequence[Keys]:
-        """Return the keys of the three poses, as a factor has them."""
+        """Return the keys of the three poses, in a factor's order."""
         return [(X(k - 2), X(k - 1), X(k)) for k in self.k.tolist()]
 
     def residuals(self, values: gtsam.Values) -> Array:

@@ -17,7 +17,7 @@ ROTATION, POSITION, POSE = slice(0, 3), slice(3, 6), slice(0, 6)
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the blocks of an error state stand; a block that the state lacks is None. The biases stand last."""
+    """The slices of the blocks of an error state; None for a block that the state lacks. The biases are last."""
 
     size: int
     velocity: slice | None
@@ -26,12 +26,12 @@ class Layout:
 
     @property
     def biases(self) -> slice:
-        """Return where all biases stand."""
+        """Return the slice of all biases."""
         return slice((self.accel_bias or self.gyro_bias).start, self.size)
 
 
 def with_velocity_turned(cov: Array, layout: Layout, rotation: Array) -> Array:
-    """Return a covariance (d, d) whose velocity's error is turned by a rotation (3, 3): to other axes."""
+    """Return a covariance (d, d) with the velocity's error rotated by (3, 3) to other axes."""
     assert layout.velocity is not None
     turn = np.eye(layout.size)
     turn[layout.velocity, layout.velocity] = rotation
@@ -39,10 +39,11 @@ def with_velocity_turned(cov: Array, layout: Layout, rotation: Array) -> Array:
 
 
 class Prediction(NamedTuple):
-    """A state carried over one interval.
+    """A state predicted over one interval.
 
-    ``T_world_imu`` (4, 4) and ``v_world`` (3,) m/s at its end; ``transition`` F (d, d) carries an error over the
-    interval and ``noise`` Q (d, d) is what the interval adds, both in the layout of the state. The biases stay.
+    ``T_world_imu`` (4, 4) and ``v_world`` (3,) m/s at its end; ``transition`` F (d, d) propagates an error over the
+    interval and ``noise`` Q (d, d) is the covariance that the interval adds, both in the layout of the state. The
+    biases stay.
     """
 
     T_world_imu: Array
@@ -63,7 +64,7 @@ class Belief:
 
     @classmethod
     def of_prior(cls, prior: Prior, layout: Layout) -> Self:
-        """Return the belief at the first frame: the prior, cut to the blocks the layout has."""
+        """Return the belief at the first frame: the prior, reduced to the blocks of the layout."""
         velocity = [] if layout.velocity is None else [slice(6, 9)]
         accel_bias = [] if layout.accel_bias is None else [slice(9, 12)]
         kept = np.r_[(slice(0, 6), *velocity, *accel_bias, slice(12, 15))]
@@ -75,7 +76,7 @@ class Belief:
         return Belief(moved.layout, moved.T_world_imu, moved.v_world, moved.bias, 0.5 * (cov + cov.T))
 
     def displaced(self, delta: Array, step: Array) -> "Belief":
-        """Return the belief with its mean moved by an error (d,), whose pose is the motion ``step`` (4, 4)."""
+        """Return the belief with its mean moved by an error (d,), its pose by the motion ``step`` (4, 4) instead."""
         v_world, bias = self.v_world, self.bias.copy()
         if self.layout.velocity is not None:
             v_world = v_world + self.T_world_imu[:3, :3] @ delta[self.layout.velocity]
@@ -102,7 +103,7 @@ class Belief:
         return replace(self, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world, cov=0.5 * (cov + cov.T))
 
     def at(self, estimate: Estimate) -> "Belief":
-        """Return the belief that an estimate states; what the estimate lacks stays."""
+        """Return the belief at the values of an estimate; values that the estimate lacks stay."""
         v_world = self.v_world if estimate.v_world is None else estimate.v_world
         bias = self.bias if estimate.bias is None else estimate.bias
         cov = self.cov if estimate.cov is None else estimate.cov

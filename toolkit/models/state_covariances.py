@@ -1,24 +1,24 @@
 """The covariance of every state of a solved graph: eliminate once, recover from the root of the elimination down.
 
-Eliminated, each variable is a linear function of some that are eliminated later plus noise, ``x = -R^-1 S x_S + n``,
-and those are together in what was recovered for the first of them (Golub & Plemmons 1980; Kaess & Dellaert 2009,
-"Covariance recovery from a square root information matrix for data association"). GTSAM's Marginals traverses its
-Bayes tree anew for each state, which takes a hundred times as long.
+After elimination each variable is a linear function of some that are eliminated later plus noise,
+``x = -R^-1 S x_S + n``, and the joint covariance recovered for the first of those contains all of them (Golub &
+Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery from a square root information matrix for data association").
+GTSAM's Marginals traverses its Bayes tree again for each state, which takes a hundred times as long.
 
-Variables that depend on the same later ones, as pose, velocity and biases of one state do, are recovered together:
-one by one, in the second order below, all digits are lost within seconds of an IMU.
+Variables that depend on the same later ones, as pose, velocity and biases of one state do, are recovered together: one
+by one, in the second order below, all digits are lost within seconds of an IMU.
 
 Two orders are tried. In the order of time every state is recovered from the next, from the last to the first: with an
 IMU all are right to 1e-7 of a standard deviation. But where steps between states are known far better than the states,
 as with correlated errors of sightings, rounding grows from state to state. On a drive of 125 frames a standard
-deviation of the first came out wrong by 5 % of itself, along the 1010 frames of Dataset 03, by twists, by fifty times.
-Nested dissection cuts the graph in halves recursively; the variables of a cut are eliminated last (George 1973, "Nested
-dissection of a regular finite element mesh"): from the root to any state it is some tens of variables, and on those
-drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Nested dissection
-is tried first where states have no velocity (their steps are measured twists), but not where landmarks are seen for
-long, as while a vehicle stands: such landmarks connect so many states that dissection finds no small cut. The result of
-an order is accepted if some of its covariances equal those computed for these states separately: for the order of time
-the first state, where rounding accumulates, else a few states.
+deviation of the first state was wrong by 5 % of itself; along the 1010 frames of Dataset 03, with twists, by a factor
+of fifty. Nested dissection cuts the graph in halves recursively; the variables of a cut are eliminated last (George
+1973, "Nested dissection of a regular finite element mesh"): from the root to any state it is some tens of variables,
+and on those drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Nested
+dissection is tried first where states have no velocity (their steps are measured twists), but not where landmarks are
+seen for long, as while a vehicle stands: such landmarks connect so many states that dissection finds no small cut. The
+result of an order is accepted if some of its covariances equal those computed for these states separately: for the
+order of time the first state, where rounding accumulates, else a few states.
 
 Where neither order is accepted, the coordinates of landmarks are changed. For a landmark thousands of baselines away
 the depth in metres is so uncertain that GTSAM rejects it as undetermined, or that rounding spoils the states'
@@ -46,7 +46,7 @@ _MOST_TIED = 50
 # Where a landmark is seen by states farther apart, as while a vehicle stands, the order of time is tried first.
 _STANDING = 150
 # A direction of a variable with less than this share of the information on its best direction is lost in double
-# precision: the depth of a landmark beyond 1e10 baselines.
+# precision: for instance the depth of a landmark beyond 1e10 baselines.
 _LEAST_DETERMINED = 1e-10
 # Rows that may be added to a joint covariance before it is copied without the rows that are no longer needed.
 _ROOM = 100
@@ -106,7 +106,7 @@ def _of_groups(
 
 
 def _with_orthonormal_landmarks(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
-    """Return the graph with all variables but those kept in coordinates whose Jacobians are orthonormal.
+    """Return the graph with all variables but ``kept`` in coordinates whose Jacobians are orthonormal.
 
     A variable keeps the directions that the graph determines, and is left out if there are none.
     """
@@ -140,7 +140,7 @@ def _determined_directions(jacobian: Array) -> Array:
 
 
 def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -> list[Array]:
-    """Return the variances of the variables of some states, all else eliminated variable by variable.
+    """Return the variances of the variables of some states, all others eliminated variable by variable.
 
     Elimination by cliques would fail here: after hundreds of frames a pose is so much more uncertain than a step that
     both in one clique exceed the condition number that GTSAM allows.
@@ -187,7 +187,7 @@ def _in_time(
 
 
 def _spans(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) -> dict[int, tuple[int, int]]:
-    """Return the first and the last group that each variable in none shares a factor with."""
+    """Return the first and the last group with which each variable outside all groups shares a factor."""
     place = {key: i for i, group in enumerate(groups) for key in group}
     spans = dict[int, tuple[int, int]]()
     for keys in (graph.at(i).keys() for i in range(graph.size())):
@@ -219,7 +219,7 @@ def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def _eliminated(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
-    """Return each variable given later ones, in the order of elimination."""
+    """Return each variable's conditional on later ones, in the order of elimination."""
     net = graph.eliminateSequential(ordering)
     return [net.at(i) for i in range(net.size())]
 
@@ -227,8 +227,8 @@ def _eliminated(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> l
 class _Clique(NamedTuple):
     """Variables, eliminated one after the other, that depend on the same later ones: x = gain @ x_later + n.
 
-    ``sizes`` are theirs (f in all) by key, ``later`` the keys of those that they depend on (m in all), ``gain`` (f, m)
-    is in that order, and ``cov`` (f, f) that of n.
+    ``sizes`` are their dimensions (f in all) by key, ``later`` the keys of those that they depend on (m in all),
+    ``gain`` (f, m) is in that order, and ``cov`` (f, f) that of n.
     """
 
     sizes: dict[int, int]
@@ -238,7 +238,7 @@ class _Clique(NamedTuple):
 
 
 def _cliques(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Clique]:
-    """Return some variables, each given later ones, as cliques in the order of elimination."""
+    """Return conditionals as cliques, in the order of elimination."""
     sizes = {one.firstFrontalKey(): len(one.R()) for one in conditionals}
     parts, later = list[list[gtsam.GaussianConditional]](), frozenset[int]()
     for conditional in conditionals:
@@ -252,7 +252,7 @@ def _cliques(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Clique]
 
 
 def _clique(conditionals: Sequence[gtsam.GaussianConditional], sizes: Mapping[int, int]) -> _Clique:
-    """Return conditionals, each on the next and on what that depends on, as one: R x = -S x_later + e."""
+    """Return conditionals, each on the next one's variable and parents, as one: R x = -S x_later + e."""
     own = {one.firstFrontalKey(): sizes[one.firstFrontalKey()] for one in conditionals}
     later = list(conditionals[-1].keys())[1:]
     columns = _rows(own | {key: sizes[key] for key in later})
@@ -283,7 +283,7 @@ class _Joint:
         return np.asarray(self._matrix[np.ix_(rows, rows)])
 
     def only(self, keys: Sequence[int], room: int) -> "_Joint":
-        """Return the covariance of some of the variables, with room for so many rows beside them."""
+        """Return the covariance of some of the variables, with room for this many further rows."""
         return _Joint(_rows({key: len(self._rows[key]) for key in keys}), self.of(keys), room)
 
     def has_room(self, clique: _Clique) -> bool:
@@ -320,7 +320,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
         needed.update(later if key in needed else ())
     cliques = _cliques([one for one, key in zip(conditionals, later_of, strict=True) if key in needed])
     clique_of = {key: i for i, clique in enumerate(cliques) for key in clique.sizes}
-    # The first of those that a clique depends on depends on all the others.
+    # The first variable that a clique depends on depends itself on all the others.
     next_of = [clique_of[min(one.later, key=place.__getitem__)] if one.later else None for one in cliques]
     groups = defaultdict[int, list[Sequence[int]]](list)
     for group in together:
@@ -336,7 +336,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
 
 
 def _room_for(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
-    """Return a joint covariance that a clique can be added to; the last clique that waits for one takes it over."""
+    """Return a joint covariance to which a clique can be added; the last clique waiting for one reuses it in place."""
     if after is None:
         return _Joint({}, np.empty((0, 0)), _ROOM + len(clique.cov))
     waiting[after] -= 1

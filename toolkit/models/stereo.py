@@ -10,7 +10,7 @@ from toolkit.sequence import StereoRig
 
 # The least depth to divide by.
 _LEAST_DIVISIBLE_M = 1e-3
-# (uL, uR) of a disparity that is added: half of it on either side.
+# Change of (uL, uR, v) per unit of added disparity: half of it in each image.
 _OF_A_DISPARITY = np.array([0.5, -0.5, 0.0])
 
 
@@ -18,8 +18,8 @@ class StereoPrediction(NamedTuple):
     """Predicted measurements of points, with Jacobians; the leading axes (...) are those of the points.
 
     ``uv_px`` (..., 3); ``d_uv_d_pose`` (..., 3, 6) for a right perturbation [rotation, position] of T_world_imu;
-    ``d_uv_d_point`` (..., 3, 3) for the point in the world; ``depth_m`` (...): where it is not positive the
-    point is not in front of the camera and the rest of its row means nothing.
+    ``d_uv_d_point`` (..., 3, 3) for the point in the world; ``depth_m`` (...): where it is not positive the point is
+    not in front of the camera and the rest of its row has no meaning.
     """
 
     uv_px: Array
@@ -53,7 +53,7 @@ def projection_jacobian(points_cam: Array, rig: StereoRig) -> Array:
 
 
 def predict(points_world: Array, T_world_imu: Array, rig: StereoRig) -> StereoPrediction:
-    """Predict the measurements of points (N, 3) from one pose (4, 4) or from a pose each (N, 4, 4)."""
+    """Predict the measurements of points (N, 3) from one pose (4, 4) or from one pose each (N, 4, 4)."""
     return linearise(transform(se3_inverse(T_world_imu), points_world), T_world_imu[..., :3, :3], rig)
 
 
@@ -78,7 +78,7 @@ def images(points_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
 
 
 def _divisible(points_cam: Array) -> tuple[Array, Array]:
-    """Return points (..., 3) no nearer to the camera's plane than what a depth is divided by, and their depths."""
+    """Return points (..., 3), those too near to the camera's plane moved in front of it, and the original depths."""
     depth_m = points_cam[..., 2].copy()
     points_cam[..., 2] = np.where(np.abs(depth_m) < _LEAST_DIVISIBLE_M, _LEAST_DIVISIBLE_M, depth_m)
     return points_cam, depth_m
@@ -111,10 +111,10 @@ def disparity_px(uvs_px: Array) -> Array:
 def scaled_rig(rig: StereoRig, scale: float) -> StereoRig:
     """Return the rig whose sightings have disparities larger by a share, which is more than -1.
 
-    d becomes d (1 + scale), the mean column c = (uL + uR) / 2 and the row stay. That is, exactly, a pair whose baseline
-    is b (1 + scale) about the same middle: the left camera is half of what is added further to the left. A wrongly
-    calibrated baseline or focal length has this effect, and so has matching that is biased to one side. A scale about
-    the left camera would also move c by half the change of the disparity.
+    d becomes d (1 + scale), the mean column c = (uL + uR) / 2 and the row stay. This is exactly a pair with the
+    baseline b (1 + scale) about the same midpoint: the left camera moves to the left by half of the added length. A
+    wrongly calibrated baseline or focal length has this effect, and so has matching that is biased to one side. A scale
+    about the left camera would also move c by half the change of the disparity.
     """
     T_imu_cam = rig.T_imu_cam.copy()
     T_imu_cam[:3, 3] -= 0.5 * scale * rig.baseline_m * T_imu_cam[:3, 0]
@@ -122,5 +122,5 @@ def scaled_rig(rig: StereoRig, scale: float) -> StereoRig:
 
 
 def d_uv_d_scale(uv_px: Array, scale: float) -> Array:
-    """Return the derivatives (..., 3) of what a scaled rig predicts, (..., 3) px, by its scale."""
+    """Return the derivatives (..., 3) of a scaled rig's predictions (..., 3) px by its scale."""
     return np.asarray(disparity_px(uv_px)[..., None] / (1.0 + scale) * _OF_A_DISPARITY)

@@ -24,9 +24,9 @@ TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
 class TwistStep(NamedTuple):
     """The relative motion of one interval and its first-order error.
 
-    ``T_start_end`` (4, 4); ``d_step_d_bias`` (6, 3), the change of the step's end (right perturbation) with
-    the gyro bias; ``cov`` (6, 6), the covariance of the step in the tangent of its end, from the noise of
-    the twist alone; ``dt_s``, the interval's length.
+    ``T_start_end`` (4, 4); ``d_step_d_bias`` (6, 3), the Jacobian of the step's end (right perturbation) to the gyro
+    bias; ``cov`` (6, 6), the covariance of the step in the tangent of its end, from the noise of the twist alone;
+    ``dt_s``, the interval's length.
     """
 
     T_start_end: Array
@@ -36,13 +36,13 @@ class TwistStep(NamedTuple):
 
 
 def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
-    """Integrate the twists of one interval with a gyro bias (3,) rad/s taken off."""
+    """Integrate the twists of one interval with a gyro bias (3,) rad/s subtracted."""
     pieces = _pieces(motion.dt_s, motion.w_radps - gyro_bias, motion.v_mps, _density_squared(motion, noise))
     return _joined(pieces, float(motion.dt_s.sum()))
 
 
 def integrate_each(motions: Sequence[TwistMotion], gyro_biases: Array, noise: TwistNoise) -> list[TwistStep]:
-    """Integrate the twists of N intervals, each with its own gyro bias (N, 3) rad/s taken off."""
+    """Integrate the twists of N intervals, each with its own gyro bias (N, 3) rad/s subtracted."""
     pieces = _pieces(
         np.concatenate([motion.dt_s for motion in motions]),
         np.concatenate([motion.w_radps - bias for motion, bias in zip(motions, gyro_biases, strict=True)]),
@@ -73,7 +73,7 @@ def _pieces(dt_s: Array, w_radps: Array, v_mps: Array, density_squared: Array) -
 
 
 def _density_squared(motion: TwistMotion, noise: TwistNoise) -> Array:
-    """Return the squared noise densities of turn rate and velocity: of each twist (n, 6), or of all (6,)."""
+    """Return the squared noise densities of turn rate and velocity: of each twist (n, 6), or common to all (6,)."""
     density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
     if motion.noise_scale is None:
         return density_squared
@@ -81,7 +81,7 @@ def _density_squared(motion: TwistMotion, noise: TwistNoise) -> Array:
 
 
 def _joined(pieces: _Pieces, dt_s: float) -> TwistStep:
-    """Return the step of consecutive pieces."""
+    """Return the step composed of consecutive pieces."""
     T_start_end, d_step_d_bias, cov = (part[0] for part in pieces)
     for piece, own_bias, own_cov in zip(*(part[1:] for part in pieces), strict=True):
         carry = se3_adjoint(se3_inverse(piece))
@@ -139,7 +139,7 @@ class TwistIncrement:
     noise: TwistNoise
 
     def predict(self, start: Belief) -> Prediction:
-        """Carry a state over the interval."""
+        """Predict a state over the interval."""
         size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
         transition, noise = np.eye(size), np.zeros((size, size))
         transition[POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
@@ -155,7 +155,7 @@ class TwistIncrement:
         return transition
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the step from pose to pose and the walk of the gyro bias."""
+        """Return the factors between the poses and the random walk of the gyro bias."""
         graph = gtsam.NonlinearFactorGraph()
         graph.add(twist_factor(self.step, self.gyro_bias, k))
         graph.add(gyro_bias_walk_factor(self.noise, self.step.dt_s, k))
@@ -176,12 +176,12 @@ class TwistModel:
         return Belief.of_prior(prior, self.layout)
 
     def integrate(self, motion: Motion, bias: Array) -> TwistIncrement:
-        """Integrate the twists between two frames about a bias (6,), of which the gyro's counts."""
+        """Integrate the twists between two frames about a bias (6,), of which only the gyro's part is used."""
         assert isinstance(motion, TwistMotion)
         return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
 
     def integrate_each(self, motions: Sequence[Motion], biases: Sequence[Array]) -> list[TwistIncrement]:
-        """Integrate the twists of some intervals, each about its own bias (6,), in one go."""
+        """Integrate the twists of some intervals, each about its own bias (6,), vectorised."""
         twists = [motion for motion in motions if isinstance(motion, TwistMotion)]
         steps = integrate_each(twists, np.array(biases)[:, 3:], self._noise)
         return [TwistIncrement(step, bias[3:], self._noise) for step, bias in zip(steps, biases, strict=True)]
@@ -202,12 +202,12 @@ class TwistModel:
         return Estimate(t_ns, values.atPose3(X(k)).matrix(), bias=bias)
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors that hold state k at a belief."""
+        """Return the prior on state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(B(k), belief.bias[3:])
         return joint_prior(at, {X(k): POSE, B(k): self.layout.gyro_bias}, belief.cov)
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
-        """Return the covariance (9, 9), made exactly symmetric: both sides use the same errors."""
+        """Return the covariance (9, 9), made exactly symmetric: GTSAM's errors are those of an Estimate here."""
         return np.asarray(0.5 * (cov + cov.T))
