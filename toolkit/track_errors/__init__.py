@@ -1,4 +1,4 @@
-"""What the errors of real tracks are like, found from a recording's own visible tracks, without truth.
+"""Statistics of the errors of real tracks, from a recording's own visible tracks, without truth.
 
 Read ``tracklets`` (the tracks by length, their residuals, the likelihood of a noise), ``adjustment`` (poses that fit
 all tracks), ``fit`` (the noise of greatest likelihood), ``card`` (its summary), and ``statement`` (whether a stated

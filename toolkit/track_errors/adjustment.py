@@ -38,8 +38,8 @@ _FIXED = 1e12
 class Adjusted:
     """Poses (K, 4, 4) of the camera in the middle of the pair, and the tracks with their landmarks.
 
-    ``freedom`` is the share of the tracks' equations that the poses leave: residuals about fitted poses are smaller
-    than errors by its root.
+    ``freedom`` is the share of the tracks' degrees of freedom that remains after the poses are fitted: residuals about
+    fitted poses are smaller than errors by its root.
     """
 
     T_world_middle: Array
@@ -65,7 +65,7 @@ def started(sequence: Sequence, tracks: tuple[Tracklets, ...]) -> Adjusted:
 
 
 def _measured(sequence: Sequence, camera: CameraMotion) -> Array:
-    """Return the camera's twist (K - 1, 6), where its own motion fails: measured, or that of the intervals around."""
+    """Return the camera's twist (K - 1, 6); where its own motion failed, a measured or a neighbouring one."""
     known = np.flatnonzero(camera.known)
     seen = np.concatenate([camera.w_radps, camera.v_mps], axis=1)
     twist = np.zeros_like(seen)
@@ -84,7 +84,7 @@ def _measured(sequence: Sequence, camera: CameraMotion) -> Array:
 
 
 def adjusted(start: Adjusted, model: Tailed, sequence: Sequence, iterations: int) -> Adjusted:
-    """Return the poses and landmarks after Gauss-Newton steps from where they are."""
+    """Return the poses and landmarks after ``iterations`` Gauss-Newton steps from the start."""
     from scipy.linalg import cho_solve_banded, cholesky_banded  # imported here because most processes do not need it
 
     poses, tracks, freedom = start.T_world_middle, start.tracks, start.freedom
@@ -123,13 +123,13 @@ def _used_up(factor: tuple[Array, bool], tie: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Tie:
-    """Motions (K - 1, 4, 4) of the intervals with their standard deviations (K - 1, 6)."""
+    """A prior on the motions of the intervals: means (K - 1, 4, 4) and standard deviations (K - 1, 6)."""
 
     motion: Array
     sigma: Array
 
     def equations(self, poses: Array) -> tuple[Array, Array]:
-        """Return whitened rows (K - 1, 6, 12) of each interval's poses and the errors (K - 1, 6) they take away."""
+        """Return whitened Jacobians (K - 1, 6, 12) to each interval's two poses, and the errors (K - 1, 6)."""
         moved = se3_inverse(poses[:-1]) @ poses[1:]
         error = se3_log(se3_inverse(self.motion) @ moved)
         by_start = -se3_adjoint(se3_inverse(moved))
@@ -139,11 +139,11 @@ class _Tie:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations of the poses, and what landmarks do.
+    """Normal equations of the poses, and the elimination of the landmarks.
 
-    ``matrix`` (K, w, w) are sums over equations whose first pose is the k-th, of the w / 6 poses from there on;
-    ``gradient`` (K, 6). ``landmarks``, a pair a group: the step (B, 3) px with the poses as they are, and its decrease
-    (B, 3, 6 n) by steps of the poses.
+    ``matrix`` (K, w, w): block k is the sum over equations whose first pose is k, on the w / 6 poses from k on;
+    ``gradient`` (K, 6). ``landmarks`` has a pair for each group of tracks: the landmark step (B, 3) px with the poses
+    fixed, and its derivative (B, 3, 6 n), negated, by steps of the poses.
     """
 
     matrix: Array
@@ -169,8 +169,8 @@ def _normal_equations(tracks: tuple[Tracklets, ...], poses: Array, rig: StereoRi
             rows *= np.sqrt(model.weights((rows[..., -1] ** 2).sum(axis=1), group.equations))[:, None, None]
             _add(system, some.first_frame, rows[..., :-1], rows[..., -1])
             step = np.linalg.solve(upper, taken)
-            # A landmark is given in its first frame and moves with that pose, but is fixed in the world in the
-            # equations.
+            # A landmark is parametrised in its first frame and moves with that pose; the equations take it as fixed in
+            # the world.
             step[..., :6] -= here.d_pose[:, 0]
             steps.append(step)
         all_steps = np.concatenate(steps)
@@ -179,14 +179,14 @@ def _normal_equations(tracks: tuple[Tracklets, ...], poses: Array, rig: StereoRi
 
 
 def _by_poses(per_channel: Array, d_pose: Array) -> Array:
-    """Return whitened rows (B, 3 n, 6 n): each of a sighting's channels depends on all poses up to its own."""
+    """Return whitened rows (B, 3 n, 6 n): a row of a channel depends on the poses of all sightings up to its own."""
     count, n = d_pose.shape[:2]
     rows: Array = np.einsum("cij,bjcp->bicjp", per_channel, d_pose)
     return rows.reshape(count, 3 * n, 6 * n)
 
 
 def _add(system: _System, first_frame: IntArray, rows: Array, values: Array) -> None:
-    """Add equations, rows (B, m, 6 n) and values (B, m) of the poses from a first frame (B,), increasing, on."""
+    """Add equations, rows (B, m, 6 n) and values (B, m), on the poses from the first frames (B,), increasing, on."""
     width = rows.shape[2]
     frames, begin = np.unique(first_frame, return_index=True)
     for frame, first, last in zip(frames.tolist(), begin, np.append(begin[1:], len(rows)), strict=True):

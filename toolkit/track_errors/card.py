@@ -1,7 +1,7 @@
 """The card of a recording: statistics of its tracks, and the scale of vision over the measured motion, without truth.
 
-All figures are computed at the poses of the fit of the noise. Residuals are about the landmark that is estimated under
-white noise, as in an estimator that assumes white noise; differences along a track hardly depend on the landmark.
+All figures are computed at the poses of the noise fit. Residuals are about the landmark that is estimated under white
+noise, as in an estimator that assumes white noise; differences along a track hardly depend on the landmark.
 """
 
 from dataclasses import dataclass
@@ -24,11 +24,12 @@ from toolkit.track_noise import CHANNELS, TrackNoise
 # Sightings between which residuals are compared, at most.
 LAGS = 8
 # A residual beyond this many robust standard deviations is in the tails; a track with this many times the usual
-# residual is at odds with the motion.
+# residual contradicts the motion.
 _TAIL, _ODDS = 4.0, 4.0
 # A lag with fewer pairs has no statistic.
 _FEWEST_PAIRS = 30
-# Intervals with fewer common tracks are not used for the scale; one with a larger error than this is not given.
+# Intervals with fewer common tracks are not used for the scale; a scale from fewer intervals, or with a larger standard
+# error, is not given.
 _FEWEST_COMMON, _FEWEST_INTERVALS, _SCALE_ERROR = 8, 30, 0.05
 QUANTILES = (0.1, 0.5, 0.9)
 
@@ -42,10 +43,10 @@ class Card:
     number of intervals without a common track, of ``intervals``. ``noise``, ``degrees``, ``gain`` and ``gain_error``
     are the fit's. ``correlation`` and ``structure_px2`` (L, 3) are, at lags of 1 to L frames and by c, d, v, the
     autocorrelation of residuals along a track and half the mean square of their difference, ``fitted_px2`` (L, 3) the
-    latter as the fitted noise has it. ``left_right`` is the correlation of residuals in uL and uR, ``tails`` the share
+    latter under the fitted noise. ``left_right`` is the correlation of residuals in uL and uR, ``tails`` the share
     beyond four robust sigmas, ``at_odds`` the share of tracks whose residuals are four times the usual and more, and
     ``scale`` vision's translation over the measured one, None where that is not known. ``left_out`` is the share of
-    visible sightings that estimators were not given for moving against the rest, None where that was not asked for.
+    visible sightings withheld from estimators because they move against the rest, None where that was not asked for.
     """
 
     tracks: int
@@ -74,7 +75,7 @@ class Card:
 
 
 def card_of(sequence: Sequence, fit: Fit) -> Card:
-    """Return the card of a sequence whose noise of tracks was fitted."""
+    """Return the card of a sequence from its fitted track noise."""
     seen, rig, state = sequence.visible, sequence.rig, fit.adjusted
     groups = [_TrackResiduals.of(group, state.T_world_middle, rig, state.freedom) for group in state.tracks]
     spread_px = _spread_px(groups)
@@ -108,7 +109,7 @@ def card_of(sequence: Sequence, fit: Fit) -> Card:
 
 @dataclass(frozen=True, eq=False)
 class _TrackResiduals:
-    """Residuals (B, n, 3) px in c, d, v: about the fitted landmark, and about the one that white noise would put."""
+    """Residuals (B, n, 3) px in c, d, v: about the fitted landmark, and about the one estimated under white noise."""
 
     px: Array
     fixed_px: Array
@@ -153,7 +154,7 @@ def _structure(groups: list[_TrackResiduals]) -> Array:
 
 
 def _pairs(residual_px: Array, lag: int) -> tuple[Array, Array]:
-    """Return the residuals (P, 3) of sightings and of those so many frames later."""
+    """Return the residuals (P, 3) of sightings, and those of the same tracks ``lag`` frames later."""
     return residual_px[:, :-lag].reshape(-1, 3), residual_px[:, lag:].reshape(-1, 3)
 
 
@@ -164,7 +165,7 @@ def _left_right(groups: list[_TrackResiduals], sound: list[BoolArray]) -> float:
 
 
 def _scale(sequence: Sequence, T_world_middle: Array, known: BoolArray) -> Scalar | None:
-    """Return the ratio of vision's velocities to the measured ones, by the neighbouring intervals' as instruments."""
+    """Return the ratio of vision's velocities to the measured ones, with neighbouring intervals as instruments."""
     motion = sequence.motion
     if not isinstance(motion, TwistSamples):
         return None
@@ -177,7 +178,7 @@ def _scale(sequence: Sequence, T_world_middle: Array, known: BoolArray) -> Scala
     if middle.size < _FEWEST_INTERVALS:
         return None
     around_mps = 0.5 * (seen_mps[middle - 1] + seen_mps[middle + 1])
-    # Along the axis of most motion alone: across it there is only noise, which is correlated in neighbouring intervals.
+    # Only along the axis of most motion: across it there is only noise, which is correlated in neighbouring intervals.
     along = np.linalg.eigh(around_mps.T @ around_mps)[1][:, -1:]
     scale = slope(around_mps @ along, measured_mps[middle] @ along, seen_mps[middle] @ along)
     return scale if scale.error < _SCALE_ERROR else None

@@ -30,21 +30,21 @@ from toolkit.track_noise import CHANNELS, TrackNoise
 FEWEST_TRACKS = 100
 # There are too few tracks where the poses use more than a quarter of the residuals' degrees of freedom.
 LEAST_FREEDOM = 0.75
-# Rounds of poses and noise; they end earlier where a round gains less than this log-likelihood a track.
+# Rounds of poses and noise; they end earlier if a round gains less than this log-likelihood per track.
 _ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
 # Smallest white noise, walk and offset (px): coordinates are not more accurate than this.
 _LEAST_PX = np.repeat([[0.02], [0.002], [0.01]], 3, axis=1)
 _MOST_PX = 100.0
 _DEGREES = (2.0, 200.0)
-# Walks and offsets below so many times their smallest count as zero.
+# Walks and offsets below this many times their smallest value count as zero.
 _NONE = 2.5
 # Initial values of the search; they do not affect the result.
 _START_PX = np.array([[0.3, 0.5, 0.3], [0.1, 0.1, 0.1], [0.5, 0.5, 0.5]])
 _START_DEGREES = 5.0
 _STRETCHES, _SIGMAS = 12, 3.0
 
-# Parts (white, walk, offset) x (c, d, v) that a kind of noise has, the simplest first. An offset in c and v cannot be
-# distinguished from another landmark.
+# Parts (white, walk, offset) x (c, d, v) of each kind of noise, the simplest first. An offset in c and v cannot be
+# distinguished from another position of the landmark.
 _KINDS: dict[str, BoolArray] = {
     "white": np.array([[1, 1, 1], [0, 0, 0], [0, 0, 0]], dtype=bool),
     "offset": np.array([[1, 1, 1], [0, 0, 0], [0, 1, 0]], dtype=bool),
@@ -58,9 +58,9 @@ _RICHEST = _KINDS["walk and offset"]
 class Fit:
     """The fitted noise, and its gain in likelihood.
 
-    ``noise`` is that of most tracks, ``degrees`` of freedom those of the tracks' Student-t (fewer: heavier tails).
-    ``gain`` is the log-likelihood a track over white noise, with its standard error. ``adjusted`` has the poses and
-    landmarks it was fitted about.
+    ``noise`` is that of most tracks, ``degrees`` the degrees of freedom of the tracks' Student-t (fewer: heavier
+    tails). ``gain`` is the log-likelihood per track above that of white noise, with its standard error. ``adjusted``
+    has the poses and landmarks about which it was fitted.
     """
 
     noise: TrackNoise
@@ -81,7 +81,7 @@ class Fit:
 
 
 def fit_track_noise(sequence: Sequence) -> Fit:
-    """Fit the noise of a sequence's visible tracks; the truth is not looked at.
+    """Fit the noise of a sequence's visible tracks, without its truth.
 
     Raises DataError where time, motion samples or tracks do not allow it.
     """
@@ -160,7 +160,7 @@ def _parts(noise: TrackNoise) -> Array:
 
 
 def _chosen(state: Adjusted, richest: Tailed, sequence: Sequence) -> Fit:
-    """Return the simplest noise that no richer one beats."""
+    """Return the simplest noise over which no richer one has a credible gain."""
     groups = _residuals(state, sequence)
     frames = np.concatenate([group.first_frame for group in state.tracks])
     stretch = frames * _STRETCHES // sequence.frame_count
@@ -177,7 +177,7 @@ def _chosen(state: Adjusted, richest: Tailed, sequence: Sequence) -> Fit:
 
 @dataclass(frozen=True)
 class _Gain:
-    """The mean log-likelihood a track that one noise gains over another, its standard error, the number of tracks."""
+    """The mean log-likelihood per track that one noise gains over another, its standard error, the number of tracks."""
 
     mean: float
     error: float
@@ -185,12 +185,12 @@ class _Gain:
 
     @classmethod
     def over(cls, stretch: IntArray, each: Array) -> "_Gain":
-        """Return the gain of tracks (B,), which are in so many stretches (B,) of the recording."""
+        """Return the gain of tracks (B,), with the number (B,) of the stretch of the recording that each is in."""
         apart = np.bincount(stretch, each - each.mean(), _STRETCHES)
         return cls(float(each.mean()), float(np.sqrt((apart**2).sum())) / each.size, each.size)
 
     def is_credible(self, further: int) -> bool:
-        """Say whether it is worth so many further parameters."""
+        """Say whether the gain justifies ``further`` more parameters."""
         return bool(self.mean > max(_SIGMAS * self.error, 0.5 * further * np.log(self.tracks) / self.tracks))
 
 
@@ -202,7 +202,7 @@ def _without_traces(noise: TrackNoise) -> TrackNoise:
 
 
 def summary_of(fit: Fit, stated_px2: Array) -> str:
-    """Return the fitted noise in a line; where it is white, beside the covariance (3, 3) of (uL, uR, v) that stands."""
+    """Return the fitted noise in a line; if it is white, beside the covariance (3, 3) of (uL, uR, v) in use."""
     noise = fit.noise
     parts = [f"white {_of_channels(noise.white_px)}"]
     if noise.walk_px.any():

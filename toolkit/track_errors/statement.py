@@ -27,7 +27,7 @@ _MEDIAN_CHI2 = 2.366
 
 
 def scatter_over(noise: TrackNoise, sequence: Sequence) -> float | None:
-    """Return the scatter of the tracks from frame to frame over that of a noise: 1 where it is the tracks' own.
+    """Return the ratio of the tracks' scatter from frame to frame to that of a noise; 1 for their own noise.
 
     The ratio is that of the medians, which mismatches do not change. None where too few tracks determine the camera's
     motion, or where the recording cannot be run.
@@ -53,7 +53,7 @@ def contradicted(noise: TrackNoise, sequence: Sequence) -> str | None:
 
 
 def _cov_px2(noise: TrackNoise, sequence: Sequence, steps: OneStep) -> Array:
-    """Return the covariance (P, 3, 3) px^2 of the residuals: of what both sightings share, and what is new in each."""
+    """Return the covariance (P, 3, 3) px^2 of the residuals: of both sightings' common error and their own errors."""
     seen = sequence.observations
     _, track, counts = np.unique(seen.track_id, return_inverse=True, return_counts=True)
     first = np.full(counts.size, np.iinfo(np.int64).max)

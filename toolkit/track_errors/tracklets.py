@@ -5,10 +5,11 @@ column ``c = fx x / z + cx``, at the disparity ``d = fx b / z``, in the row ``v 
 by its (c, d, v) in the track's first frame; d is an inverse depth, so that it may be at infinity (Civera, Davison &
 Montiel, "Inverse depth parametrization for monocular SLAM", 2008).
 
-The landmark of a track is in no other track, so it is eliminated with a flat prior: whitened residuals lose the three
-directions it explains (Triggs et al., "Bundle adjustment", 2000, section 6.1; restricted likelihood: Patterson &
-Thompson 1971). What is left is multivariate Student-t: a track that slid off its point, or whose point moves, counts
-little (Lange, Little & Taylor, "Robust statistical modeling using the t distribution", 1989).
+The landmark of a track is in no other track, so it is eliminated with a flat prior: whitened residuals are projected
+off the three directions it explains (Triggs et al., "Bundle adjustment", 2000, section 6.1; restricted likelihood:
+Patterson & Thompson 1971). The remaining residuals are multivariate Student-t: a track that slid off its point, or
+whose point moves, has little weight (Lange, Little & Taylor, "Robust statistical modeling using the t distribution",
+1989).
 """
 
 from collections.abc import Iterable
@@ -47,12 +48,12 @@ class Tracklets:
 
     @property
     def sightings(self) -> int:
-        """Return n."""
+        """Return n, the number of sightings per track."""
         return int(self.cdv_px.shape[1])
 
     @property
     def equations(self) -> int:
-        """Return how many equations a track has left, the landmark's three unknowns eliminated."""
+        """Return the number of equations per track after its landmark's three unknowns are eliminated."""
         return 3 * self.sightings - 3
 
     @property
@@ -61,18 +62,18 @@ class Tracklets:
         return self.first_frame[:, None] + np.arange(self.sightings)
 
     def moved(self, by_px: Array) -> "Tracklets":
-        """Return them with landmarks moved by (B, 3) px, none beyond infinity."""
+        """Return the tracks with landmarks moved by (B, 3) px, none beyond infinity."""
         landmark = self.landmark_cdv_px + by_px
         landmark[:, 1] = np.maximum(landmark[:, 1], 0.0)
         return replace(self, landmark_cdv_px=landmark)
 
     def select(self, rows: BoolArray | IntArray | slice) -> "Tracklets":
-        """Return those of a mask (B,) or an index (M,)."""
+        """Return the tracks of a mask (B,) or an index (M,)."""
         return Tracklets(self.first_frame[rows], self.track_id[rows], self.cdv_px[rows], self.landmark_cdv_px[rows])
 
 
 def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
-    """Return the tracks an estimator may see, a group for each number of sightings; none where none is long enough."""
+    """Return the tracks an estimator may see, one group per number of sightings; no group if none is long enough."""
     seen = sequence.visible
     # The fit needs disparities, so a track ends where a sighting lacks the right image.
     seen = seen.select(~is_left_only(seen.uv_px))
@@ -80,7 +81,7 @@ def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
     frame, track_id, cdv_px = seen.frame[order], seen.track_id[order], seen.uv_px[order] @ CHANNELS.T
     first = np.flatnonzero(np.diff(track_id, prepend=track_id[:1] - 1) != 0)
     count = _unbroken(frame, track_id, first)
-    # Tracks are selected by their first sighting; a selection by all sightings would depend on the noise of later ones.
+    # Tracks are selected by their first sighting: a selection by all sightings would depend on the noise of later ones.
     usable = (cdv_px[first, 1] > LEAST_DISPARITY_PX) & (count >= FEWEST_SIGHTINGS)
     usable &= _in_stretches(frame[first], sequence.frame_count)
     frames = min(sequence.frame_count, MOST_FRAMES)
@@ -98,14 +99,14 @@ def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
 
 
 def _unbroken(frame: IntArray, track_id: IntArray, first: IntArray) -> IntArray:
-    """Return how many sightings (T,) each track, whose first row is given, has in successive frames from its first."""
+    """Return the number of sightings (T,) of each track in successive frames from its first, whose row is given."""
     breaks = np.flatnonzero((np.diff(frame, prepend=-2) != 1) | (np.diff(track_id, prepend=-1) != 0))
     following = np.append(breaks, frame.size)[np.searchsorted(breaks, first, side="right")]
     return np.minimum(following - first, MOST_SIGHTINGS)
 
 
 def _in_stretches(frame: IntArray, frame_count: int) -> BoolArray:
-    """Say of frames (T,) whether they are in one of the stretches that are used."""
+    """Say which frames (T,) are in one of the stretches that are used."""
     if frame_count <= MOST_FRAMES:
         return np.ones(frame.size, dtype=bool)
     period = frame_count * STRETCH_FRAMES // MOST_FRAMES
@@ -113,19 +114,19 @@ def _in_stretches(frame: IntArray, frame_count: int) -> BoolArray:
 
 
 def _evenly(usable: BoolArray, a_frame: float) -> BoolArray:
-    """Say of tracks (T,) which to keep so that no more than MOST_A_FRAME are in a frame on average."""
+    """Say which tracks (T,) to keep so that on average at most MOST_A_FRAME are in a frame."""
     number = np.cumsum(usable) * min(MOST_A_FRAME / max(a_frame, 1.0), 1.0)
     return np.asarray(np.diff(np.floor(number), prepend=0.0) > 0.0)
 
 
 def middle_of_pair(rig: StereoRig) -> Array:
-    """Return T_cam_middle (4, 4): the left camera's pose of the camera half-way between left and right."""
+    """Return T_cam_middle (4, 4), the pose of the camera half-way between left and right in the left camera."""
     return se3(np.eye(3), np.array([0.5 * rig.baseline_m, 0.0, 0.0]))
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Residuals (B, n, 3) px, measured minus predicted in (c, d, v), and derivatives of what is predicted.
+    """Residuals (B, n, 3) px, measured minus predicted in (c, d, v), and derivatives of the prediction.
 
     ``d_landmark`` (B, n, 3, 3) by the landmark's own (c, d, v); ``d_pose`` (B, n, 3, 6) by the sighting's pose of the
     camera, perturbed on the right [rotation, position], the landmark fixed in the world.
@@ -176,7 +177,7 @@ def _d_cdv_d_point(point: Array, disparity_px: Array, rig: StereoRig) -> Array:
 
 
 def whitening(noise: TrackNoise, sightings: int) -> Array:
-    """Return L^-1 (3, n, n) per channel, L L^T the covariance of that many sightings in successive frames."""
+    """Return L^-1 (3, n, n) per channel, with L L^T the covariance of n sightings in successive frames."""
     cov: Array = noise.cov(np.arange(float(sightings)))
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
@@ -196,13 +197,13 @@ class Residuals:
 
     @classmethod
     def of(cls, tracks: Linearised, freedom: float) -> "Residuals":
-        """Return those about adjusted poses, as large as errors are where the poses left that share of freedom."""
+        """Return the residuals about adjusted poses, scaled to the size of errors by the remaining share of freedom."""
         px = np.moveaxis(tracks.residual_px, 2, 0) / np.sqrt(freedom)
         by_landmark = tracks.d_landmark.transpose(2, 0, 3, 1)
         return cls(np.ascontiguousarray(px), np.ascontiguousarray(by_landmark))
 
     def select(self, rows: slice) -> "Residuals":
-        """Return those of some tracks."""
+        """Return the residuals of some tracks."""
         return Residuals(self.px[:, rows], self.by_landmark[:, rows])
 
     @property
@@ -219,7 +220,7 @@ class Tailed:
     degrees: float
 
     def weights(self, chi2: Array, equations: int) -> Array:
-        """Return what tracks (B,) count, by their squared whitened residuals: about 1 for most, less for outliers."""
+        """Return the weights of tracks (B,) by their squared whitened residuals: about 1, less for outliers."""
         return np.asarray((self.degrees + equations) / (self.degrees + chi2))
 
 
@@ -227,8 +228,8 @@ class Tailed:
 class Likelihood:
     """Log-likelihood (B,) of each track, and the gradients of their sum.
 
-    ``by_variance`` (3, 3) is that by the variances, white, walk, offset x c, d, v; ``by_degrees`` that by the degrees
-    of freedom. ``chi2`` (B,) is the squared whitened residual of each track, its landmark at its best.
+    ``by_variance`` (3, 3) is the gradient by the variances, white, walk, offset x c, d, v; ``by_degrees`` that by the
+    degrees of freedom. ``chi2`` (B,) is the squared whitened residual of each track at its best landmark.
     """
 
     each: Array
@@ -265,7 +266,7 @@ def _student(chi2: Array, p: int, nu: float) -> tuple[Array, float]:
 
 
 def _by_variance(information: Array, left: Array, spread: Array, weight: Array) -> Array:
-    """Return half of the weighted r^T P K P r - tr(P K) (3, 3), K the parts of each channel's covariance."""
+    """Return half of the weighted r^T P K P r - tr(P K) (3, 3), with K the parts of each channel's covariance."""
     count, n = left.shape[1:]
     ages = np.arange(n)
     rows = []
