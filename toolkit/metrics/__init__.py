@@ -1,13 +1,12 @@
-"""Scores a run. Every module in this folder is a metric file and is found without being listed; so are other packages'.
+"""Scores a run. Every module in this folder is a metric file and is found without being listed.
 
 A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with its presentation in tables and
-files), ``ORDER`` (its place among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why its
-metrics belong to the causal output alone, where they do. ``GROUP`` is a name that stands for all of them where a
-table's columns are asked for. ``ON_REQUEST`` names the setting ``metrics.<name>`` without which metrics that take long
-are not computed. Read :mod:`toolkit.metrics.parts.evaluation`, then ``ate``, then the others; docs/metrics.md defines
-each number.
+files), ``ORDER`` (its place among other files) and ``score(evaluation) -> Scores``. If its metrics belong to the causal
+output alone, ``CAUSAL_ONLY`` says why. ``GROUP`` is a name for all of them where a table's columns are asked for.
+``ON_REQUEST`` names the setting ``metrics.<name>`` without which metrics that take long are not computed. Read
+:mod:`toolkit.metrics.parts.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
 
-A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
+A package of another distribution is found by the entry-point group ``toolkit.metrics`` under which it is announced.
 """
 
 from collections.abc import Collection, Iterable
@@ -58,7 +57,7 @@ class MetricFile(Protocol):
 
 
 class _Found(NamedTuple):
-    """The metric files by their ORDER, and why others cannot be used, by name."""
+    """The metric files by their ORDER, and for others the reason why they cannot be used, by name."""
 
     files: tuple[MetricFile, ...]
     missing: dict[str, str]
@@ -68,7 +67,7 @@ class _Found(NamedTuple):
 def _found() -> _Found:
     """Import every metric file of this package and of the announced ones.
 
-    Raises ExtensionError, naming the file, where one is no metric file or declares a key that another has.
+    Raises ExtensionError, naming the file, if one is no metric file or declares a key of another file.
     """
     files: list[MetricFile] = []
     missing: dict[str, str] = {}
@@ -86,7 +85,7 @@ def _found() -> _Found:
 
 
 def _loaded(found: FoundModule) -> MetricFile:
-    """Import a metric file; raises ExtensionError where it does not define what one does."""
+    """Import a metric file; raises ExtensionError if it does not define what a metric file must."""
     try:
         file = found.load()
     except ExtensionError as error:
@@ -116,7 +115,7 @@ def describe() -> dict[str, str]:
 
 
 def unavailable() -> dict[str, str]:
-    """Return the metric files that cannot be imported here, by name, with the dependency they lack."""
+    """Return the metric files that cannot be imported here, by name, with the missing dependency."""
     return dict(_found().missing)
 
 
@@ -161,11 +160,12 @@ def score_run(
 ) -> Scores:
     """Score one output of a run against its sequence, with every key of :func:`describe`.
 
-    ``requested`` names the switches of metrics that are computed on request alone; with ``only``, the keys, names or
-    groups of some metrics, no other file's are computed, and the scores have the keys of these files alone. A metric
-    that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where the run
-    has no output of that kind, UnknownNameError where ``only`` names a metric that does not exist, ExtensionError
-    where a file scores others than it declares; an error inside a metric is a defect and passes through.
+    ``requested`` names the switches of metrics that are computed on request only. With ``only``, the keys, names or
+    groups of some metrics, only the files of these are computed, and the scores have the keys of these files alone. A
+    metric that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where
+    the run has no output of that kind, UnknownNameError where ``only`` names a metric that does not exist,
+    ExtensionError where a file scores other keys than it declares; an error inside a metric is a defect and passes
+    through.
     """
     evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
@@ -191,7 +191,7 @@ def _files_of(names: Collection[str] | None) -> tuple[MetricFile, ...]:
 
 
 def repeated(causal: Scores) -> Scores:
-    """Return the scores of a final output that repeats the causal one: the same but for metrics of causal outputs."""
+    """Return the scores of a final output that equals the causal one: without metrics of causal outputs alone."""
     final = causal
     for file in _found().files:
         if reason := _causal_only(file):
@@ -200,7 +200,7 @@ def repeated(causal: Scores) -> Scores:
 
 
 def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
-    """Return the scores as they are where no metrics on request but the ``requested`` were computed."""
+    """Return the scores without metrics on request, except the ``requested`` ones."""
     for file in _found().files:
         if (switch := _on_request(file)) and switch not in requested:
             scores = scores.without(_keys(file), _how_to_request(switch))
@@ -224,7 +224,7 @@ def _keys(file: MetricFile) -> list[str]:
 
 
 def _causal_only(file: MetricFile) -> str:
-    """Return why a file's metrics belong to the causal output alone; nothing where they do not."""
+    """Return why a file's metrics belong to the causal output alone; "" if they do not."""
     return str(getattr(file, "CAUSAL_ONLY", ""))
 
 
@@ -233,5 +233,5 @@ def _how_to_request(switch: str) -> str:
 
 
 def _on_request(file: MetricFile) -> str:
-    """Return the switch without which a file's metrics are not computed; nothing where they always are."""
+    """Return the switch without which a file's metrics are not computed; "" if they always are."""
     return str(getattr(file, "ON_REQUEST", ""))

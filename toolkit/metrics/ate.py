@@ -100,7 +100,7 @@ def score(evaluation: AgainstTruth) -> Scores:
 
 
 def _telling_tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float | None:
-    """Return how far apart the two verticals are (deg) where that explains most of ate_yaw_m, else None."""
+    """Return the angle between the two verticals (deg) if it explains most of ate_yaw_m, else None."""
     se3_m, yaw_m = scores.values["ate_se3_m"], scores.values["ate_yaw_m"]
     if se3_m is None or yaw_m is None or se3_m**2 > (1.0 - _EXPLAINED) * yaw_m**2:
         return None
@@ -109,7 +109,7 @@ def _telling_tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float | None:
 
 
 def _telling_scale(evaluation: AgainstTruth, scores: Scores) -> float | None:
-    """Return by what the estimate must be multiplied where that explains nearly all of ate_se3_m, else None."""
+    """Return the factor on the estimate's scale that explains nearly all of ate_se3_m, else None."""
     se3_m, sim3_m = scores.values["ate_se3_m"], scores.values["ate_sim3_m"]
     if se3_m is None or sim3_m is None or _TIMES_BETTER * sim3_m > se3_m:
         return None
@@ -129,7 +129,7 @@ def position_rmse(matched: Matched, alignment: Alignment) -> float:
 def rotation_rmse_deg(matched: Matched, alignment: Alignment) -> float:
     """Return the root mean square of the angles between true and aligned rotations, in degrees.
 
-    Raises Unavailable where the alignment leaves a rotation open.
+    Raises Unavailable where the alignment does not determine a rotation.
     """
     if not alignment.rotation_is_unique:
         raise Unavailable(_ON_A_LINE)

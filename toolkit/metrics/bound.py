@@ -3,8 +3,8 @@
 Van Trees, "Detection, estimation and modulation theory", part I (1968), section 2.4; how bound and efficient estimate
 are computed is in :mod:`toolkit.metrics.parts.cramer_rao`. The error of an unbiased estimator is the error of the
 efficient one on the same measurements plus a part ``d`` that is not correlated with it, so its covariance is the bound
-P plus that of d. The error of a single run itself is mostly due to the noise that both share, above all the error of
-the start.
+P plus that of d. Most of the error of a single run is due to the noise that both share, above all the error of the
+start.
 
 Without an exact truth the bound that the model claims is used, linearised at the run's own final estimate. The ratio of
 the error to it is then a test of the model: about 1 where model and estimator are consistent.
@@ -68,9 +68,9 @@ METRICS = (
 
 @dataclass(frozen=True, eq=False)
 class AgainstBound:
-    """An output and its bound at stamps (n,): its errors beyond the efficient estimate (n, d), its stated covariances.
+    """An output and its bound at stamps (n,): its errors beyond the efficient estimate (n, d), and two covariances.
 
-    ``bound`` and ``stated`` (n, d, d) are covariances in the layout's order.
+    ``bound`` and ``stated`` (n, d, d) are the Cramér-Rao bound and the stated covariance, in the layout's order.
     """
 
     t_ns: IntArray
@@ -141,7 +141,7 @@ def _stated(evaluation: Evaluation, shape: tuple[int, ...]) -> Array:
 
 
 def _rms_error_m(evaluation: Evaluation) -> float:
-    """Return the RMS distance from the true positions, as the NEES takes it: placed by the first pose if need be."""
+    """Return the RMS distance from the true positions as in the NEES: aligned by the first pose if need be."""
     return float(np.sqrt(np.square(body_errors(evaluation).distance_m).mean()))
 
 

@@ -43,7 +43,7 @@ METRICS = (
 _ITERATIONS, _SETTLED_S = 20, 1e-6
 # Pairs that are needed, and their largest distance in median steps: a path is not known across a gap.
 _FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
-# Where less of the velocity (share) is left beside the alignment, a shift in time looks like one in space.
+# If a smaller share of the velocity remains after the alignment, a shift in time cannot be told from one in space.
 _LEAST_LEFT = 0.02
 # An offset is reported from this many standard errors and from a millisecond on; few stamps are more accurate.
 _SIGMAS, _LEAST_S = 5.0, 1e-3
@@ -112,7 +112,7 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
     path = CubicSpline(t_s, true)
     offset_s = 0.0
     for _ in range(_ITERATIONS):
-        # A pair that a step took beyond the ends stays out, lest the fit come and go with it.
+        # A pair that a step moved beyond the ends stays out, so that the fit does not oscillate with it.
         usable &= (t_s + offset_s >= t_s[0]) & (t_s + offset_s <= t_s[-1])
         if usable.sum() < _FEWEST_PAIRS:
             raise Unavailable("no offset within the recording makes the positions fit")
@@ -126,7 +126,7 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
 
 
 class _Rate(NamedTuple):
-    """How fast the estimate's clock runs, its standard error, and the RMS distances with that and without it (m)."""
+    """The rate error of the estimate's clock, its standard error, and the RMS distances with it and without it (m)."""
 
     value: float
     error: float
@@ -135,7 +135,7 @@ class _Rate(NamedTuple):
 
 
 def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:
-    """Return the rate of the estimate's clock; None where it is not determined, or an offset fits nearly as well."""
+    """Return the rate error of the estimate's clock; None if it is not determined, or an offset fits nearly as well."""
     pairs = evaluation.compared
     t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
     usable = _beside_no_gap(t_s)
@@ -158,9 +158,9 @@ def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:
 
 
 def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArray) -> tuple[float, Array, _Linearised]:
-    """Return by how much slower the estimate's clock runs, and the time since the middle (m,) s and errors of pairs.
+    """Return by how much slower the estimate's clock runs, the time since the middle (m,) s, and the errors of pairs.
 
-    Gauss-Newton for offset and rate, over more and more of the pairs (n,); raises Unavailable where it does not settle.
+    Gauss-Newton for offset and rate, over more and more of the pairs (n,); raises Unavailable if it does not converge.
     """
     from scipy.interpolate import CubicSpline  # as above
 
@@ -181,7 +181,7 @@ def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArra
 
 
 def _clock(error_m: Array, jacobian: Array, since_s: Array) -> Array:
-    """Return the steps (2,) of the offset (s) and of the rate that explain errors (n, 3) best, beside any alignment."""
+    """Return the steps (2,) of offset (s) and rate that best explain errors (n, 3), together with any alignment."""
     velocity, aligning = jacobian[:, :, 0], jacobian[:, :, 1:].reshape(-1, 6)
     moved = np.stack([velocity.ravel(), (since_s[:, None] * velocity).ravel()], axis=1)
     left = moved - aligning @ np.linalg.lstsq(aligning, moved, rcond=None)[0]
@@ -192,13 +192,13 @@ def _clock(error_m: Array, jacobian: Array, since_s: Array) -> Array:
 
 
 def _beside_no_gap(t_s: Array) -> BoolArray:
-    """Return which stamps (n,) s are no farther from their neighbours than stamps are as a rule."""
+    """Say which stamps (n,) s are no farther from their neighbours than the usual step allows."""
     wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
     return ~(np.append(wide, False) | np.insert(wide, 0, False))
 
 
 def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Linearised:
-    """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise what is left."""
+    """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise the remaining errors."""
     true, velocity = path(t_s), path(t_s, 1)
     alignment = fit_se3(true, estimated)
     aligned = estimated @ alignment.rotation.T + alignment.translation
@@ -208,7 +208,7 @@ def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Li
 
 
 def _offset_s(error_m: Array, jacobian: Array) -> float:
-    """Return the step of the offset that explains errors (n, 3) best, beside any turn and displacement."""
+    """Return the step of the offset that best explains errors (n, 3), together with any rotation and displacement."""
     velocity, aligning = jacobian[:, :, 0].ravel(), jacobian[:, :, 1:].reshape(-1, 6)
     left = velocity - aligning @ np.linalg.lstsq(aligning, velocity, rcond=None)[0]
     if left @ left <= _LEAST_LEFT**2 * (velocity @ velocity):

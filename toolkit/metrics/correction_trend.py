@@ -1,11 +1,12 @@
-"""Tests whether the corrections of a causal output have a trend: push the state one way for longer than by chance.
+"""Tests whether the corrections of a causal output have a trend: whether they push the state one way beyond chance.
 
 Row errors, a rotated camera, wheel slip or late stamps affect all tracks of a frame alike. Each track is affected so
 little that it passes its gate, and the innovations stay near their covariance while they push the state one way, frame
-after frame. The corrections of a consistent estimator are independent from frame to frame, and their sum over a stretch
-of time has the covariance that they took away (:mod:`toolkit.models.corrections`): its squared length is chi-square
-distributed. A correction is an estimate less the prediction by the measured motion from the estimate before, with the
-noise of the motion that the estimator assumed: the stated one, unless the estimator reports ``motion_noise_scale``.
+after frame. The corrections of a consistent estimator are independent from frame to frame, and the covariance of their
+sum over a stretch of time is the sum of their reductions of the state's covariance (:mod:`toolkit.models.corrections`):
+its squared Mahalanobis length is chi-square distributed. A correction is an estimate less the prediction by the
+measured motion from the estimate before, with the noise of the motion that the estimator assumed: the stated one,
+unless the estimator reports ``motion_noise_scale``.
 """
 
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ TREND, LIMIT = "correction_trend", "correction_trend_limit"
 _STRETCH_S = 1.0
 NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
 # A consistent estimator exceeds half of the limit less than once in a million runs. The other half allows for filters
-# that linearise at estimates which they have since corrected, and so count some information twice. It was chosen by
+# that linearise at estimates which they correct later, and so count some information twice. It was chosen by
 # looking at 36 sound simulated runs of each of three filters, of which one exceeds the limit (docs/metrics.md).
 _BY_CHANCE, _BY_LINEARISATION = 1e-6, 2.0
 METRICS = (
@@ -54,7 +55,7 @@ METRICS = (
 def score(evaluation: Evaluation) -> Scores:
     """Score the corrections of a causal output.
 
-    Raises Unavailable where there are none: no covariance of the whole state, or no second in which any is corrected.
+    Raises Unavailable where there are none: no covariance of the whole state, or no second with a correction.
     """
     tests = [test for test in _tests(evaluation) if test.dof]
     if not tests:
@@ -79,7 +80,7 @@ def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
 
 
 def _noise_scale(evaluation: Evaluation) -> Array | None:
-    """Return how many times its stated variance the run took the noise of the motion up to each row (N,) for."""
+    """Return the factor that the run applied to the stated variance of the motion up to each row (N,)."""
     scale = evaluation.run.info.get("motion_noise_scale")
     return None if scale is None else np.nan_to_num(scale, nan=1.0)
 
@@ -98,7 +99,7 @@ def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:
 
 
 def _answer(before: Belief, trajectory: Trajectory, cov: Array, row: int) -> Belief:
-    """Return a state of the trajectory as a belief; parts that it lacks are those of the prediction."""
+    """Return a state of the trajectory as a belief; parts that it lacks are taken from the prediction."""
     v_world = before.v_world if trajectory.v_world is None else trajectory.v_world[row]
     bias = before.bias if trajectory.bias is None else trajectory.bias[row]
     return Belief(before.layout, trajectory.T_world_imu[row], v_world, bias, cov[row])

@@ -1,7 +1,7 @@
 """The share of the tested measurements that an estimator's outlier gate accepted.
 
 The innovations that pass a gate look consistent however wrong the model is; a wrong model shows in the share that is
-rejected. The gate of a consistent estimator without outliers accepts the share that is its probability.
+rejected. Without outliers, the gate of a consistent estimator accepts a share equal to its probability.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def refuses_much(accepted_percent: float) -> bool:
-    """Say whether a gate refused so many measurements that there are mismatches or the model is wrong."""
+    """Say whether a gate rejected so many measurements that there are mismatches or the model is wrong."""
     return accepted_percent < _LEAST_USUAL_PERCENT
 
 

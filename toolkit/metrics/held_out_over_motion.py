@@ -1,9 +1,9 @@
-"""Held-out reprojection over that of the measured motion alone, track by track: shows whether vision helped.
+"""The ratio of held-out reprojection to that of the measured motion alone, track by track: shows whether vision helped.
 
-An estimator corrects the measured motion by the tracks that it is given. Where it explains withheld tracks worse than
-the motion alone, its corrections were wrong or, in a causal output, jump back and forth by more than they gain,
-whatever its covariance. The motion is integrated from the output's own first state. Errors are paired over the tracks,
-which differ far more from each other than two estimates of one track do.
+An estimator corrects the measured motion by the tracks that it is given. If it predicts withheld tracks worse than the
+motion alone, its corrections were wrong or, in a causal output, jump back and forth by more than they gain, whatever
+its covariance. The motion is integrated from the output's own first state. Errors are paired over the tracks, which
+differ far more from each other than two estimates of one track do.
 """
 
 from typing import NamedTuple
@@ -24,9 +24,9 @@ RATIO, ERROR = "heldout_over_motion", "heldout_over_motion_error"
 _FLOOR_PX = 0.1
 # This many tracks, drawn evenly, give the ratio to a few percent; with fewer than the second number it is not computed.
 _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
-# Vision did harm where a run is worse by the first factor, or by the second in the worst of ten stretches, both by more
-# than this many standard errors. In 365 sound simulated runs the ratio is 1.03 at most with twists, and 2.0 with an
-# IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at them.
+# Vision did harm if a run is worse by the first factor, or by the second in the worst of ten stretches, in both cases
+# by more than this many standard errors. In 365 sound simulated runs the ratio is at most 1.03 with twists, and 2.0
+# with an IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at these runs.
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
 _OF_CAUSAL = ": it revises itself by so much, or follows tracks that are wrong"
@@ -49,16 +49,16 @@ METRICS = (
 
 
 class _Paired(NamedTuple):
-    """Of n tracks the logarithm (n,) of an error over another, and the time (n,) s of their sightings' mean."""
+    """For n tracks the logarithm (n,) of the ratio of two errors, and the mean time (n,) s of their sightings."""
 
     log_ratio: Array
     t_s: Array
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score how many times as far the evaluated poses miss withheld tracks as the measured motion alone does.
+    """Score the ratio of the errors of withheld tracks under the evaluated poses to those under the motion alone.
 
-    Where vision did harm, a remark on the ratio says so, and in which stretch most.
+    If vision did harm, a remark on the ratio says so, and in which stretch most.
     """
     paired = _paired(evaluation)
     ratio, error = _mean(paired.log_ratio)
@@ -70,7 +70,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def _paired(evaluation: Evaluation) -> _Paired:
-    """Return the errors of withheld tracks over those by the measured motion alone."""
+    """Return the ratios of the errors of withheld tracks to those under the measured motion alone."""
     sequence = evaluation.sequence
     motion = _motion_alone(evaluation.estimate, sequence)
     seen, errors_px = evaluation.held_out_errors
@@ -109,14 +109,14 @@ def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
 
 
 def _of_some_tracks(track_ids: IntArray) -> BoolArray:
-    """Say which sightings (N,) are of at most so many tracks, evenly drawn."""
+    """Say which sightings (N,) belong to an even draw of at most ``_MOST_TRACKS`` tracks."""
     ids = np.unique(track_ids)
     some = ids[np.linspace(0, ids.size - 1, min(ids.size, _MOST_TRACKS)).round().astype(int)]
     return np.isin(track_ids, some)
 
 
 def _harm(paired: _Paired, kind: str) -> str:
-    """Say by how much, and in which stretch most, vision did harm; empty where it did not."""
+    """Return by how much, and in which stretch most, vision did harm; empty if it did not."""
     whole, notes = _mean(paired.log_ratio), list[str]()
     if _least(whole) > np.log(MOST_RATIO[kind]):
         ratio = float(np.exp(whole[0]))

@@ -1,8 +1,8 @@
 """Normalised innovation squared: compares the innovations with their stated covariance.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
-An innovation that a chi-square gate lets through is a truncated variable: its sum is divided by the mean of that
-(:func:`toolkit.models.gating.mean_below_bound`), where the estimator reports it, and else by the degrees of freedom.
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4. An
+innovation that passes a chi-square gate is a truncated variable: the sum is divided by the mean of that
+(:func:`toolkit.models.gating.mean_below_bound`) if the estimator reports it, and otherwise by the degrees of freedom.
 """
 
 from toolkit.metrics.parts.consistency import INNOVATIONS_ARE_CAUSAL, nis_over_time

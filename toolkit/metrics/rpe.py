@@ -37,8 +37,8 @@ METRICS = (
     ),
 )
 INTERVAL_M = 100.0
-# A pair may be longer than the interval by this much; else it spans a gap and is left out: 1.5 steps of the matched
-# stamps for the second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as evo does).
+# A pair may exceed the interval by this much; a longer one spans a gap and is left out: 1.5 steps of the matched stamps
+# for one second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as in evo).
 _LATEST_IN_STEPS = 1.5
 _LONGEST_OVER_INTERVAL = 1.1
 
@@ -73,7 +73,7 @@ def _errors_of_a_second(evaluation: AgainstTruth) -> Array:
 
 
 def _one_second(matched: Matched) -> _Intervals:
-    """Pair each stamp with the first one a second later; stamps a rounding error short of it count."""
+    """Pair each stamp with the first one a second later, allowing for rounding of the stamps."""
     latest_ns = NS_PER_S + _LATEST_IN_STEPS * median_period_ns(matched.t_ns)
     intervals = _first_reaching(matched.t_ns, NS_PER_S - STAMP_TOLERANCE_NS, latest_ns)
     if not intervals.first.size:

@@ -21,8 +21,8 @@ _COLLINEAR = 1e-12
 class Alignment:
     """The similarity x -> scale R x + t from the estimate's world to the truth's.
 
-    ``rotation_is_unique`` is False where the positions lie on a line (or in a point): the residual distances
-    are then still the least ones, but any turn about the line gives the same.
+    ``rotation_is_unique`` is False where the positions lie on a line (or in a point): the residual distances are then
+    still the least ones, but any rotation about the line gives the same distances.
     """
 
     rotation: Array
@@ -43,7 +43,7 @@ def place_pose(truth: Array, estimate: Array) -> Alignment:
 
 
 def place_yaw(truth: Array, estimate: Array) -> Alignment:
-    """Make the position of one estimated pose (4, 4) coincide with the true one, its heading as nearly as can be."""
+    """Make the position of an estimated pose (4, 4) coincide with the true one, its heading as nearly as possible."""
     rotation = about_z(_best_yaw(truth[:3, :3] @ estimate[:3, :3].T))
     return Alignment(rotation, truth[:3, 3] - rotation @ estimate[:3, 3])
 

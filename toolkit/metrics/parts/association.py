@@ -64,10 +64,10 @@ def associate(estimate: Trajectory, truth: Truth, frame_period_ns: float) -> Mat
 
 
 def true_poses_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple[BoolArray, Array]:
-    """Return which of the stamps (N,) the truth reaches, and the true poses (n, 4, 4) there, by the rule above.
+    """Return which of the stamps (N,) the truth covers, and the true poses (n, 4, 4) there, by the rule above.
 
-    The same rule with the roles exchanged: here the truth is interpolated, for what is stated about an estimate
-    belongs to the estimate's own stamp.
+    The roles are exchanged: here the truth is interpolated, because a stated covariance belongs to the estimate's own
+    stamp.
     """
     known = finite_poses(truth.T_world_imu)
     if not known.any() or t_ns.size == 0:
@@ -76,7 +76,7 @@ def true_poses_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple
 
 
 def poses_at(t_ns: IntArray, poses: Array, at_ns: IntArray, frame_period_ns: float) -> tuple[BoolArray, Array]:
-    """Return which of the stamps (M,) finite poses (N, 4, 4), N > 0, reach by the rule above, and the poses there."""
+    """Return which of the stamps (M,) finite poses (N, 4, 4), N > 0, cover by the rule above, and the poses there."""
     tolerance_ns = min(STAMP_TOLERANCE_NS, median_period_ns(at_ns) / 4.0) if at_ns.size > 1 else STAMP_TOLERANCE_NS
     after = np.clip(np.searchsorted(t_ns, at_ns), 0, t_ns.size - 1)
     before = np.maximum(after - 1, 0)

@@ -36,8 +36,8 @@ NOT_PLACED = "the estimate has its own world frame, and the truth has no pose fo
 class BodyErrors:
     """T_estimate^-1 T_truth (n, 4, 4) at the estimate's stamps (n,), which are its ``rows`` (n,).
 
-    ``T_world_imu`` (n, 4, 4) are the estimated poses in the truth's world. ``placed`` is True where the estimate has
-    its own world frame and was aligned with the truth's by its first pose.
+    ``T_world_imu`` (n, 4, 4) are the estimated poses in the truth's world. ``placed`` is True if the estimate has its
+    own world frame and was aligned with the truth's by its first pose.
     """
 
     t_ns: IntArray
@@ -66,7 +66,7 @@ class StatedErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Nees:
-    """NEES at stamps (n,) of the pose, the orientation and the position, each (n,) and over its degrees of freedom."""
+    """NEES at stamps (n,) of pose, orientation and position, each (n,) and divided by its degrees of freedom."""
 
     t_ns: IntArray
     pose: Array
@@ -90,12 +90,12 @@ class Nis:
 
     @property
     def mean(self) -> float:
-        """Return the NIS of the whole run over what is expected of it: 1 where the estimator is consistent."""
+        """Return the ratio of the run's NIS to its expectation: 1 if the estimator is consistent."""
         return float(self.nis.sum() / self.expected.sum())
 
     @property
     def independent_dof(self) -> float:
-        """Return the degrees of freedom of a chi-square variable that scatters, over them, at least as the mean does.
+        """Return the degrees of freedom of a chi-square variable whose relative scatter is at least that of the mean.
 
         Frames are independent in a consistent filter. The innovations of one frame share the error of its pose: in the
         worst case they are one innovation of a stereo sighting, of three degrees of freedom.
@@ -104,12 +104,12 @@ class Nis:
         return float(1.0 / np.sum(weights**2 / np.minimum(self.dof, SIGHTING_DOF)))
 
     def bands(self) -> tuple[Array, Array]:
-        """Return the two-sided 95 % band (n,), (n,) of each frame's ``nis`` over its expectation.
+        """Return the two-sided 95 % band (n,), (n,) of each frame's ``nis`` divided by its expectation.
 
-        A gate makes the sum of a frame's innovations scatter less than chi-square, the error of the pose that they
-        share makes it scatter more: on simulated drives 1.3 and 0.7 times the degrees of freedom. Frames are
-        independent in a consistent filter, so the scatter is estimated from the changes of the run from frame to frame,
-        which a constant excess does not affect. With few frames it is that of chi-square.
+        A gate makes the sum of a frame's innovations scatter less than chi-square; their shared pose error makes it
+        scatter more: on simulated drives 1.3 and 0.7 times the degrees of freedom. Frames are independent in a
+        consistent filter, so the scatter is estimated from the changes of the run from frame to frame, which a constant
+        excess does not affect. With few frames it is that of chi-square.
         """
         dof = np.asarray(self.dof, dtype=float)
         change = np.abs(np.diff((self.nis / self.expected - 1.0) * np.sqrt(dof)))
@@ -131,9 +131,9 @@ def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:
 
 
 def nis_over_time(evaluation: Evaluation) -> Nis:
-    """Return the innovations a causal output reports, with what is expected of them.
+    """Return the innovations a causal output reports, with their expected sums.
 
-    An estimator that reports no ``nis_expected`` is taken to have no gate. Raises Unavailable where it reports none.
+    An estimator that reports no ``nis_expected`` is assumed to have no gate. Raises Unavailable where it reports none.
     """
     info = evaluation.run.info
     if evaluation.output != "causal" or evaluation.run.causal is None:
@@ -162,9 +162,9 @@ def chi2_quantile(probability: float, dof: float | Array) -> float | Array:
 def body_errors(evaluation: Evaluation) -> BodyErrors:
     """Return the errors of the evaluated estimate in the body frame, wherever the truth has a pose.
 
-    In the truth's world frame without any alignment, if the sequence has a prior in that frame, as a simulated one
-    has. Otherwise every estimator starts in a frame of its own and is placed by its first pose, as for
-    ``ate_none_m``: only what the start fixes without measuring it is aligned. Raises Unavailable without truth, or
+    In the truth's world frame without any alignment, if the sequence has a prior in that frame, as a simulated one has.
+    Otherwise every estimator starts in a frame of its own and is placed by its first pose, as for ``ate_none_m``: only
+    the degrees of freedom that the start fixes without measuring them are aligned. Raises Unavailable without truth, or
     where the truth begins after the estimate, for then there is no first pose to place.
     """
     truth, estimate = evaluation.sequence.truth, evaluation.estimate
@@ -186,7 +186,7 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
 
 
 def starts_in_the_truths_world(sequence: Sequence) -> bool:
-    """Say whether the sequence's own prior agrees with its truth within the covariance it states."""
+    """Say whether the sequence's own prior agrees with its truth within its stated covariance."""
     truth, prior = sequence.truth, sequence.prior
     if truth is None or prior is None:
         return False

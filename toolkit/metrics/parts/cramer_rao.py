@@ -48,8 +48,9 @@ _EXACT = (0.8, 1.25)
 class Efficient:
     """The bound at every frame (K, d, d), and the errors (K, d) of the efficient estimate.
 
-    In the order and on the side of an Estimate's covariance; an error is the difference from the estimate to the
-    truth."""
+    Both have the order and the side of an Estimate's covariance; an error is the difference from the estimate to the
+    truth.
+    """
 
     layout: Layout
     covs: Array
@@ -58,11 +59,11 @@ class Efficient:
 
 @lru_cache(maxsize=2)
 def efficient(sequence: Sequence, output: Output) -> Efficient:
-    """Return the efficient estimate of a sequence: from what is known at each frame, or from all of it.
+    """Return the efficient estimate of a sequence: from the measurements up to each frame, or from all of them.
 
     It starts as the estimators do: with the prior that was drawn for a simulation, or with the start from another
-    sequence's measurements, placed at the first pose. Raises Unavailable where the truth lacks what the state has, or
-    is not exact.
+    sequence's measurements, placed at the first pose. Raises Unavailable if the truth lacks a part of the state, or is
+    not exact.
     """
     return _efficient(_problem_at_truth(sequence), output)
 
@@ -173,7 +174,7 @@ def _motion_chi_square(problem: _Problem) -> float:
 def _without_mismatches(
     packets: tuple[Packet, ...], poses: Array, rig: StereoRig
 ) -> tuple[tuple[Packet, ...], IntArray, Array]:
-    """Return the packets without sightings that chance does not explain, and the landmarks (M,), (M, 3) of the rest."""
+    """Return the packets without mismatched sightings, and the landmarks (M,), (M, 3) of the rest."""
     kept = _placed_by_stereo(packets)
     for _ in range(2):
         track_ids, points = _landmarks(kept, poses, rig)
@@ -183,7 +184,7 @@ def _without_mismatches(
 
 
 def _placed_by_stereo(packets: tuple[Packet, ...]) -> tuple[Packet, ...]:
-    """Return the packets without the sightings by the left image alone of tracks that no pair has shown before."""
+    """Return the packets without left-only sightings of tracks that both images have not shown before."""
     if not any(is_left_only(packet.frame.uvs_px).any() for packet in packets):
         return packets
     placed, kept = np.empty(0, dtype=np.int64), []
@@ -203,7 +204,7 @@ def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Arr
 
 
 def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tuple[IntArray, Array]:
-    """Return the tracks (M,) and the points (M, 3) that explain their sightings from the true poses best."""
+    """Return the tracks (M,) and the points (M, 3) that best explain their sightings from the true poses."""
     frames = [packet.frame for packet in packets]
     ids, uvs_px = np.concatenate([f.track_ids for f in frames]), np.concatenate([f.uvs_px for f in frames])
     pose = np.repeat(np.arange(len(frames)), [f.track_ids.size for f in frames])
@@ -224,7 +225,7 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
 
 
 def _causal(problem: _Problem) -> Efficient:
-    """Carry the information of state and landmarks forward; a landmark leaves it with its last sighting."""
+    """Propagate the information of state and landmarks; a landmark is marginalised after its last sighting."""
     last_seen = np.zeros(problem.track_ids.size, dtype=np.int64)
     for packet in problem.packets:
         last_seen[problem.rows(packet.frame)] = packet.index
@@ -260,7 +261,7 @@ class _Information:
         # Linearised at the true end, not at the predicted one, so that unobservable directions gain no information.
         at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
         transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
-        # The measured motion says that the next state's offset is F x + r, but for its noise.
+        # By the measured motion the next state's offset is F x + r plus noise.
         r = now.error_to(before.predicted(prediction))
         weighted = transition.T @ precision
         to_next = np.concatenate([-weighted, self._matrix[:d, d:]], axis=1)
@@ -293,7 +294,7 @@ class _Information:
         return 0.5 * (cov + cov.T), cov @ (self._vector[:d] - self._matrix[:d, d:] @ inner[:, d])
 
     def forget(self, gone: BoolArray) -> None:
-        """Marginalise landmarks that are not seen again: ``gone`` (M,) of the problem's."""
+        """Marginalise landmarks that are not seen again: ``gone`` (M,) masks the problem's landmarks."""
         leaving = gone[self._landmarks]
         if not leaving.any():
             return

@@ -1,13 +1,13 @@
 """Predict every sighting of a track from the track's other sightings, for known camera poses.
 
 A track's point is q = (a, b, r): x = a z, y = b z, z = 1 / r in the left camera of the track's last view (inverse
-depth; Civera, Davison and Montiel 2008). With it every measurement of every view is a ratio of two functions
-linear in q, points at infinity (no disparity) are as good as any other, and a Gauss-Newton step reaches far.
+depth; Civera, Davison and Montiel 2008). With it every measurement of every view is a ratio of two functions linear in
+q, points at infinity (no disparity) need no special treatment, and Gauss-Newton converges from far away.
 
-One robust solution a track comes first: Levenberg-Marquardt on all of its views, Huber's weights. Leaving view i
-out then subtracts its share from the normal equations and takes one Gauss-Newton step,
-(H - H_i) d = -(g - g_i). That is linear in the number of sightings, but view i still influences the weights, so
-tracks of at most 40 views are solved again from there without view i; in a longer one its influence is negligible.
+Each track is first solved robustly: Levenberg-Marquardt on all of its views with Huber's weights. Leaving view i out
+then means subtracting its share from the normal equations and taking one Gauss-Newton step, (H - H_i) d = -(g - g_i).
+That is linear in the number of sightings, but view i still influences the weights, so tracks of at most 40 views are
+solved again from there without view i; in a longer one its influence is negligible.
 """
 
 from collections.abc import Iterator
@@ -58,8 +58,8 @@ class _Projections(NamedTuple):
 class Views:
     """The views of M tracks, N in all, sorted by track, which map a track's point to measurements.
 
-    ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. ``linear`` (3, 3, N) and ``constant`` (3, N) make
-    of a track's point r times the point in the view's camera, linear @ q + constant. ``uv_px`` (3, N) was measured.
+    ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. ``linear`` (3, 3, N) and ``constant`` (3, N) map
+    a track's point to r times the point in the view's camera, linear @ q + constant. ``uv_px`` (3, N) was measured.
     ``sqrt_information`` (3, 3), or one each (3, 3, N), whitens. Views are the last axis, because arithmetic on whole
     rows takes a third of the time of products of small matrices.
     """
@@ -82,7 +82,7 @@ class Views:
         return _Projections(ratio, inverse_depth, depth > 0.0)
 
     def pixels(self, seen: _Projections) -> Array:
-        """Return the pixels (3, N) of what is seen."""
+        """Return the pixels (3, N) of projections."""
         return np.asarray(self._focal_px * seen.ratio + self._centre_px)
 
     def predict(self, points: Array) -> PredictedSightings:
@@ -155,12 +155,12 @@ class Views:
         return replace(self, track=np.repeat(np.arange(rows.size), count), first=first, **per_view)
 
     def summed(self, shares: Array) -> Array:
-        """Add up the views' shares (..., N) to one a track (..., M)."""
+        """Sum the views' shares (..., N) to one per track (..., M)."""
         return np.add.reduceat(shares, self.first, axis=-1)
 
 
 def _dot(first: Array, second: Array) -> Array:
-    """Return the sum of products over the first of the axes, of three."""
+    """Return the sum of products over the first axis, of length three."""
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
@@ -198,7 +198,7 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
 
 
 def _in_parts(rows: IntArray, others: IntArray) -> Iterator[IntArray]:
-    """Yield the rows (n,), so many at a time that their numbers of other views (n,) add up to the most of a part."""
+    """Yield the rows (n,) in parts whose total number of other views (n,) is at most ``_VIEWS_AT_A_TIME``."""
     part = np.cumsum(others) // _VIEWS_AT_A_TIME
     yield from (of_part for of_part in np.split(rows, np.flatnonzero(np.diff(part)) + 1) if of_part.size)
 
@@ -233,7 +233,7 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
 
 
 def _start(views: Views, T_last_view: Array, rig: StereoRig) -> Array:
-    """Start each track (3, M) at the median, by component, of what its views see in stereo one by one."""
+    """Return the initial point of each track (3, M): the median, by component, of its views' stereo points."""
     u_left_px, u_right_px, v_px = views.uv_px
     ray = np.stack([(u_left_px - rig.cx_px) / rig.fx_px, (v_px - rig.cy_px) / rig.fy_px], axis=1)
     inverse_depth = (u_left_px - u_right_px) / (rig.fx_px * rig.baseline_m)
@@ -244,7 +244,7 @@ def _start(views: Views, T_last_view: Array, rig: StereoRig) -> Array:
 
 
 def _median_by_track(views: Views, values: Array) -> Array:
-    """Return the lower median (M,) of values (N,) over each track's views, those apart that are NaN."""
+    """Return the lower median (M,) of values (N,) over each track's views, NaN left out."""
     order, known = np.lexsort((values, views.track)), np.add.reduceat((~np.isnan(values)).astype(np.int64), views.first)
     median: Array = values[order][views.first + np.maximum(known - 1, 0) // 2]
     return np.where(np.isfinite(median), median, 0.0)

@@ -61,7 +61,8 @@ def pixel_metrics(
 ) -> tuple[Metric, Metric]:
     """Declare PREFIX_median_px and PREFIX_rmse_px of an error (N,) px, which :func:`pixel_scores` scores.
 
-    ``whose`` tells it from other reprojection errors in a word; the rest is how the median is shown (:class:`Metric`).
+    ``whose`` is a word that distinguishes it from other reprojection errors; the other arguments say how the median is
+    shown (:class:`Metric`).
     """
     median = Metric(
         f"{prefix}_median_px",
@@ -82,8 +83,8 @@ def pixel_metrics(
 def pixel_scores(prefix: str, errors_px: Array, observation_count: int, why_left_out: str) -> Scores:
     """Score the median and the root mean square of errors (N,) px, as the metrics PREFIX_median_px and PREFIX_rmse_px.
 
-    A remark says how many of the observations were scored, why others were not, and how many of those stand at the cap.
-    Raises Unavailable where there are none.
+    A remark says how many of the observations were scored, why others were not, and how many of the scored ones are at
+    the cap. Raises Unavailable where there are none.
     """
     if not errors_px.size:
         raise Unavailable("no observation could be reprojected")

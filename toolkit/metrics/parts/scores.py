@@ -1,4 +1,4 @@
-"""What a metric file declares, a record for each metric, and what it returns: a number, or why there is none."""
+"""The declaration of a metric, a record for each, and the result of a metric file: numbers, or the reasons for none."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -15,12 +15,12 @@ InTable = Literal["always", "where rows differ", "on request"]
 class Metric:
     """One metric: what it means and how every table, file and page shows it.
 
-    ``meaning`` is one line with the unit; ``unit`` is as it stands in a table, "1" for a ratio and "" for a count.
-    ``heading`` are the two lines above its column, ``name`` the same in one line where it is not given. ``best`` is
-    which value is best: the least, the most, the one nearest 1, or none that is. ``table`` is when the table of a
-    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one.
-    ``in_contract`` marks the keys that every ``vislam.metrics/1`` document has; it counts for the toolkit's own
-    metrics only. ``gate_name`` is what the accuracy gate calls it, "" where the gate does not test it.
+    ``meaning`` is one line with the unit; ``unit`` is the unit as written in a table, "1" for a ratio and "" for a
+    count. ``heading`` are the two lines above its column, ``name`` the same in one line where it is not given. ``best``
+    says which value is best: the least, the most, the one nearest 1, or "" for none. ``table`` is when the table of a
+    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one. ``in_contract``
+    marks the keys that every ``vislam.metrics/1`` document has; it counts for the toolkit's own metrics only.
+    ``gate_name`` is what the accuracy gate calls it, "" where the gate does not test it.
     """
 
     key: str
@@ -89,7 +89,7 @@ class Scores:
 
 
 def evaluate(metrics: Mapping[str, Callable[[], float]]) -> Scores:
-    """Compute each metric by itself, so that one that is unavailable leaves the others their values."""
+    """Compute each metric separately, so that an unavailable one does not affect the others."""
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
     for key, compute in metrics.items():

@@ -1,7 +1,7 @@
 """The error of the whole stated state: pose, velocity and biases in the order of an Estimate's covariance.
 
 Every error is the motion, or the difference, from the estimate to the truth, in the body frame. This is not in
-``consistency`` because its layouts need GTSAM, which the evaluation of trajectory files does without.
+``consistency`` because its layouts need GTSAM, which the evaluation of trajectory files does not import.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _LAYOUTS = {layout.size: layout for layout in (IMU_LAYOUT, TWIST_LAYOUT)}
 
 
 def layout_of(stated: StatedErrors) -> Layout:
-    """Return where the blocks of the stated covariance stand; raise Unavailable where it is that of the pose alone."""
+    """Return the layout of the stated covariance; raise Unavailable if it is that of the pose alone."""
     layout = _LAYOUTS.get(stated.cov.shape[-1])
     if layout is None:
         raise Unavailable("the covariance is that of the pose alone")
@@ -27,7 +27,7 @@ def layout_of(stated: StatedErrors) -> Layout:
 
 
 def state_errors(evaluation: Evaluation, stated: StatedErrors) -> Array:
-    """Return the errors (n, d) of the whole state. Raises Unavailable where a block or its truth is lacking."""
+    """Return the errors (n, d) of the whole state. Raises Unavailable if a block or its truth is missing."""
     layout = layout_of(stated)
     errors = np.zeros((len(stated.cov), layout.size))
     errors[:, POSE] = se3_log(stated.errors.T_estimate_truth)
