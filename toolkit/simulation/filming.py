@@ -1,7 +1,7 @@
 """A simulated recording as stereo images of a pair of cameras, in the layout of EuRoC's recordings.
 
-Motion, IMU and truth are those of the scenario under the same seed: only the tracks are not simulated but have to be
-made by a front end. The seed also draws the noise of each image.
+Motion, IMU and truth are those of the scenario under the same seed. Tracks are not simulated: a front end has to make
+them from the images. The seed also draws the noise of each image.
 
 Errors of tracks made of the images measure the accuracy of a front end, in pixels. The ray of a track's first sighting,
 from the true pose, meets a point of the hall; every later sighting of the track should be where that point is. Tracks
@@ -39,8 +39,8 @@ ABOUT, SCHEMA = "simulation.json", "vislam.simulation/1"
 _CAMERAS = ("cam0", "cam1")
 _PAIR_GB = 4e-4
 _TRUTH = "state_groundtruth_estimate0"
-_IMAGES_STREAM = 5  # of the seed; simulate() has the first five
-# Automatic exposure: the gain of both images oscillates by a share over some seconds; the right image is brighter.
+_IMAGES_STREAM = 5  # stream of random numbers of a seed; simulate() uses the first five
+# Automatic exposure: the gain of both images oscillates by a share, with a period (s); the right image is brighter.
 _SWING, _SWING_S, _RIGHT_GAIN = 0.12, 7.0, 1.04
 _SHOTS = 5  # in an exposure that blurs
 # Imperfect mounting of a pair with lenses: the rotation of the right camera against the left one (rad).
@@ -57,14 +57,14 @@ _EUROC_NAMES: dict[LensModel, str] = {
     "radtan": "radial-tangential",
     "equidistant": "equidistant",
 }
-# From a median absolute deviation, which mismatches do not move, to the sigma of a normal variable.
+# Ratio of a normal variable's sigma to its median absolute deviation, which mismatches do not change.
 _TO_SIGMA = 1.4826
 _MISMATCH_PX = 3.0
 
 
 @dataclass(frozen=True)
 class Filming:
-    """How images are taken: lenses, the time of an exposure (s, 0: no blur), and how many crates fly about."""
+    """How images are taken: lenses, exposure time (s, 0: no blur), and the number of flying crates."""
 
     lens: LensModel = "none"
     exposure_s: float = 0.0
@@ -90,12 +90,12 @@ def check_filmable(scenario: Scenario, directory: Path) -> None:
 
 
 def pair_count(scenario: Scenario) -> int:
-    """Return how many pairs the images of a scenario are."""
+    """Return the number of image pairs of a scenario."""
     return int(scenario.duration_s * scenario.camera.rate_hz) + 1
 
 
 def size_gb(scenario: Scenario) -> float:
-    """Return about how much room the images of a scenario take."""
+    """Return the approximate size of a scenario's images (GB)."""
     return _PAIR_GB * pair_count(scenario)
 
 
@@ -124,7 +124,7 @@ def film(
 
 
 def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Progress) -> None:
-    """Write all images, some at a time."""
+    """Write all images, several at a time."""
     done = count(1)
 
     def shoot(k: int) -> None:
@@ -145,14 +145,14 @@ def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Prog
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two cameras: lenses, and where they are mounted (4, 4)."""
+    """Two cameras: their lenses and mounting poses (4, 4)."""
 
     lenses: tuple[Lens, Lens]
     T_imu_cams: tuple[Array, Array]
 
     @classmethod
     def of(cls, scenario: Scenario, model: LensModel) -> "_Pair":
-        """Return the cameras of a scenario: its rectified pair, or lenses, whose right one looks a little aside."""
+        """Return the cameras of a scenario: its rectified pair, or two with lenses, the right one slightly rotated."""
         rig, coefficients = scenario.rig, np.array(_COEFFICIENTS[model])
         scale = _FISHEYE_FOCAL if model == "equidistant" else 1.0
         pinhole_px = (scale * rig.fx_px, scale * rig.fy_px, rig.cx_px, rig.cy_px)
@@ -166,7 +166,7 @@ def _right_of(rig: StereoRig, turned: Array) -> Array:
 
 
 class _Crew:
-    """Takes any image of a recording, in any order: each has its noise from a stream of its own."""
+    """Takes any image of a recording, in any order: each has a random stream of its own for its noise."""
 
     def __init__(
         self, trajectory: SmoothTrajectory, surfaces: Surfaces, pair: _Pair, filming: Filming, seed: int
@@ -200,7 +200,7 @@ class _Crew:
 
 
 def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Path) -> None:
-    """Write everything of a folder but its images."""
+    """Write all files of a folder except its images."""
     stamps = sequence.frames_t_ns.tolist()
     names = "".join(f"{t},{t}.png\n" for t in stamps)
     for camera, lens, T_imu_cam in zip(_CAMERAS, pair.lenses, pair.T_imu_cams, strict=True):
@@ -274,7 +274,7 @@ def is_simulated(root: Path) -> bool:
 
 
 def _written_by_us(directory: Path) -> frozenset[str]:
-    """Return the names a folder of ours has; of a folder without our mark, which may be a real recording, none."""
+    """Return the file names of a folder that was written here; none without its mark, as it may be a real recording."""
     if not is_simulated(directory):
         return frozenset()
     tables = [f"mav0/{sensor}/{name}" for sensor in (*_CAMERAS, "imu0", _TRUTH) for name in ("data.csv", "sensor.yaml")]
@@ -293,7 +293,7 @@ def _written_by_us(directory: Path) -> frozenset[str]:
 
 
 def errors_px(sequence: Sequence) -> Array:
-    """Return by how much each sighting (N, 3) px is off; NaN where the frame has no truth or the ray meets nothing."""
+    """Return the error of each sighting (N, 3) px; NaN where the frame has no truth or the ray meets nothing."""
     truth, seen, rig = sequence.truth, sequence.observations, sequence.rig
     if truth is None:
         return np.full((len(seen), 3), np.nan)
@@ -313,7 +313,7 @@ def errors_px(sequence: Sequence) -> Array:
 
 
 def _met(T_world_cam: Array, rays: Array) -> Array:
-    """Return the points (M, 3) of the hall that rays (M, 3), each of a camera of its own (M, 4, 4), meet first."""
+    """Return the points (M, 3) of the hall that rays (M, 3), each from its own camera (M, 4, 4), meet first."""
     origin, towards = T_world_cam[:, :3, 3], (T_world_cam[:, :3, :3] @ rays[:, :, None])[..., 0]
     nearest = np.full(len(rays), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -329,7 +329,7 @@ def _met(T_world_cam: Array, rays: Array) -> Array:
 
 
 def with_scene_errors(sequence: Sequence) -> Sequence:
-    """Return the sequence, made of rendered images, with a fact that says how far its tracks are off."""
+    """Return the sequence, made of rendered images, with the size of its tracks' errors as a fact."""
     off_px = errors_px(sequence)
     off_px = off_px[np.isfinite(off_px).all(axis=1)]
     if not len(off_px):

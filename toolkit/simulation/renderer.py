@@ -25,7 +25,7 @@ _OPTICS_PX = 0.6
 class Lens:
     """A camera: (fx, fy, cx, cy) px, the model and coefficients (n,) of its distortion, and (width, height) px.
 
-    Models as OpenCV and Kalibr have them: radial-tangential (Brown 1966), equidistant (Kannala & Brandt 2006).
+    Models as in OpenCV and Kalibr: radial-tangential (Brown 1966), equidistant (Kannala & Brandt 2006).
     """
 
     pinhole_px: tuple[float, float, float, float]
@@ -135,9 +135,9 @@ def _cut(
     rays: tuple[Floats, Floats],
     T_panel_cam: Floats,
 ) -> None:
-    """Cut a part of the rays with a panel, and keep it where it is nearer than what is there.
+    """Intersect a part of the rays with a panel, and keep the panel where it is nearer than the earlier hits.
 
-    Inverse depth, and places in the panel times that, are linear in the ray: no pixel needs a division.
+    Inverse depth, and positions in the panel times that, are linear in the ray: no pixel needs a division.
     """
     x, y = rays
     directions = T_panel_cam[:3, :3]
@@ -176,7 +176,7 @@ def _looked_up(panels: Sequence[Panel], hits: _Hits, focal_heights: Floats) -> F
 
 
 def _at_level(kept: Atlas, level: Floats, u: Floats, v: Floats, column: Floats) -> Floats:
-    """Return the textures at places in texels of the finest level, as a level of each shows them."""
+    """Return the textures at positions in texels of the finest level, each read from one level."""
     import cv2
 
     level_index = level.astype(np.intp)
@@ -214,7 +214,7 @@ class Sensor:
 
 
 def exposed(shot: Callable[[float], Floats], t_s: float, exposure_s: float, shots: int) -> Floats:
-    """Return the mean light over an exposure about a time, of so many shots: motion blurs it."""
+    """Return the mean light over an exposure about a time, from ``shots`` instants: motion blur."""
     if exposure_s == 0.0:
         return shot(t_s)
     times_s = t_s + exposure_s * ((np.arange(shots) + 0.5) / shots - 0.5)

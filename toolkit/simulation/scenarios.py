@@ -1,12 +1,12 @@
 """The simulated recordings: `drive` (a car, twist or IMU) and `flight` (hand-held or aerial, IMU).
 
-Both also as `-realistic`, with tracks whose errors are correlated as those of real trackers do (docs/tracks.md).
+Both also exist as `-realistic`, with tracks whose errors are correlated like those of real trackers (docs/tracks.md).
 
-Trajectory and landmarks belong to the scenario; the seed draws the prior's error, the biases, all noise,
-the chance ends of tracks and the outliers, each from a stream of its own, and other ones for every scenario: two
-scenarios under one seed are independent draws. Repeating a scenario over seeds is therefore a Monte-Carlo experiment
-about noise, as a consistency test needs (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and
-Navigation", 2001, section 5.4). Where the world varies, the seed draws trajectory and landmarks too.
+Trajectory and landmarks belong to the scenario; the seed draws the prior's error, the biases, all noise, the random
+ends of tracks and the outliers. Each has a stream of its own, which differs between scenarios: two scenarios under one
+seed are independent draws. Repeating a scenario over seeds is therefore a Monte-Carlo experiment about noise, as a
+consistency test needs (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+section 5.4). Where the world varies, the seed draws trajectory and landmarks too.
 """
 
 from dataclasses import dataclass, field, replace
@@ -39,15 +39,15 @@ _UNUSED_ACCEL_BIAS_SIGMA = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """Everything about a simulated recording but its seed.
+    """Everything about a simulated recording except its seed.
 
     ``scene`` builds the trajectory and the world for a duration; ``varied`` lets every seed draw its own.
     ``noise_scale`` multiplies every drawn error (pixels, motion, biases, prior) and leaves the stated noise as it is,
     so that 0 gives exact measurements with a noise for estimators to assume. ``has_surfaces`` says that its world has
-    not only landmarks and can be filmed (:mod:`~toolkit.simulation.filming`). Where there is a ``track_noise``, the
-    errors of tracks are drawn from it and not from the rig's covariance, which is what a data sheet would state; a
+    surfaces besides landmarks and can be filmed (:mod:`~toolkit.simulation.filming`). With a ``track_noise``, the
+    errors of tracks are drawn from it instead of the rig's covariance, which then is what a data sheet would state; a
     ``slip_share`` of the tracks slips to another point and stays there. An audit of the first ``audited_s`` seconds,
-    where that is known, decides every fault as an audit of the whole does.
+    where that is known, decides every fault as an audit of the whole recording does.
     """
 
     name: str
@@ -66,10 +66,10 @@ class Scenario:
 
 
 def noise_free(scenario: Scenario) -> Scenario:
-    """Return the scenario with exact measurements, an exact prior and, where there is an IMU, 1 kHz of it.
+    """Return the scenario with exact measurements, an exact prior and, where there is an IMU, a rate of 1 kHz.
 
-    Exact IMU samples are instantaneous, so their integral is exact only in the limit: the midpoint rule errs
-    by the square of the sample interval.
+    Exact IMU samples are instantaneous, so their integral is exact only in the limit: the error of the midpoint rule is
+    proportional to the square of the sample interval.
     """
     exact = replace(
         scenario, noise_scale=0.0, slip_share=0.0, camera=replace(scenario.camera, step_px=0.0, outlier_rate=0.0)
@@ -78,12 +78,12 @@ def noise_free(scenario: Scenario) -> Scenario:
 
 
 def _number(name: str) -> int:
-    """Return the number of a name that goes into the seeds: 0 for drive, whose draws depend on the seed alone."""
+    """Return the number by which a name enters the seeds: 0 for drive, whose draws depend on the seed alone."""
     return crc32(name.encode()) ^ crc32(b"drive")
 
 
 def simulate(scenario: Scenario, seed: int) -> Sequence:
-    """Return the recording of a scenario under one seed; the same arguments give the same bits.
+    """Return the recording of a scenario under one seed; equal arguments give bit-identical recordings.
 
     Raises SettingsError for a duration that gives no two frames, or more than an hour.
     """
@@ -178,7 +178,7 @@ def _at_frames(measured: MotionMeasurements, frames_t_ns: IntArray) -> Array:
 
 
 def _prior(scenario: Scenario, motion: Kinematics, rng: np.random.Generator) -> Prior:
-    """Return a prior whose error is drawn from its own covariance; the biases' is in the sensor already."""
+    """Return a prior whose error is drawn from its own covariance; the biases' error is already in the sensor."""
     sensor = scenario.motion
     if isinstance(sensor, Imu):
         bias_sigma = sensor.bias_sigma
@@ -248,8 +248,9 @@ _WHEEL_ODOMETER = Odometer(
 _CAR_IMU = Imu(100.0, ImuNoise(5e-3, 5e-4, 5e-4, 1e-5), bias_sigma=np.repeat([0.02, 3e-4], 3))
 _EUROC_IMU = Imu(200.0, ImuNoise(2e-3, 1.7e-4, 3e-3, 1.9e-5), bias_sigma=np.repeat([0.02, 5e-4], 3))
 
-# Audited seconds: over eight seeds no more is undecided after them than after all 60. Undecided stay the camera's place
-# on `drive` (under one seed, and under six of the whole) and on `drive-imu`, and vision's scale beside an IMU.
+# Audited seconds: over eight seeds no more faults are undecided after them than after all 60. Undecided remain the
+# camera's position on `drive` (under one seed, and with the whole recording under six) and on `drive-imu`, and vision's
+# scale with an IMU.
 DRIVE = Scenario(
     name="drive",
     scene=road,
@@ -269,7 +270,7 @@ FLIGHT = Scenario(
     has_surfaces=True,
     audited_s=20.0,
 )
-# What the fit finds on real drives and on EuRoC's images, and what their tracks are like (docs/tracks.md).
+# Track noise fitted to real drives and to EuRoC's images, and the length of their tracks (docs/tracks.md).
 DRIVE_REALISTIC = replace(
     DRIVE,
     name="drive-realistic",

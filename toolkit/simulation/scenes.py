@@ -44,7 +44,7 @@ class Scene:
 
 
 class SceneOf(Protocol):
-    """Makes a scene that lasts so long: always the same one, or one drawn from random numbers."""
+    """Makes a scene of a given duration: always the same one, or one drawn from random numbers."""
 
     def __call__(self, duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
         """Return the scene."""
@@ -124,12 +124,12 @@ def hall(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
 
 
 def _landmark_rng(drawn: np.random.Generator | None) -> np.random.Generator:
-    """Return the stream that landmarks come from: always the same one where the scene is not drawn."""
+    """Return the random stream of the landmarks: always the same one if the scene is not drawn."""
     return np.random.default_rng(_WORLD_SEED) if drawn is None else drawn
 
 
 def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:
-    """Return a time base that reaches from 0 to ``reach_s`` and a little on, and its control points' times."""
+    """Return a time base from 0 to a little beyond ``reach_s``, and the times of its control points."""
     before = ORDER // 2
     count = int(np.ceil(reach_s / step_s)) + 2 * before + 3
     start_s = -before * step_s

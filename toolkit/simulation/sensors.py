@@ -1,7 +1,7 @@
 """Sensor measurements of the exact motion: stereo pixels, body twists and IMU samples with known noise.
 
-Continuous densities have Kalibr's names and units; a sample of white noise over dt has the standard deviation
-density / sqrt(dt), a step of a walk over dt has density * sqrt(dt) (Furgale et al., "Kalibr", IMU noise model).
+Continuous densities have Kalibr's names and units; a sample of white noise over dt has the standard deviation density /
+sqrt(dt), a step of a random walk over dt has density * sqrt(dt) (Furgale et al., "Kalibr", IMU noise model).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from toolkit.track_noise import CHANNELS, TrackNoise
 
 @dataclass(frozen=True, eq=False)
 class Odometer:
-    """Body twists at the frame stamps: noise, and the standard deviation (3,) rad/s of the bias it starts with."""
+    """Body twists at the frame stamps: noise, and the standard deviation (3,) rad/s of the initial gyro bias."""
 
     noise: TwistNoise
     gyro_bias_sigma: Array
@@ -28,7 +28,7 @@ class Odometer:
 
 @dataclass(frozen=True, eq=False)
 class Imu:
-    """Raw IMU samples: rate, noise, and the standard deviation (6,) of the bias [accel, gyro] it starts with."""
+    """Raw IMU samples: rate, noise, and the standard deviation (6,) of the initial bias [accel, gyro]."""
 
     rate_hz: float
     noise: ImuNoise
@@ -37,7 +37,7 @@ class Imu:
 
 @dataclass(frozen=True, eq=False)
 class MotionMeasurements:
-    """Motion samples and the bias (S, 6), [accel, gyro], that is in each of them."""
+    """Motion samples and the bias (S, 6), [accel, gyro], contained in each of them."""
 
     samples: MotionSamples
     bias: Array
@@ -51,11 +51,11 @@ def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class ImuStamps:
-    """Stamps (S,) of IMU samples and that of the trajectory's 0 s.
+    """Stamps (S,) of IMU samples, and the stamp of the trajectory's time 0 s.
 
-    They are the middles of the IMU's intervals, from one before the start of a recording to one after its end. Frames
-    stand between two intervals then, and no sample informs both sides of a frame: what two intervals between frames
-    measure errs independently, as every estimator assumes.
+    They are the midpoints of the IMU's intervals, from one before the start of a recording to one after its end. Each
+    frame then lies between two intervals, and no sample is used on both sides of a frame: the measurements between
+    successive pairs of frames have independent errors, as every estimator assumes.
     """
 
     t_ns: IntArray
@@ -78,7 +78,7 @@ def sightings(tracks: Tracks, points: Array, T_world_imu: Array, rig: StereoRig)
 def with_pixel_noise(
     exact: Observations, scale: float, cov_uv_px2: Array, step_px: float, rng: np.random.Generator
 ) -> Observations:
-    """Add noise of the covariance (3, 3) px^2, its standard deviations scaled, and round to the step (0: not)."""
+    """Add noise of the covariance (3, 3) px^2, its standard deviations scaled, and round to the step (0: none)."""
     spread = scale * np.linalg.cholesky(cov_uv_px2)
     noisy_px = exact.uv_px + rng.standard_normal((len(exact), 3)) @ spread.T
     if step_px > 0.0:
@@ -87,9 +87,9 @@ def with_pixel_noise(
 
 
 def with_track_noise(clean: Observations, noise: TrackNoise, rng: np.random.Generator) -> Observations:
-    """Add to every track white noise, a walk from its first sighting on and an offset, in mean column, disparity, row.
+    """Add white noise, a random walk from the first sighting on and an offset to every track, in c, d, v.
 
-    Frames in which a track is not seen count for its walk as well.
+    These are mean column, disparity and row. Frames in which a track is not seen count for its walk as well.
     """
     order = np.lexsort((clean.frame, clean.track_id))
     frame = clean.frame[order]
@@ -106,7 +106,7 @@ def with_track_noise(clean: Observations, noise: TrackNoise, rng: np.random.Gene
 
 
 def with_outliers(clean: Observations, camera: CameraLimits, rng: np.random.Generator) -> Observations:
-    """Displace a share of the sightings, both images alike, as a tracker that has slipped to another corner.
+    """Displace a share of the sightings, both images alike, like a tracker that has slipped to another corner.
 
     The displacement points towards the middle of the image, so that the sighting stays inside it.
     """
@@ -122,9 +122,9 @@ def with_outliers(clean: Observations, camera: CameraLimits, rng: np.random.Gene
 
 
 def with_slips(clean: Observations, share: float, rig: StereoRig, rng: np.random.Generator) -> Observations:
-    """Let a share of the tracks slip to another point, 5 to 30 px away, and follow that one to their end.
+    """Let a share of the tracks slip to another point, 5 to 30 px away, and follow that point to their end.
 
-    The other point is nearer to the middle of the image, so that it is in it.
+    The other point is nearer to the middle of the image, so that it is inside the image.
     """
     track, first, row, length = np.unique(clean.track_id, return_index=True, return_inverse=True, return_counts=True)
     slips = rng.uniform(size=track.size) < share
@@ -151,7 +151,7 @@ def measure_twist(
 ) -> MotionMeasurements:
     """Measure the exact mean body twist of each interval between stamps: log(T_k^-1 T_k+1) / dt, plus noise.
 
-    Takes stamps (S + 1,) and poses (S + 1, 4, 4) and gives S samples; sample k is of the motion from k to k + 1.
+    Takes stamps (S + 1,) and poses (S + 1, 4, 4) and returns S samples; sample k is the motion from k to k + 1.
     """
     dt_s = np.diff(t_ns)[:, None] / NS_PER_S
     exact = se3_log(se3_inverse(T_world_imu[:-1]) @ T_world_imu[1:]) / dt_s

@@ -27,7 +27,7 @@ _FRAME = 4
 # Nothing stands where the camera flies: it keeps within 2.1 m of the middle, and above 1.4 m.
 _FLOWN_M, _LOWEST_M = 2.5, 1.2
 _POSTERS, _CRATES, _LAMPS = 44, 16, 8
-# Faces of a box catch more or less light by where they look: x, y, z and their opposites.
+# Brightness of the faces of a box, by the direction they face: x, y, z and their opposites.
 _SHADES = (0.95, 0.85, 1.0, 0.8, 0.9, 0.7)
 
 
@@ -35,8 +35,9 @@ _SHADES = (0.95, 0.85, 1.0, 0.8, 0.9, 0.7)
 class Panel:
     """A textured rectangle, seen from the side its z-axis points to.
 
-    ``T_world_panel`` (4, 4) has the x and y axes along its edges, from a corner on; ``texture`` is the number of its
-    texture, ``offset_m`` (2,) where in it the corner lies, and ``shade`` multiplies its grey values.
+    ``T_world_panel`` (4, 4) has its origin in a corner and the x and y axes along the edges; ``texture`` is the number
+    of its texture, ``offset_m`` (2,) the position of the corner in the texture, and ``shade`` multiplies its grey
+    values.
     """
 
     T_world_panel: Array
@@ -53,7 +54,7 @@ class Panel:
         return np.asarray(local @ self.T_world_panel[:3, :3].T + self.T_world_panel[:3, 3])
 
     def moved(self, T_world_body: Array) -> "Panel":
-        """Return the panel of a body at a pose (4, 4), its own pose being one in the body."""
+        """Return the panel of a body at a pose (4, 4); this panel's own pose is relative to the body."""
         return replace(self, T_world_panel=T_world_body @ self.T_world_panel)
 
 
@@ -72,7 +73,7 @@ class Surfaces:
 def furnished_hall(moving: int = 0) -> Surfaces:
     """Return the hall of `flight`: walls, posters up to 0.3 m before them, pillars, crates, lamps.
 
-    So many crates fly circles between the camera and the walls, at walking pace.
+    ``moving`` crates fly circles between the camera and the walls, at walking pace.
     """
     rng = np.random.default_rng(_WORLD_SEED)
     standing = (*_walls(rng), *_posters(rng), *_pillars(rng), *_crates(rng), *_lamps(rng))
@@ -192,8 +193,8 @@ def _circling(count: int, rng: np.random.Generator) -> Callable[[float], tuple[P
 class Atlas:
     """All textures at all levels in one image: textures side by side, and of each the halved ones below each other.
 
-    ``first_column`` (textures,) and ``first_row`` (levels,) say where an image begins; behind its last row and column
-    the first ones come again, so that interpolation knows no border.
+    ``first_column`` (textures,) and ``first_row`` (levels,) say where an image begins; its first rows and columns are
+    repeated after the last ones, so that interpolation needs no special case at the border.
     """
 
     image: Grey
@@ -203,7 +204,7 @@ class Atlas:
 
 @lru_cache(maxsize=1)
 def atlas() -> Atlas:
-    """Return the textures, the finest level of which has ``TEXEL_M`` a texel; made once in a process."""
+    """Return the textures; a texel of the finest level is ``TEXEL_M`` wide. Made once in a process."""
     columns = [_column(_texture(i, np.random.default_rng([_WORLD_SEED, i]))) for i in range(_TEXTURES)]
     heights = [(TEXELS >> level) + _FRAME for level in range(LEVELS)]
     width = TEXELS + _FRAME
@@ -212,7 +213,7 @@ def atlas() -> Atlas:
 
 
 def _column(image: Grey) -> Grey:
-    """Return the levels of a texture below each other, each framed by its own other side."""
+    """Return the levels of a texture below each other, each padded periodically."""
     import cv2
 
     column = np.zeros((sum((TEXELS >> level) + _FRAME for level in range(LEVELS)), TEXELS + _FRAME), np.uint8)
@@ -226,7 +227,7 @@ def _column(image: Grey) -> Grey:
 
 
 def _texture(which: int, rng: np.random.Generator) -> Grey:
-    """Return a periodic image: plaster, with more prints of many greys and sizes over it the later its number."""
+    """Return a periodic image: plaster with prints of many greys and sizes over it, more for higher numbers."""
     import cv2
 
     image = (125.0 + 20.0 * _clouds(rng, 1.3)).astype(np.float32)
@@ -236,7 +237,7 @@ def _texture(which: int, rng: np.random.Generator) -> Grey:
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         outline = middle + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
         grey = float(rng.uniform(35.0, 215.0))
-        for shift in np.ndindex(3, 3):  # also over the borders, for the image is periodic
+        for shift in np.ndindex(3, 3):  # also across the borders, because the image is periodic
             place = outline + TEXELS * (np.array(shift) - 1)
             if (place.max(axis=0) >= 0.0).all() and (place.min(axis=0) < TEXELS).all():
                 cv2.fillPoly(image, [np.rint(place).astype(np.int32)], grey)

@@ -26,7 +26,7 @@ _REVERSED: dict[str, Pairing] = {"start": "end", "end": "start", "mean": "mean"}
 
 
 def turned(sequence: Sequence, yaw_rad: float, shift_m: Array) -> Sequence:
-    """Return a recording whose world is another: turned about the vertical, and then shifted by (3,) m.
+    """Return a recording in another world frame: rotated about the vertical, and then shifted by (3,) m.
 
     Truth and prior are expressed in it; the measurements stay.
     """
@@ -51,7 +51,7 @@ def renamed(sequence: Sequence, ids: IntArray) -> Sequence:
 
 
 def delayed(sequence: Sequence, by_ns: int) -> Sequence:
-    """Return a recording all of whose stamps are later by so many nanoseconds."""
+    """Return a recording with all stamps ``by_ns`` nanoseconds later."""
     motion, truth, bridges = sequence.motion, sequence.truth, sequence.bridges
     if bridges is not None:
         bridges = replace(bridges, begin_t_ns=bridges.begin_t_ns + by_ns, end_t_ns=bridges.end_t_ns + by_ns)
@@ -67,9 +67,9 @@ def delayed(sequence: Sequence, by_ns: int) -> Sequence:
 def mirrored(sequence: Sequence) -> Sequence:
     """Return a recording as a mirror shows it: left is right, of body, world and images alike.
 
-    The y-axes of body and world are reflected. Of the two cameras each takes the other's place, and columns are counted
-    from the other side, so that the rig is an ordinary one again. Raises DataError where a sighting has no right image:
-    it would be one of the right camera alone.
+    The y-axes of body and world are reflected. The two cameras exchange their places, and columns are counted from the
+    other side, so that the rig is an ordinary one again. Raises DataError where a sighting has no right image: it would
+    be one of the right camera alone.
     """
     seen, rig, prior = sequence.observations, sequence.rig, sequence.prior
     if is_left_only(seen.uv_px).any():
@@ -130,8 +130,8 @@ def _mirrored_truth(truth: Truth) -> Truth:
 def reversed_in_time(sequence: Sequence) -> Sequence:
     """Return a recording played backwards, without a prior: velocities and turn rates are negated, forces stay.
 
-    An error of the gyro, its bias too, is negated with what it reads. A track that was lost where it was seen best is
-    found there.
+    An error of the gyro, its bias included, is negated together with its reading. A track that was lost where it was
+    seen best begins there.
     """
     first_ns, last_ns = sequence.frames_t_ns[[0, -1]].tolist()
     seen, truth, bridges, both_ns = sequence.observations, sequence.truth, sequence.bridges, first_ns + last_ns

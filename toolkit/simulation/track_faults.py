@@ -1,4 +1,4 @@
-"""Errors of real trackers that last over a track, to plant in a recording, unlike the noise of single sightings.
+"""Faults of real trackers that last over a track, unlike the noise of single sightings.
 
 Injectors as in :mod:`toolkit.simulation.faults`, ``fault(sequence, dose, seed) -> Sequence``; faults of single
 sightings, clocks (``camera_clock``) and the scale of samples (``linear_unit``, ``angular_unit``) are there.
@@ -16,7 +16,7 @@ from toolkit.simulation.sensors import with_slips, with_track_noise
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 _NONE = np.zeros(3)
-# Points whose tracks begin within so many seconds are taken to be on one vehicle.
+# Points whose tracks begin within this many seconds are on one vehicle.
 _ONE_VEHICLE_S = 2.0
 
 
@@ -26,18 +26,18 @@ def track_walk(sequence: Sequence, dose: float = 0.13, seed: int = 0) -> Sequenc
 
 
 def match_offset(sequence: Sequence, dose: float = 0.7, seed: int = 0) -> Sequence:
-    """Put every track's disparity off by a constant of its own of the dose (px): matched once, at birth, and wrong."""
+    """Give every track a constant disparity error, of the dose (px) as sigma: matched once, at its start, and wrong."""
     return _with_track_noise(sequence, TrackNoise(_NONE, _NONE, np.array([0.0, dose, 0.0])), seed)
 
 
 def disparity_scale(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequence:
-    """Make all disparities larger by a share: a baseline or a focal length that is off, so that vision falls short."""
+    """Make all disparities larger by a share: a wrong baseline or focal length, with which vision falls short."""
     cdv_px = sequence.observations.uv_px @ CHANNELS.T
     return _with_pixels(sequence, (cdv_px * np.array([1.0, 1.0 + dose, 1.0])) @ np.linalg.inv(CHANNELS).T)
 
 
 def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequence:
-    """End every track before a share of the frames, and go on with new ones: images that repeat, a tracker that fails.
+    """End every track before a share of the frames, and continue with new ones: repeated images, a tracker that fails.
 
     Repaired stale frames have this effect: across each, only the motion samples measure the motion.
     """
@@ -49,7 +49,7 @@ def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequenc
 
 
 def persistent_mismatch(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
-    """Let a share of the tracks slip to a point 5 to 30 px nearer to the middle, and follow that one to their end."""
+    """Let a share of the tracks slip to a point 5 to 30 px nearer to the middle, and follow that point to their end."""
     slipped = with_slips(sequence.observations, dose, sequence.rig, np.random.default_rng(seed))
     return replace(sequence, observations=slipped)
 

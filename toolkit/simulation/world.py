@@ -17,11 +17,11 @@ _POSES_AT_ONCE = 64
 class CameraLimits:
     """The limits of a stereo pair and of its tracker.
 
-    A landmark is seen where its true projection lies ``border_px`` or more inside both images and its depth
-    inside ``depth_m``; at most ``max_tracks`` are followed at a time, and a track that could go on ends at
-    a frame with probability ``loss_per_frame``. Coordinates are written down in steps of ``step_px`` (0: not
-    rounded); a share ``outlier_rate`` of the sightings is displaced by a length inside ``outlier_px``. The
-    noise of the coordinates is the rig's ``cov_uv_px2``.
+    A landmark is seen where its true projection lies ``border_px`` or more inside both images and its depth inside
+    ``depth_m``; at most ``max_tracks`` are followed at a time, and a track that could go on ends at a frame with
+    probability ``loss_per_frame``. Coordinates are rounded to steps of ``step_px`` (0: not rounded); a share
+    ``outlier_rate`` of the sightings is displaced by a length inside ``outlier_px``. The noise of the coordinates is
+    the rig's ``cov_uv_px2``.
     """
 
     rate_hz: float
@@ -36,9 +36,9 @@ class CameraLimits:
 
 
 def room(lower_m: Array, upper_m: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return landmarks (count, 3) on the six faces of a box, each face as dense as the others.
+    """Return landmarks (count, 3) on the six faces of a box, with the same density on each face.
 
-    They stand up to 0.3 m proud of their wall, as shelves and posters do, so that no face is a plane.
+    They stand up to 0.3 m in front of their wall, as shelves and posters do, so that no face is a plane.
     """
     size = upper_m - lower_m
     normal = np.repeat([0, 1, 2], 2)
@@ -69,9 +69,9 @@ def roadside(path: Array, per_pose: int, rng: np.random.Generator) -> Array:
 
 
 def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
-    """Say of points (M, 3) whether they are that near to the path (N, 4, 4), seen from above.
+    """Say which points (M, 3) are within a radius of the path (N, 4, 4), seen from above.
 
-    An hour's path with its points would be 25 GB of distances, so that the nearest pose is looked for first.
+    The nearest pose is looked up first, because all distances between an hour's path and its points would take 25 GB.
     """
     along = path[:, :2, 3]
     _, nearest = cKDTree(along).query(points[:, :2])
@@ -103,7 +103,7 @@ def _in_view(points_cam: Array, rig: StereoRig, camera: CameraLimits) -> BoolArr
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """The landmark each sighting is of: frame (N,), track id (N,) and landmark (N,), by frame then track."""
+    """The landmark of each sighting: frame (N,), track id (N,) and landmark (N,), by frame then track."""
 
     frame: IntArray
     track_id: IntArray
@@ -121,7 +121,7 @@ def follow(seen: BoolArray, camera: CameraLimits, rng: np.random.Generator) -> T
     for k, visible in enumerate(seen):
         kept = visible[landmark] & (rng.uniform(size=landmark.size) >= camera.loss_per_frame)
         free = visible.copy()
-        free[landmark] = False  # also where a track has just been lost: it is not found again at once
+        free[landmark] = False  # also if its track has just been lost: it is not found again at once
         landmark, track_id = landmark[kept], track_id[kept]
         candidates = np.flatnonzero(free)
         wanted = min(max(camera.max_tracks - landmark.size, 0), candidates.size)

@@ -11,17 +11,17 @@ from toolkit.simulation.faults.parts import with_pixels
 
 
 def zero_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
-    """Give every intrinsic the value of the dose: a K nobody filled in."""
+    """Set every intrinsic to the dose: a K nobody filled in."""
     return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=dose, cy_px=dose)
 
 
 def identity_intrinsics(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
-    """Give the focal lengths the value of the dose and put the centre to zero: K left at the identity."""
+    """Set the focal lengths to the dose and the centre to zero: K left at the identity."""
     return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=0.0, cy_px=0.0)
 
 
 def transposed_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
-    """Put the principal point to the dose: what a transposed K, read by its places, says."""
+    """Set the principal point to the dose: the elements that are read from a transposed K."""
     return _with_rig(sequence, cx_px=dose, cy_px=dose)
 
 
@@ -41,14 +41,14 @@ def wrong_aspect(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Seque
 
 
 def shifted_centre(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
-    """Write the principal point so many pixels away, in a direction drawn: the middle of the image taken for it."""
+    """Shift the stated principal point by the dose (px) in a random direction: the middle of the image used instead."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     cx_px, cy_px = sequence.rig.cx_px + dose * np.cos(angle), sequence.rig.cy_px + dose * np.sin(angle)
     return _with_rig(sequence, cx_px=float(cx_px), cy_px=float(cy_px))
 
 
 def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequence:
-    """Give the images a skew of the dose (px), as a K may state one that no rectified pair has."""
+    """Give the images a skew of the dose (px), which a K may state but no rectified pair has."""
     rig, uv_px = sequence.rig, sequence.observations.uv_px
     shift_px = dose * (uv_px[:, 2:] - rig.cy_px) / rig.fy_px
     return with_pixels(sequence, uv_px + shift_px * np.array([1.0, 1.0, 0.0]))
@@ -71,14 +71,14 @@ def inverted_extrinsic(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> 
 
 
 def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
-    """Turn the camera in its mount by the dose (rad) about an axis drawn: a knock, a calibration of another day."""
+    """Rotate the camera in its mount by the dose (rad) about a random axis: a knock, a calibration of another day."""
     axis = np.random.default_rng(seed).standard_normal(3)
     T_imu_cam = sequence.rig.T_imu_cam
     return _with_rig(sequence, T_imu_cam=T_imu_cam @ se3(so3_exp(dose * axis / np.linalg.norm(axis)), np.zeros(3)))
 
 
 def displaced_camera(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequence:
-    """Write the camera so many metres from where it is, in a direction drawn: a tape measure, a bracket moved since."""
+    """State the camera's position wrong by the dose (m) in a random direction: a tape measure, a bracket moved."""
     axis, T_imu_cam = np.random.default_rng(seed).standard_normal(3), sequence.rig.T_imu_cam
     displaced = se3(T_imu_cam[:3, :3], T_imu_cam[:3, 3] + dose * axis / np.linalg.norm(axis))
     return _with_rig(sequence, T_imu_cam=displaced)

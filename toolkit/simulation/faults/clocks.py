@@ -1,6 +1,6 @@
 """Faults of clocks: wrong stamps of frames, or of frames and motion samples.
 
-They are injectors like those of ``faults``, through which they are reached.
+They are injectors like those of ``faults``, which re-exports them.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ from toolkit.simulation.faults.parts import ns, span_s
 
 
 def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
-    """Stamp frames so many seconds late: exposure and transfer not accounted for, a clock set by hand.
+    """Stamp all frames late by the dose (s): exposure and transfer not accounted for, a clock set by hand.
 
     Frames that leave the time of the motion samples are cut off. The truth stays on the motion's clock.
     """
@@ -21,19 +21,19 @@ def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Seque
 
 
 def camera_clock_step(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
-    """Stamp the frames of the second half so many seconds late: the camera's clock alone is set on the way."""
+    """Stamp the frames of the second half late by the dose (s): only the camera's clock is set during the recording."""
     later = np.arange(sequence.frame_count) >= sequence.frame_count // 2
     return _with_frames_at(sequence, sequence.frames_t_ns + np.where(later, ns(dose), 0))
 
 
 def alternate_frames_late(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
-    """Stamp every other frame so many seconds late: two buffers, of which one is read after the other."""
+    """Stamp every other frame late by the dose (s): two buffers, of which one is read after the other."""
     odd = np.arange(sequence.frame_count) % 2 == 1
     return _with_frames_at(sequence, sequence.frames_t_ns + np.where(odd, ns(dose), 0))
 
 
 def frame_jitter(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequence:
-    """Stamp each frame up to so many seconds early or late, evenly drawn, less than half a step: a busy computer."""
+    """Shift each stamp uniformly by up to the dose (s), less than half a step: a busy computer."""
     off_s = np.random.default_rng(seed).uniform(-dose, dose, sequence.frame_count)
     return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(1e9 * off_s).astype(np.int64))
 
@@ -45,7 +45,7 @@ def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) ->
 
 
 def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
-    """Let frames and samples be stamped on by a clock that has jumped so many seconds: a daemon sets the time."""
+    """Shift all stamps of frames and samples by the dose (s) from some time on: a daemon sets the clock."""
     at_ns = sequence.frames_t_ns[0] + ns(span_s(sequence, 0.0, seed)[0])
     motion, frames_t_ns = sequence.motion, sequence.frames_t_ns
     frames_t_ns = frames_t_ns + np.where(frames_t_ns > at_ns, ns(dose), 0)

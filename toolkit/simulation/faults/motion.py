@@ -14,14 +14,14 @@ from toolkit.simulation.faults.parts import ns, span_s, with_pixels
 
 
 def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
-    """Lose the motion samples of so many seconds: a full buffer, a loose cable."""
+    """Lose the motion samples of a span whose length is the dose (s): a full buffer, a loose cable."""
     begin_s, end_s = span_s(sequence, dose, seed)
     t_s = sequence.elapsed_s(sequence.motion.t_ns)
     return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
 
 
 def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
-    """Repeat the last motion sample for so many seconds: a driver that hangs."""
+    """Repeat the last motion sample for the dose (s): a driver that hangs."""
     begin_s, end_s = span_s(sequence, dose, seed)
     t_s, values = sequence.elapsed_s(sequence.motion.t_ns), sequence.motion.values.copy()
     stuck = (t_s > begin_s) & (t_s < end_s)
@@ -30,21 +30,21 @@ def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequen
 
 
 def saturated_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
-    """Cut the motion samples off at this share of the largest on each axis: a sensor of too small a range."""
+    """Clip the motion samples at this share of the largest on each axis: a sensor whose range is too small."""
     values = sequence.motion.values
     largest = dose * np.abs(values).max(axis=0, initial=0.0)
     return _with_values(sequence, np.clip(values, -largest, largest))
 
 
 def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
-    """Give one motion sample the value of the dose on one axis: a flipped bit, a failed parse."""
+    """Set one motion sample to the dose on one axis: a flipped bit, a failed parse."""
     rng, values = np.random.default_rng(seed), sequence.motion.values.copy()
     values[rng.integers(len(values) // 4, 3 * len(values) // 4), rng.integers(6)] = dose
     return _with_values(sequence, values)
 
 
 def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
-    """Add so many m/s, or m/s^2, along an axis drawn to a third of the motion samples: wheels that slip, vibration."""
+    """Add the dose (m/s, or m/s^2) along a random axis to a third of the motion samples: slipping wheels, vibration."""
     begin_s, end_s = span_s(sequence, sequence.duration_s / 3.0, seed)
     axis, t_s = np.random.default_rng(seed).standard_normal(3), sequence.elapsed_s(sequence.motion.t_ns)
     added = np.concatenate([dose * axis / np.linalg.norm(axis), np.zeros(3)])
@@ -52,7 +52,7 @@ def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Se
 
 
 def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
-    """Write NaN for all motion samples and sightings of so many seconds: a driver that gives up and comes back."""
+    """Write NaN to all motion samples and sightings of a span of the dose (s): a driver that fails and recovers."""
     begin_s, end_s = span_s(sequence, dose, seed)
     values, uv_px = sequence.motion.values.copy(), sequence.observations.uv_px.copy()
     t_s, seen_s = sequence.elapsed_s(sequence.motion.t_ns), sequence.frames_s[sequence.observations.frame]
@@ -74,7 +74,7 @@ def changed_speed(sequence: Sequence, dose: float = 1.08, seed: int = 0) -> Sequ
 
 
 def thinned_motion(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
-    """Keep every so many-th motion sample: a log that was thinned out, a bus that is busy."""
+    """Keep one motion sample in as many as the dose: a log that was thinned out, a bus that is busy."""
     return _with_samples(sequence, np.arange(sequence.motion.t_ns.size) % int(dose) == 0)
 
 
@@ -96,14 +96,14 @@ def coarse_samples(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequ
 
 
 def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
-    """Add a constant of the dose (rad/s), in a direction drawn, to every angular velocity: a warm gyro."""
+    """Add a constant of the dose (rad/s) in a random direction to every angular velocity: a warm gyro."""
     axis = np.random.default_rng(seed).standard_normal(3)
     bias = np.concatenate([np.zeros(3), dose * axis / np.linalg.norm(axis)])
     return _with_values(sequence, sequence.motion.values + bias)
 
 
 def wrong_noise(sequence: Sequence, dose: float = 2.0, seed: int = 0) -> Sequence:
-    """State the dose times the noise of tracks and motion, which stay as they are: a data sheet of another sensor."""
+    """State the dose times the noise of tracks and motion, whose errors stay: a data sheet of another sensor."""
     rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 * dose**2)
     return replace(sequence, rig=rig, noise=sequence.noise.scaled(dose))
 
@@ -119,10 +119,10 @@ def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
 
 
 def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
-    """Stop for so many seconds at a frame and go on from there: a red light. For twists, whose motion may just stop.
+    """Stop at a frame for the dose (s) and continue from there: a red light. For twists, whose motion may just stop.
 
-    The tracks of that frame are seen again in every one, with the noise of the rig. Raises DataError where the
-    motion is an IMU's: braking would need accelerations nobody measured; simulate a scene that halts.
+    The tracks of that frame are seen again in every one, with the noise of the rig. Raises DataError where the motion
+    is an IMU's: braking would need accelerations nobody measured; simulate a scene that halts.
     """
     motion, noise = sequence.motion, sequence.noise
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
@@ -146,7 +146,7 @@ def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequenc
 
 
 class _Pause(NamedTuple):
-    """So many stamps, a period apart, put in before the stamp ``at_ns``; what follows is as much later."""
+    """Stamps, a period apart, inserted before the stamp ``at_ns``; later stamps are delayed by the whole pause."""
 
     at_ns: int
     period_ns: int
@@ -160,7 +160,7 @@ class _Pause(NamedTuple):
         return np.concatenate([t_ns[:at], extra_ns, t_ns[at:] + self.stamps * self.period_ns]), rows
 
     def within(self, t_ns: IntArray) -> BoolArray:
-        """Say which stamps (N,) are of the pause."""
+        """Say which stamps (N,) are in the pause."""
         return np.asarray((t_ns >= self.at_ns) & (t_ns < self.at_ns + self.stamps * self.period_ns))
 
 

@@ -12,20 +12,20 @@ from toolkit.simulation.faults.parts import span_s, with_pixels
 
 
 def dropped_sightings(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
-    """Lose a share of the sightings, each by itself: a matcher that fails now and then, or packets lost on the way."""
+    """Lose a share of the sightings, each independently: a matcher that sometimes fails, or lost data packets."""
     kept = np.random.default_rng(seed).uniform(size=len(sequence.observations)) >= dose
     return replace(sequence, observations=sequence.observations.select(kept))
 
 
 def missing_right(sequence: Sequence, dose: float = 0.33, seed: int = 0) -> Sequence:
-    """Lose the right image of a share of the sightings, each by itself: a stereo matcher that fails now and then."""
+    """Lose the right image of a share of the sightings, each independently: a stereo matcher that sometimes fails."""
     uv_px = sequence.observations.uv_px.copy()
     uv_px[np.random.default_rng(seed).uniform(size=len(uv_px)) < dose, 1] = np.nan
     return with_pixels(sequence, uv_px)
 
 
 def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
-    """See nothing for so many seconds, and new tracks after that: a tunnel, glare, a covered lens."""
+    """Lose all sightings for the dose (s), and start new tracks after that: a tunnel, glare, a covered lens."""
     seen, begin_s, end_s = sequence.observations, *span_s(sequence, dose, seed)
     time_s = sequence.frames_s[seen.frame]
     later = time_s >= end_s
@@ -67,7 +67,7 @@ def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
 
 
 def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence:
-    """Keep so many tracks a frame at most, each for as long as it lasts: fog, a bare wall, a cheap tracker."""
+    """Keep at most the dose in tracks a frame, each for as long as it lasts: fog, a bare wall, a cheap tracker."""
     seen = sequence.observations
     chance = np.random.default_rng(seed).permutation(int(seen.track_id.max(initial=-1)) + 1)
     followed, kept = np.empty(0, dtype=np.int64), np.zeros(len(seen), dtype=bool)
@@ -83,7 +83,7 @@ def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence
 
 
 def one_sided_view(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
-    """Lose a share of the image, from its left or its right edge on: a dirty lens, a wall on one side only."""
+    """Lose a share of the image, starting at its left or its right edge: a dirty lens, a wall on one side only."""
     seen, side = sequence.observations, np.random.default_rng(seed).choice([-1.0, 1.0])
     across = side * seen.uv_px[:, 0]
     hidden = across < np.quantile(across, dose) if len(seen) else np.zeros(0, dtype=bool)
@@ -91,7 +91,7 @@ def one_sided_view(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
 
 
 def swapped_images(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
-    """Exchange left and right in a share of the tracks; all of them where the cameras' cables are exchanged."""
+    """Exchange left and right in a share of the tracks; in all of them if the cameras' cables are exchanged."""
     seen, struck = sequence.observations, _struck_tracks(sequence, dose, seed)
     return with_pixels(sequence, np.where(struck[:, None], seen.uv_px[:, [1, 0, 2]], seen.uv_px))
 
@@ -110,19 +110,19 @@ def swapped_coordinates(sequence: Sequence, dose: float = 1.0, seed: int = 0) ->
 
 
 def shifted_pixels(sequence: Sequence, dose: float = 5000.0, seed: int = 0) -> Sequence:
-    """Add so many pixels to every image coordinate: pixels of a crop, of a mosaic, or counted from elsewhere."""
+    """Add the dose (px) to every image coordinate: pixels of a crop or a mosaic, or of another origin."""
     return with_pixels(sequence, sequence.observations.uv_px + dose)
 
 
 def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Sequence:
-    """Put vR so many pixels off vL: a pair that is not rectified, or no longer. v, their mean, is off by half of it."""
+    """Shift vR by the dose (px) against vL: a pair that is not rectified. v, their mean, shifts by half of it."""
     return with_pixels(sequence, sequence.observations.uv_px + np.array([0.0, 0.0, 0.5 * dose]))
 
 
 def rolled_right(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Roll the right camera by the dose (rad) about its optical axis: a mount that was bent after the calibration.
 
-    Columns and rows of the right image turn about the principal point; v, the mean of both rows, by half of it.
+    Columns and rows of the right image rotate about the principal point; v, the mean of both rows, by half of it.
     """
     rig, uv_px = sequence.rig, sequence.observations.uv_px.copy()
     across, down = (uv_px[:, 1] - rig.cx_px) / rig.fx_px, (uv_px[:, 2] - rig.cy_px) / rig.fy_px
@@ -133,7 +133,7 @@ def rolled_right(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Seque
 
 
 def shifted_right(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
-    """Add so many pixels to the columns of the right image: cameras that turned apart, two principal points."""
+    """Add the dose (px) to the columns of the right image: cameras that turned apart, two principal points."""
     return with_pixels(sequence, sequence.observations.uv_px + dose * np.array([0.0, 1.0, 0.0]))
 
 
@@ -145,7 +145,7 @@ def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -
 
 
 def jumped_image(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
-    """Shift every image of the second half by so many pixels: a camera that is knocked, a crop that changes."""
+    """Shift every image of the second half by the dose (px): a camera that is knocked, a crop that changes."""
     later = sequence.observations.frame >= sequence.frame_count // 2
     return with_pixels(sequence, sequence.observations.uv_px + dose * later[:, None])
 
