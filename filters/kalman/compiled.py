@@ -80,8 +80,8 @@ def track_test(compilation: Compilation) -> TrackTest:
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
         points, reliable, nis, dof, worst, H, residuals, owners = kernel.test_tracks(
-            _given((sightings.uvs_px, sightings.seen, sightings.ages)),
-            _given(window),
+            _as_kernel_arrays((sightings.uvs_px, sightings.seen, sightings.ages)),
+            _as_kernel_arrays(window),
             _camera(rig),
             _GATE_RULES,
             bounds,
@@ -107,8 +107,8 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         """Return tracks with their landmarks as the definition does, which is called where right images are missing."""
         if sightings.left_only.any():
             return tracks_in_view.followed(known, sightings, joint, rig)
-        before = _given((known.sightings.track_ids, known.clone_frames, known.points, known.weights))
-        now = _given((sightings.track_ids, joint.clone_frames, sightings.uvs_px, sightings.seen))
+        before = _as_kernel_arrays((known.sightings.track_ids, known.clone_frames, known.points, known.weights))
+        now = _as_kernel_arrays((sightings.track_ids, joint.clone_frames, sightings.uvs_px, sightings.seen))
         found, points, weights = kernel.follow(
             before, now, np.ascontiguousarray(joint.clones), _camera(rig), FEWEST_SIGHTINGS, LEAST_DISPARITY_PX
         )
@@ -119,8 +119,8 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         counted = tracks.counted
         if counted.left_only.any():
             return tracks_in_view.information(tracks, window, rig, gate)
-        arrays = _given((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
-        poses, root = _given((window.poses, window.poses_at)), window.root
+        arrays = _as_kernel_arrays((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
+        poses, root = _as_kernel_arrays((window.poses, window.poses_at)), window.root
         threshold = np.inf if gate.huber is None else float(huber_threshold(3, gate.huber))
         rules = np.array([LEAST_DEPTH_M, float(gate.bound(3)), threshold])
         normals = kernel.normals_of_tracks(arrays, poses, _camera(rig), rules)
@@ -153,7 +153,10 @@ def learning(compilation: Compilation) -> Learn:
         if sightings.left_only.any():
             correlation.learn(sightings, points, poses)
             return
-        arrays, (points, poses) = _given((sightings.uvs_px, sightings.seen)), _given((points, poses))
+        arrays, (points, poses) = (
+            _as_kernel_arrays((sightings.uvs_px, sightings.seen)),
+            _as_kernel_arrays((points, poses)),
+        )
         correlation.add(*kernel.successive_residuals(arrays, points, poses, _camera(rig), FEWEST_CORRELATED))
 
     return learn
@@ -175,13 +178,13 @@ def images(compilation: Compilation) -> multiview.Images:
 
     def linearised(points: Array, poses: Array, rig: StereoRig) -> StereoPrediction:
         """Predict images and their Jacobians as the definition does."""
-        uvs_px, d_pose, d_point, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        uvs_px, d_pose, d_point, depths_m = kernel.predict_images(*_as_kernel_arrays((points, poses)), _camera(rig))
         seen = depths_m.shape
         return StereoPrediction(uvs_px, d_pose.reshape(*seen, 3, 6), d_point.reshape(*seen, 3, 3), depths_m)
 
     def plain(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
         """Predict images as the definition does."""
-        uvs_px, _, _, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        uvs_px, _, _, depths_m = kernel.predict_images(*_as_kernel_arrays((points, poses)), _camera(rig))
         return uvs_px, depths_m
 
     return multiview.Images(plain, linearised)
@@ -198,7 +201,9 @@ def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], Corr
 
     def tested(before: Belief, after: Belief) -> CorrectionTest:
         """Test a correction as the definition does."""
-        return CorrectionTest(*kernel.test_correction(given(before), given(after), _places(before.layout), LEAST_TAKEN))
+        return CorrectionTest(
+            *kernel.test_correction(given(before), given(after), _block_indices(before.layout), LEAST_TAKEN)
+        )
 
     return tested
 
@@ -318,7 +323,7 @@ def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[
     return along_twists
 
 
-def _given(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
+def _as_kernel_arrays(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
     """Return arrays in the form kernels take."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
 
@@ -328,7 +333,7 @@ def _pose_of(belief: Belief) -> Array:
     return np.array(belief.T_world_imu[None], order="C")
 
 
-def _places(layout: Layout) -> IntArray:
+def _block_indices(layout: Layout) -> IntArray:
     """Return the indices of velocity, accel bias and gyro bias in the error state, -1 for what the layout lacks."""
     blocks = (layout.velocity, layout.accel_bias, layout.gyro_bias)
     return np.array([-1 if block is None else block.start for block in blocks])

@@ -56,7 +56,7 @@ def correct_pose(
     A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
     residual, whitened by the covariance of sighting and landmark.
     """
-    residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, belief.T_world_imu, rig)
+    residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
     own_cov = H_point @ landmarks.covs @ transposed(H_point) + left_only.noise_px2(uvs_px, rig)
     nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
     dof = left_only.degrees_of_freedom(uvs_px)
@@ -70,7 +70,9 @@ def correct_pose(
     return PoseCorrection(updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted)
 
 
-def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> stereo.StereoPrediction:
+def _residuals_with_jacobians(
+    landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig
+) -> stereo.StereoPrediction:
     """Return the residuals (N, 3) px of sightings, with Jacobians; both are zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
     if not left_only.any_missing(uvs_px):
@@ -121,7 +123,7 @@ def correct_landmarks(
     ``pose_cov`` (6, 6), zero in the report, is added to the measurement noise, so that an uncertain pose does not make
     the map overconfident.
     """
-    residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, T_world_imu, rig)
+    residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = left_only.noise_px2(uvs_px, rig)
     carried = H_point @ landmarks.covs
     innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + noise_px2

@@ -91,7 +91,7 @@ class JointBelief:
         """Marginalise clones (C,): their rows and columns are dropped."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.clone_columns] = np.repeat(~which, 6)
-        self._cov = _of_slices(self._cov, _stretches(kept))
+        self._cov = _of_slices(self._cov, _true_ranges(kept))
         self.clone_frames = self.clone_frames[~which]
         self.clones, self.first_clones = self.clones[~which], self.first_clones[~which]
 
@@ -99,7 +99,7 @@ class JointBelief:
         """Marginalise landmarks (L,)."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.landmark_columns] = np.repeat(~which, 3)
-        self._cov = _of_slices(self._cov, _stretches(kept))
+        self._cov = _of_slices(self._cov, _true_ranges(kept))
         self.landmark_ids = self.landmark_ids[~which]
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
@@ -243,7 +243,7 @@ def _symmetric(cov: Array) -> Array:
     return result
 
 
-def _stretches(kept: BoolArray) -> list[slice]:
+def _true_ranges(kept: BoolArray) -> list[slice]:
     """Return the contiguous ranges in which a mask (n,) is True."""
     padded = np.zeros(kept.size + 2, dtype=bool)
     padded[1:-1] = kept

@@ -72,7 +72,7 @@ class ResidualCorrelation:
     @classmethod
     def of(cls, setup: Setup) -> Self:
         """Return the measurement that the settings and the motion of a run ask for."""
-        return cls(setup.rig, setup.settings.noise.match_tracks, not _is_calibration_larger(setup.noise))
+        return cls(setup.rig, setup.settings.noise.match_tracks, not _has_small_white_noise(setup.noise))
 
     @property
     def correlation(self) -> float:
@@ -214,6 +214,6 @@ def residuals_left(sightings: TrackSightings, points: Array, poses: Array, rig: 
     return np.asarray((residuals - H @ step).reshape(count, window, 3))
 
 
-def _is_calibration_larger(noise: MotionNoise) -> bool:
+def _has_small_white_noise(noise: MotionNoise) -> bool:
     """Return whether odometry's white noise is smaller than its lasting errors, such as those of calibration."""
     return isinstance(noise, TwistNoise) and float(noise.velocity_noise_density.max()) < _LEAST_WHITE_NOISE

@@ -93,7 +93,7 @@ class SlidingWindowFilter:
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct_by_landmarks(packet.frame, gate)
-        self._tracks.add_frame(_without(packet.frame, self._joint))
+        self._tracks.add_frame(_without_landmarks(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
         self._correct_by_bridge(packet)
@@ -254,7 +254,7 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
     return JointBelief(core) if noise is None else TrackErrorBelief(core, noise)
 
 
-def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
+def _without_landmarks(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of landmarks in the state."""
     if not len(joint.landmark_ids):
         return frame

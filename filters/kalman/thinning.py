@@ -32,7 +32,7 @@ class Thinned:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
         t_ns = packet.frame.t_ns
-        self._since = _in_one(self._since, packet.motion)
+        self._since = _concatenated(self._since, packet.motion)
         if self._newest is not None and self._interval(t_ns) == self._interval(self._kept_ns[-1]):
             assert self._since is not None
             self._left_out.append((len(self._kept_ns) - 1, t_ns, self._since))
@@ -60,7 +60,7 @@ class Thinned:
         return answer if state.cov is not None else replace(answer, cov=None)
 
 
-def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
+def _concatenated(first: Motion | None, second: Motion | None) -> Motion | None:
     """Concatenate two successive motions; where one is None, return the other."""
     if first is None or second is None:
         return second if first is None else first

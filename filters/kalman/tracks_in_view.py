@@ -175,7 +175,9 @@ class TracksInView:
         self._known = tracks._replace(points=found.points).select(found.usable)
         if not found.usable.any():
             return joint.core
-        return _informed(joint, window.root, np.multiply(found.matrix, share, out=found.matrix), share * found.vector)
+        return _corrected_by_information(
+            joint, window.root, np.multiply(found.matrix, share, out=found.matrix), share * found.vector
+        )
 
 
 class _Rows(NamedTuple):
@@ -308,7 +310,7 @@ def _of_poses(rows: _Rows) -> tuple[Array, Array]:
     return matrix.reshape(6 * window, 6 * window), vector.reshape(6 * window)
 
 
-def _informed(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:
+def _corrected_by_information(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:
     """Return the present state given information (6 W, 6 W), (6 W,) on errors of which the clones' are ``root`` times.
 
     The matrix is overwritten.

@@ -47,7 +47,7 @@ class Renewal(NamedTuple):
     replaced: Mapping[int, int]
 
 
-class _Between(NamedTuple):
+class _LinearisationPoints(NamedTuple):
     """Poses (N, 4, 4) of N sightings and of the sightings before them, and points (N, 3) m."""
 
     own: Array
@@ -55,12 +55,12 @@ class _Between(NamedTuple):
     points: Array
 
     @classmethod
-    def at(cls, chained: ChainedFactors, values: gtsam.Values) -> "_Between":
+    def at(cls, chained: ChainedFactors, values: gtsam.Values) -> "_LinearisationPoints":
         """Return poses and points of sightings at values."""
         poses, points = chained.sightings.places(values)
         return cls(poses, poses[chained.sightings.chain.before], points)
 
-    def differ_from(self, other: "_Between") -> BoolArray:
+    def differ_from(self, other: "_LinearisationPoints") -> BoolArray:
         """Say which rows (N,) differ by more than rounding."""
         pairs = ((ours - theirs).reshape(len(self.own), -1) for ours, theirs in zip(self, other, strict=True))
         return np.asarray(np.abs(np.hstack(list(pairs))).max(axis=1) > ROUNDING)
@@ -70,8 +70,8 @@ class _Between(NamedTuple):
 class _Linearised:
     """N sightings linearised about the estimates, with Jacobians at other points, and their weights (N,)."""
 
-    about: _Between
-    jacobians_at: _Between
+    about: _LinearisationPoints
+    jacobians_at: _LinearisationPoints
     weight: Array
     linear: LinearInnovations
 
@@ -79,7 +79,7 @@ class _Linearised:
     def none(cls) -> "_Linearised":
         """Return no rows."""
         poses, blocks = np.empty((0, 4, 4)), np.empty((0, 3, 6))
-        nowhere = _Between(poses, poses, np.empty((0, 3)))
+        nowhere = _LinearisationPoints(poses, poses, np.empty((0, 3)))
         linear = LinearInnovations(np.empty((0, 3)), blocks, blocks, np.empty((0, 3, 3)))
         return cls(nowhere, nowhere, np.empty(0), linear)
 
@@ -87,7 +87,7 @@ class _Linearised:
     def at(cls, chained: ChainedFactors, places: Places) -> "_Linearised":
         """Linearise sightings."""
         linear = chained.linear(*places)
-        about, jacobians_at = (_Between.at(chained, values) for values in places)
+        about, jacobians_at = (_LinearisationPoints.at(chained, values) for values in places)
         return cls(about, jacobians_at, chained.weights(linear.innovation), linear)
 
     def differs_from(self, old: "_Linearised") -> BoolArray:
@@ -122,7 +122,9 @@ class _Linearised:
     @staticmethod
     def _of(columns: Iterable[Array]) -> "_Linearised":
         rows = list(columns)
-        return _Linearised(_Between(*rows[:3]), _Between(*rows[3:6]), rows[6], LinearInnovations(*rows[7:]))
+        return _Linearised(
+            _LinearisationPoints(*rows[:3]), _LinearisationPoints(*rows[3:6]), rows[6], LinearInnovations(*rows[7:])
+        )
 
 
 def _step(start: Array, end: Array) -> Array:

@@ -101,7 +101,7 @@ class FixedLagTree:
         self._chained.drop(track_ids)
         keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
         slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
-        slots = [slot for slot in slots if any(_goes_with(key, factors.at(slot)) for key in keys)]
+        slots = [slot for slot in slots if any(_is_removed_with(key, factors.at(slot)) for key in keys)]
         self._landmark_stamps_ns |= dict.fromkeys(keys, self._oldest_ns - 1)
         return self._solved(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
 
@@ -265,7 +265,7 @@ class FixedLagTree:
         self._chained.drop([gtsam.Symbol(key).index()])
         kept = gtsam.NonlinearFactorGraph()
         for factor in (factors.at(i) for i in range(factors.size())):
-            if not _goes_with(key, factor):
+            if not _is_removed_with(key, factor):
                 kept.add(factor)
         if kept.keys().count(key):
             self._landmark_stamps_ns[key] = self._oldest_ns - 1
@@ -292,7 +292,7 @@ class FixedLagTree:
         states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= self._oldest_ns]
         some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_ns) + len(self._state_stamps_ns)
         groups, place = gtsam.KeyGroupMap(), int(some_leave)
-        for together in self._in_turn(landmarks):
+        for together in self._landmark_groups(landmarks):
             for key in together:
                 groups.insert2(key, place)
             place += bool(together)
@@ -303,7 +303,7 @@ class FixedLagTree:
         groups.insert2(LAST, place + len(stamps_ns))
         return groups
 
-    def _in_turn(self, landmarks: list[int]) -> list[list[int]]:
+    def _landmark_groups(self, landmarks: list[int]) -> list[list[int]]:
         """Return groups of landmarks to eliminate together: first those that are in no marginal.
 
         All others are connected by marginals. They are grouped by when they were last seen, and each group starts with
@@ -318,7 +318,7 @@ class FixedLagTree:
         return [unconnected, *(part for turn in turns for part in (turn[-1:], turn[:-1]))]
 
 
-def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
+def _is_removed_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
     """Say whether a factor is removed with a landmark: a sighting, or a linear factor on it alone."""
     keys: list[int] = factor.keys()
     return landmark in keys and (len(keys) == 1 or not isinstance(factor, gtsam.LinearContainerFactor))

@@ -35,7 +35,7 @@ from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
 # Damping of steps in images, which overshoot little; with less, GTSAM finds far landmarks undetermined.
-_IN_IMAGES = 1e-7
+_DAMPING_IN_IMAGES = 1e-7
 # Least decrease of the error, half a sum of squares in sigma: with exact measurements the error is near zero, and a
 # relative criterion is never met.
 _LEAST_DECREASE = 1e-12
@@ -43,9 +43,9 @@ _LEAST_DECREASE = 1e-12
 # variables are damped as well.
 _FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
 # If a step raises the error by less than this share of it, the solve is at a minimum.
-_NEXT_TO_NOTHING = 1e-5
+_NEGLIGIBLE_INCREASE = 1e-5
 # A step that achieves less than this share of the decrease predicted by the linear system is shortened.
-_KEPT = 0.5
+_LEAST_GAIN_RATIO = 0.5
 # A step that gains little ends the solve only if it was damped by at most this, and not shortened below this part.
 _FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
@@ -126,7 +126,7 @@ def solve(
     return _solved(solver, start, error, stopping, advance)._replace(overshot=in_metres.overshot)
 
 
-class _Reached(Protocol):
+class _SolveState(Protocol):
     """The state of a solve: its error, and whether damping kept its last step short."""
 
     @property
@@ -136,21 +136,21 @@ class _Reached(Protocol):
     def values(self) -> gtsam.Values: ...
 
 
-Reached = TypeVar("Reached", bound=_Reached)
+State = TypeVar("State", bound=_SolveState)
 
 
-class _Solver(Protocol[Reached]):
+class _Solver(Protocol[State]):
     """Takes the steps of one solve."""
 
-    def started(self, values: gtsam.Values, error: float) -> Reached:
+    def started(self, values: gtsam.Values, error: float) -> State:
         """Return the initial state of the solve."""
 
-    def advanced(self, here: Reached) -> Reached:
+    def advanced(self, here: State) -> State:
         """Return the state after the next step that lowers the error; the same state if none does."""
 
 
 def _solved(
-    solver: _Solver[Reached],
+    solver: _Solver[State],
     start: gtsam.Values,
     error: float,
     stopping: Stopping,
@@ -167,7 +167,7 @@ def _solved(
     return Solution(here.values(), here.error, stopping.max_iterations, converged=enough)
 
 
-class _OfGtsam(NamedTuple):
+class _GtsamState(NamedTuple):
     """The state of a solve by GTSAM's optimizer, which has the values and the damping, and its error."""
 
     optimizer: gtsam.LevenbergMarquardtOptimizer
@@ -184,7 +184,7 @@ class _OfGtsam(NamedTuple):
         return gtsam.Values(self.optimizer.values())
 
 
-class _Damped(NamedTuple):
+class _DampedState(NamedTuple):
     """The state of a solve: its values, its error, and the damping of its next step."""
 
     reached: gtsam.Values
@@ -204,14 +204,14 @@ class _GraphSolver:
         self._graph, self._ordering, self._ends_at_overshoot = graph, ordering, ends_at_overshoot
         # Whether a step raised the error, and whether one lowered it.
         self.overshot, self._lowered = False, False
-        self._held: dict[float, gtsam.GaussianFactorGraph] = {}
+        self._damping_factors: dict[float, gtsam.GaussianFactorGraph] = {}
 
-    def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
+    def started(self, values: gtsam.Values, error: float) -> _GtsamState | _DampedState:
         """Return the initial state of the solve."""
         if self._graph.has_python:
-            return _Damped(values, error, _FIRST_DAMPING)
+            return _DampedState(values, error, _FIRST_DAMPING)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph.native, values, self._params())
-        return _OfGtsam(optimizer, error)
+        return _GtsamState(optimizer, error)
 
     def _params(self) -> gtsam.LevenbergMarquardtParams:
         params = gtsam.LevenbergMarquardtParams()
@@ -223,24 +223,24 @@ class _GraphSolver:
         params.setlambdaFactor(_DAMPING_FACTOR)
         return params
 
-    def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
+    def advanced(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
         """Return the state after the next step that lowers the error; the same state if none does."""
         tried, there = here.damping, self._stepped_in_metres(here)
         self.overshot |= there.damping >= tried
         return there
 
-    def _stepped_in_metres(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
-        if isinstance(here, _Damped):
+    def _stepped_in_metres(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
+        if isinstance(here, _DampedState):
             return self.stepped(here, gtsam.Values.retract, 0.0)
         here.optimizer.iterate()
-        return _OfGtsam(here.optimizer, here.optimizer.error())
+        return _GtsamState(here.optimizer, here.optimizer.error())
 
     def stepped(
         self,
-        here: _Damped,
+        here: _DampedState,
         taken: Callable[[gtsam.Values, gtsam.VectorValues], gtsam.Values],
         least_damping: float,
-    ) -> _Damped:
+    ) -> _DampedState:
         """Return the state after the least damped step that lowers the error; ``taken`` applies a step to values.
 
         If a step raises the error only negligibly the state is at a minimum: more damping would gain no more (GTSAM's
@@ -254,8 +254,10 @@ class _GraphSolver:
                 error = self._graph.error(there)
                 if error <= here.error:
                     self._lowered = True
-                    return _Damped(there, error, max(damping / _DAMPING_FACTOR, least_damping))
-                if error - here.error < _NEXT_TO_NOTHING * here.error or (self._ends_at_overshoot and self._lowered):
+                    return _DampedState(there, error, max(damping / _DAMPING_FACTOR, least_damping))
+                if error - here.error < _NEGLIGIBLE_INCREASE * here.error or (
+                    self._ends_at_overshoot and self._lowered
+                ):
                     break
             damping *= _DAMPING_FACTOR
         return here._replace(held_back=False)
@@ -264,9 +266,9 @@ class _GraphSolver:
         self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
     ) -> gtsam.VectorValues | None:
         """Return the damped step from some values; None if the linear system does not determine it."""
-        if damping not in self._held:
-            self._held[damping] = _held(values.dims(), damping)
-        return _eliminated(_joined(linear, self._held[damping]), self._ordering)
+        if damping not in self._damping_factors:
+            self._damping_factors[damping] = _damping_factors(values.dims(), damping)
+        return _eliminated(_joined(linear, self._damping_factors[damping]), self._ordering)
 
 
 class _ImageSolver:
@@ -278,24 +280,24 @@ class _ImageSolver:
     def __init__(self, in_metres: _GraphSolver, images: FirstImages) -> None:
         self._in_metres, self._images = in_metres, images
 
-    def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
+    def started(self, values: gtsam.Values, error: float) -> _GtsamState | _DampedState:
         """Return the initial state of the solve."""
         if self._images.at_once:
-            return _Damped(values, error, _IN_IMAGES)
+            return _DampedState(values, error, _DAMPING_IN_IMAGES)
         return self._in_metres.started(values, error)
 
-    def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
+    def advanced(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
         """Return the state after the next step that lowers the error; the same state if none does."""
         if self._images.at_once or self._in_metres.overshot:
-            assert isinstance(here, _Damped)
-            return self._in_metres.stepped(here, self._images.taken, _IN_IMAGES)
+            assert isinstance(here, _DampedState)
+            return self._in_metres.stepped(here, self._images.taken, _DAMPING_IN_IMAGES)
         there = self._in_metres.advanced(here)
         if self._in_metres.overshot:
-            return _Damped(there.values(), there.error, _IN_IMAGES, held_back=True)
+            return _DampedState(there.values(), there.error, _DAMPING_IN_IMAGES, held_back=True)
         return there
 
 
-class _WithLandmarks(NamedTuple):
+class _LandmarkState(NamedTuple):
     """The state of a solve: values, error, the damping share of its next step, and whether the last was short."""
 
     reached: gtsam.Values
@@ -315,14 +317,14 @@ class _LandmarkSolver:
         self._graph, self._beside = graph, beside
         self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
 
-    def started(self, values: gtsam.Values, error: float) -> _WithLandmarks:
+    def started(self, values: gtsam.Values, error: float) -> _LandmarkState:
         """Return the initial state of the solve."""
-        return _WithLandmarks(values, error, _FIRST_SHARE, held_back=False)
+        return _LandmarkState(values, error, _FIRST_SHARE, held_back=False)
 
     def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
         return _joined(self._graph.linear(values), steps.sightings)
 
-    def advanced(self, here: _WithLandmarks) -> _WithLandmarks:
+    def advanced(self, here: _LandmarkState) -> _LandmarkState:
         """Return the state after the next step that lowers the error; the same state if none does."""
         steps = self._beside.landmark_steps(here.reached)
         linear = self._linear(here.reached, steps)
@@ -335,15 +337,15 @@ class _LandmarkSolver:
         return here._replace(held_back=False)
 
     def _tried(
-        self, here: _WithLandmarks, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
-    ) -> _WithLandmarks | None:
+        self, here: _LandmarkState, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
+    ) -> _LandmarkState | None:
         """Return the state after a step damped by a share, taken in full or in part; None if its error is larger."""
         step = self._step(linear, steps, share)
         if step is None:
             return None
         promised = here.error - linear.error(step)
         there = self._at(steps, step, share)
-        if here.error - there.error < _KEPT * promised:
+        if here.error - there.error < _LEAST_GAIN_RATIO * promised:
             # The minimum along the step of the parabola with the predicted slope and the error found at its end.
             part = promised / (2.0 * promised - (here.error - there.error))
             shorter = self._at(steps, step.scale(part), share, held_back=part < _LEAST_PART)
@@ -352,18 +354,18 @@ class _LandmarkSolver:
 
     def _at(
         self, steps: LandmarkSteps, step: gtsam.VectorValues, share: float, held_back: bool = False
-    ) -> _WithLandmarks:
+    ) -> _LandmarkState:
         there = steps.taken(step)
         error = self._graph.error(there) + self._beside.error(there)
         next_share = max(share / _DAMPING_FACTOR, _LEAST_SHARE)
-        return _WithLandmarks(there, error, next_share, held_back or share > _FREE_SHARE)
+        return _LandmarkState(there, error, next_share, held_back or share > _FREE_SHARE)
 
     def _step(self, linear: gtsam.GaussianFactorGraph, steps: LandmarkSteps, share: float) -> gtsam.VectorValues | None:
         """Return the damped step; None if the linear system does not determine it."""
         damped = _joined(linear, steps.damping(share))
         if share > _LANDMARKS_ALONE:
             dims = steps.values.dims()
-            damped.push_back(_held({key: size for key, size in dims.items() if kind_of(key) != "l"}, share))
+            damped.push_back(_damping_factors({key: size for key, size in dims.items() if kind_of(key) != "l"}, share))
         return _eliminated(damped, self._ordering)
 
 
@@ -383,7 +385,7 @@ def _eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> 
         return None
 
 
-def _held(sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
+def _damping_factors(sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
     """Return factors that damp variables, whose keys have sizes, at their values."""
     graph = gtsam.GaussianFactorGraph()
     of_size = {size: np.sqrt(damping) * np.eye(size) for size in set(sizes.values())}

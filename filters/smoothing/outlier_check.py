@@ -108,7 +108,7 @@ class _KnownSightings(NamedTuple):
         return cls(rows, frame.uvs_px[rows], *landmarks.of(frame.track_ids[rows].tolist()))
 
 
-class _Refused(NamedTuple):
+class _AgreeingRejections(NamedTuple):
     """The point (3,) m in the world of the first of some agreeing rejected sightings, and their number."""
 
     point: Array
@@ -120,7 +120,7 @@ class RefusedTracks:
 
     def __init__(self, rig: StereoRig, gate_probability: float | None) -> None:
         self._rig, self._bound = rig, chi2_bound(3, gate_probability)
-        self._refused: dict[int, _Refused] = {}
+        self._refused: dict[int, _AgreeingRejections] = {}
         self._taken = Counter[int]()
 
     def forget(self, track_ids: Iterable[int]) -> None:
@@ -144,7 +144,9 @@ class RefusedTracks:
         agree = mahalanobis_squared(off_px, covs_px2) <= self._bound
         found = zip(seen.track_ids.tolist(), before, points, agree.tolist(), strict=True)
         self._refused = {
-            i: one._replace(sightings=one.sightings + 1) if one is not None and agrees else _Refused(point, 1)
+            i: one._replace(sightings=one.sightings + 1)
+            if one is not None and agrees
+            else _AgreeingRejections(point, 1)
             for i, one, point, agrees in found
         }
         least = ((i, max(FEWEST_REFUSED, self._taken[i] + 1)) for i in self._refused)

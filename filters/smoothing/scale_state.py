@@ -17,7 +17,7 @@ from toolkit.models.motion import MotionModel
 from toolkit.models.state_covariances import covs_beside
 
 # With a standard deviation above this share of the prior's, the measurements do not determine the scale.
-_UNTOLD = 0.95
+_UNDETERMINED = 0.95
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,6 @@ class ScaleState:
     def message_of(self, scale: float, sigma: float) -> str:
         """Return the log line about the scale."""
         message = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
-        if sigma > _UNTOLD * self.prior_sigma:
+        if sigma > _UNDETERMINED * self.prior_sigma:
             return f"{message}: the measurements do not tell, and that is the prior"
         return f"{message} (prior 0 +- {100.0 * self.prior_sigma:g} %)"

@@ -131,7 +131,7 @@ class Vision:
         weighted = weights[:, None, None] * left_only.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
         seen, all_rows = self.sightings, np.arange(weights.size)
-        of_poses = [_OfPoses(all_rows, seen.pose, J_pose)]
+        of_poses = [_PoseJacobians(all_rows, seen.pose, J_pose)]
         return _eliminated(weights[:, None] * self._residual, of_poses, J_point, seen.point, self.counts)
 
     @property
@@ -171,11 +171,11 @@ class ChainedVision(Vision):
         before = weights * chain.whitened(np.zeros_like(to_pose), chain.of_before(channels, to_pose))
         J_point = weights * chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point))
         seen, left, of_poses = self.sightings, is_left_only(self.sightings.uv_px), []
-        of_poses.append(_OfPoses(np.arange(seen.pose.size), seen.pose, own))
+        of_poses.append(_PoseJacobians(np.arange(seen.pose.size), seen.pose, own))
         # A stereo sighting and a left-only sighting may have the same preceding sighting.
         for kind in (~left, left) if left.any() else (~left,):
             follow = np.flatnonzero((chain.before >= 0) & kind)
-            of_poses.append(_OfPoses(follow, seen.pose[chain.before[follow]], before[follow]))
+            of_poses.append(_PoseJacobians(follow, seen.pose[chain.before[follow]], before[follow]))
         return _eliminated(weights[..., 0] * self._residual, of_poses, J_point, seen.point, self.counts)
 
     @cached_property
@@ -191,7 +191,7 @@ class ChainedVision(Vision):
         return self._chain.innovations(residuals_px, channels_of(self.sightings.uv_px))
 
 
-class _OfPoses(NamedTuple):
+class _PoseJacobians(NamedTuple):
     """Jacobians (n, 3, 6) of some residuals, given by rows (n,), to one pose (n,) that each depends on.
 
     No two of them share both pose and point.
@@ -203,7 +203,7 @@ class _OfPoses(NamedTuple):
 
 
 def _eliminated(
-    residual: Array, of_poses: Sequence[_OfPoses], J_point: Array, point: IntArray, counts: tuple[int, int]
+    residual: Array, of_poses: Sequence[_PoseJacobians], J_point: Array, point: IntArray, counts: tuple[int, int]
 ) -> ReducedVision:
     pose_count, point_count = counts
     # Small matrix products are several times as fast on contiguous arrays.
@@ -222,11 +222,11 @@ def _eliminated(
         vector += _summation(pose, pose_count) @ (to_pose @ residual[rows, :, None])[..., 0]
     across = coupling.reshape(6 * pose_count, 3 * point_count)
     information = -(across @ across.T)
-    _add_of_poses(information.reshape(pose_count, 6, pose_count, 6), of_poses)
+    _add_pose_information(information.reshape(pose_count, 6, pose_count, 6), of_poses)
     return ReducedVision(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
 
 
-def _add_of_poses(information: Array, of_poses: Sequence[_OfPoses]) -> None:
+def _add_pose_information(information: Array, of_poses: Sequence[_PoseJacobians]) -> None:
     """Add the residuals' information on their poses to the information (K, 6, K, 6) on all of them."""
     count = len(information)
     for one in of_poses:

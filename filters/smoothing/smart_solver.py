@@ -70,7 +70,7 @@ def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> Sma
     """Marginalise the ``count`` oldest states with every track they saw; the row numbers of other points stay."""
     seen = window.sightings
     leaving_points = np.unique(seen.point[seen.pose < count])
-    leaving = replace(_only(window, leaving_points), motion=window.motion[: count + 1])
+    leaving = replace(_with_points(window, leaving_points), motion=window.motion[: count + 1])
     system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
     root = np.linalg.cholesky(system.information[:gone, :gone])
     across = solve_triangular(root, system.information[:gone, gone:], lower=True)
@@ -87,7 +87,7 @@ def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> Sma
     return SmartWindow(window.keys[count:], values, motion, prior, kept, window.points)
 
 
-def _only(window: SmartWindow, points: IntArray) -> SmartWindow:
+def _with_points(window: SmartWindow, points: IntArray) -> SmartWindow:
     """Return the window with some points (M,), by their ascending rows, and their sightings."""
     seen = window.sightings.of_points(points)
     rows = np.searchsorted(points, seen.point).astype(np.int64)
@@ -110,7 +110,7 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
             moved = _moved(here.window, system, step)
             there = Evaluated.of(moved, camera)
             if not there.error <= here.error:
-                there = Evaluated.of(_each_landmark_by_itself(moved, here.window.points, camera), camera)
+                there = Evaluated.of(_with_shortened_landmark_steps(moved, here.window.points, camera), camera)
             if there.error <= here.error:
                 return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
         except np.linalg.LinAlgError:
@@ -119,7 +119,7 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
     return _DescentStep(here, 0.0, damping)
 
 
-def _each_landmark_by_itself(moved: SmartWindow, before: Array, camera: RobustCamera) -> SmartWindow:
+def _with_shortened_landmark_steps(moved: SmartWindow, before: Array, camera: RobustCamera) -> SmartWindow:
     """Return the window with each landmark (M,) moved by the part of its step with the lowest cost of its sightings.
 
     A landmark that comes nearer by metres may overshoot to behind a camera, and alone would make every step fail.

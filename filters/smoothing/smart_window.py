@@ -165,7 +165,7 @@ class Evaluated:
     def of(cls, window: SmartWindow, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: Python factors cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
-        return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
+        return cls(window, _joined_graph(window.motion).linearize(window.values), _off_prior(window), vision)
 
     @cached_property
     def error(self) -> float:
@@ -201,7 +201,7 @@ class Evaluated:
         return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
 
 
-def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
+def _joined_graph(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
     whole = gtsam.NonlinearFactorGraph()
     for graph in graphs:
         whole.push_back(graph)

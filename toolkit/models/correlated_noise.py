@@ -52,7 +52,7 @@ def decorrelation(
         units = np.where(
             left_only[some, :, None, None], np.linalg.pinv(left_whitener(rig)), np.linalg.inv(rig.whitener)
         )
-        mixed[some] = _together(_inverse_root_of_all(noise, ages[some], seen[some], left_only[some]), units)
+        mixed[some] = _times_blocks(_inverse_root_of_all(noise, ages[some], seen[some], left_only[some]), units)
     return np.asarray(mixed)
 
 
@@ -117,7 +117,7 @@ def _inverse_root_of_all(noise: TrackNoise, ages: IntArray, seen: BoolArray, lef
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
 
-def _together(mixing: Array, units: Array) -> Array:
+def _times_blocks(mixing: Array, units: Array) -> Array:
     """Return matrices (F, 3 W, 3 W) multiplied by the matrix (F, W, 3, 3) of each sighting."""
     tracks, window = units.shape[:2]
     by_sighting = mixing.reshape(tracks, 3 * window, window, 3)
@@ -136,7 +136,7 @@ def in_channels(channels: Array, values: Array) -> Array:
     return applied(channels, values) if values.ndim == 2 else np.asarray(channels @ values)
 
 
-def _as_seen(variance: Array, left: BoolArray, of_none: float = 0.0) -> Array:
+def _with_left_only(variance: Array, left: BoolArray, of_none: float = 0.0) -> Array:
     """Return variances (N, 3) of the channels c, d, v, or for left-only rows of uL = c + d / 2, ``of_none``, v."""
     if not left.any():
         return variance
@@ -184,9 +184,9 @@ class Chain:
             before[both] = np.append(both, -1)[_row_before(track[both])]
         common = np.square(noise.offset_px) + np.square(noise.walk_px) * ages[:, None].astype(float)
         variance = common + np.square(np.maximum(noise.white_px, LEAST_WHITE_PX))
-        with_before = np.where(before[:, None] >= 0, _as_seen(common[before], left), 0.0)
-        carried = with_before / _as_seen(variance[before], left, of_none=1.0)
-        return cls(before, carried, np.sqrt(_as_seen(variance, left, of_none=1.0) - carried * with_before))
+        with_before = np.where(before[:, None] >= 0, _with_left_only(common[before], left), 0.0)
+        carried = with_before / _with_left_only(variance[before], left, of_none=1.0)
+        return cls(before, carried, np.sqrt(_with_left_only(variance, left, of_none=1.0) - carried * with_before))
 
     @classmethod
     def without_memory(cls, count: int) -> "Chain":

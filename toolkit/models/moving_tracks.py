@@ -109,7 +109,7 @@ class MovingTracks:
         tested = (seen.refusals < REFUSALS) & seen.recent.can_predict(seen.now) & _deep(seen.uvs_px)
         found = _found(self._pairs(seen, seen.recent, tested), step, self._rig, self._rng)
         enough = found.agree.sum() >= (1.0 - MOST_MISMATCHED) * found.agree.size
-        motion = found if enough else _Found(np.zeros(6), step.cov, found.agree)
+        motion = found if enough else _FoundMotion(np.zeros(6), step.cov, found.agree)
         T_start_end = step.T_start_end @ se3_exp(motion.error)
         self._path[seen.now] = self._path[seen.now - 1] @ T_start_end
         self._belief = step.conditioned(self._belief.predicted(prediction), motion)
@@ -125,7 +125,7 @@ class MovingTracks:
         self._step_cov = motion.cov
         return agree
 
-    def _pairs(self, seen: "_Tracks", begun: "_Begun", which: BoolArray) -> "_Pairs":
+    def _pairs(self, seen: "_Tracks", begun: "_EarlierSightings", which: BoolArray) -> "_Pairs":
         """Return some tracks as points (N, 3) m in the body at the previous frame, from their earlier sightings."""
         before, rig = seen.now - 1, self._rig
         frames, row = np.unique(begun.frames[which], return_inverse=True)
@@ -137,7 +137,7 @@ class MovingTracks:
         return _Pairs(transform(T_before_cam, points_cam), d_point_d_uv, seen.uvs_px[which], steps * self._step_cov)
 
 
-class _Begun(NamedTuple):
+class _EarlierSightings(NamedTuple):
     """The sightings (N, 3) px from which tracks are predicted, and their frames (N,)."""
 
     uvs_px: Array
@@ -147,17 +147,19 @@ class _Begun(NamedTuple):
         """Say which (N,) are of an earlier frame and have a known depth."""
         return np.asarray((self.frames < now) & _deep(self.uvs_px))
 
-    def with_those(self, others: "_Begun", rows: IntArray, places: IntArray) -> "_Begun":
+    def with_those(self, others: "_EarlierSightings", rows: IntArray, places: IntArray) -> "_EarlierSightings":
         """Return the sightings with rows (M,) of others at some indices (M,)."""
         uvs_px, frames = self.uvs_px.copy(), self.frames.copy()
         uvs_px[places], frames[places] = others.uvs_px[rows], others.frames[rows]
-        return _Begun(uvs_px, frames)
+        return _EarlierSightings(uvs_px, frames)
 
-    def moved_on(self, seen: "_Tracks", sound: BoolArray, most_frames: int) -> "_Begun":
+    def moved_on(self, seen: "_Tracks", sound: BoolArray, most_frames: int) -> "_EarlierSightings":
         """Replace sightings of a certain age by the present ones: by accepted ones first, later by any."""
         age = seen.now - self.frames
         late = (sound & (age >= most_frames)) | (age >= most_frames + REFUSALS) | ~_deep(self.uvs_px)
-        return _Begun(np.where(late[:, None], seen.uvs_px, self.uvs_px), np.where(late, seen.now, self.frames))
+        return _EarlierSightings(
+            np.where(late[:, None], seen.uvs_px, self.uvs_px), np.where(late, seen.now, self.frames)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,14 +172,14 @@ class _Tracks:
     now: int
     ids: IntArray
     uvs_px: Array
-    recent: _Begun
-    early: _Begun
+    recent: _EarlierSightings
+    early: _EarlierSightings
     refusals: IntArray
 
     @classmethod
     def begun(cls, ids: IntArray, uvs_px: Array, k: int) -> "_Tracks":
         """Return tracks that begin with frame k."""
-        here = _Begun(uvs_px, np.full(ids.size, k))
+        here = _EarlierSightings(uvs_px, np.full(ids.size, k))
         return cls(k, ids, uvs_px, here, here, np.zeros(ids.size, dtype=np.int64))
 
     def continuing(self, before: "_Tracks") -> "_Tracks":
@@ -203,7 +205,7 @@ def _deep(uvs_px: Array) -> BoolArray:
     return np.asarray(~is_left_only(uvs_px) & (disparity_px(uvs_px) > LEAST_DISPARITY_PX))
 
 
-class _Found(NamedTuple):
+class _FoundMotion(NamedTuple):
     """The error (6,) of a predicted motion, its covariance (6, 6), and which of the tracks (N,) agree with it."""
 
     error: Array
@@ -230,7 +232,7 @@ class _Step(NamedTuple):
             raise DataError("the measured motion is too large to tell moving tracks by; run without leave_out_moving")
         return cls(T_start_end, 0.5 * (cov + cov.T), end.transition @ carried + end.noise[:, POSE])
 
-    def conditioned(self, end: Belief, found: _Found) -> Belief:
+    def conditioned(self, end: Belief, found: _FoundMotion) -> Belief:
         """Return the belief at the end, given the estimated error of the motion."""
         gain = np.linalg.solve(self.cov, self.cov_with_state.T).T
         return end.moved(gain @ found.error, end.cov - gain @ (self.cov - found.cov) @ gain.T)
@@ -280,7 +282,7 @@ class _Linear(NamedTuple):
         return mahalanobis_squared(self.residual_px - self.d_uv_d_motion @ error, spread)
 
 
-def _found(pairs: _Pairs, step: _Step, rig: StereoRig, rng: np.random.Generator) -> _Found:
+def _found(pairs: _Pairs, step: _Step, rig: StereoRig, rng: np.random.Generator) -> _FoundMotion:
     """Return the motion that most tracks agree on, among those that the prediction does not exclude."""
     root = np.linalg.cholesky(step.cov + 1e-12 * np.trace(step.cov) * np.eye(6))
     bound, most = float(chi2_bound(3, PROBABILITY)), float(chi2_bound(6, PROBABILITY))
@@ -298,7 +300,7 @@ def _found(pairs: _Pairs, step: _Step, rig: StereoRig, rng: np.random.Generator)
         problem = _Problem.of(linear, root)
     best, left = problem.solution(problem.chi2(best[None])[0] < bound)
     error, error_cov = root @ best, root @ left @ root.T
-    return _Found(error, error_cov, linear.chi2(error, error_cov) < bound)
+    return _FoundMotion(error, error_cov, linear.chi2(error, error_cov) < bound)
 
 
 class _Problem(NamedTuple):

@@ -26,7 +26,7 @@ from toolkit.track_errors.tracklets import (
 )
 
 # Standard deviations of the prior of an interval's motion, rad/s and m/s: far above its uncertainty by tracks.
-_TIE = np.repeat([0.1, 2.0], 3)
+_PRIOR_SIGMA = np.repeat([0.1, 2.0], 3)
 # Tracks whose (3 n, 6 n) Jacobians are in memory at a time.
 _AT_ONCE = 400
 _PROBES = 8
@@ -88,7 +88,9 @@ def adjusted(start: Adjusted, model: Tailed, sequence: Sequence, iterations: int
     from scipy.linalg import cho_solve_banded, cholesky_banded  # imported here because most processes do not need it
 
     poses, tracks, freedom = start.T_world_middle, start.tracks, start.freedom
-    tie = _Tie(se3_inverse(poses[:-1]) @ poses[1:], _TIE * np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S)
+    tie = _MotionPrior(
+        se3_inverse(poses[:-1]) @ poses[1:], _PRIOR_SIGMA * np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+    )
     for _ in range(iterations):
         system = _normal_equations(tracks, poses, sequence.rig, model)
         rows, error = tie.equations(poses)
@@ -122,7 +124,7 @@ def _used_up(factor: tuple[Array, bool], tie: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tie:
+class _MotionPrior:
     """A prior on the motions of the intervals: means (K - 1, 4, 4) and standard deviations (K - 1, 6)."""
 
     motion: Array

@@ -33,7 +33,7 @@ from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, 
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
 
-class _Unfinished(JITCodeLibrary):
+class _UnoptimisedLibrary(JITCodeLibrary):
     """The code of a part before optimisation; optimisation and code generation happen in the kernels that call it.
 
     By default numba does both for every part by itself, and again within every part that calls it.
@@ -52,7 +52,7 @@ class _Unfinished(JITCodeLibrary):
         self._finalized = True
 
 
-class _Passes(CompilerBase):
+class _ShortPipeline(CompilerBase):
     """The numba passes these functions need: they have no closures, generators or array expressions.
 
     numba's default looks for those, and for code to inline, prune and unroll, in a dozen more passes over each
@@ -79,7 +79,7 @@ class _Passes(CompilerBase):
         return [passes]
 
 
-class _Remembering(Context):
+class _CachedTyping(Context):
     """numba's typing rules, with the result for each call and its argument types cached.
 
     Uncached, they try a dozen rules, for arrays, tuples and strings, at each product of two numbers, and once more in
@@ -124,19 +124,19 @@ def _with_cached_types(function: Any) -> Any:
 
 
 @cache
-def _remembering(rules: Context) -> Context:
-    return _Remembering(rules)
+def _cached_typing(rules: Context) -> Context:
+    return _CachedTyping(rules)
 
 
 def _translated(dispatcher: Any, args: Any, return_type: Any, flags: Flags, library: JITCodeLibrary | None) -> Any:
     """Return numba's compilation of a function for some argument types, in its own library if ``library`` is None."""
     dispatcher.targetdescr.options.parse_as_flags(flags, dispatcher.targetoptions)
-    rules = _remembering(dispatcher.typingctx)
+    rules = _cached_typing(dispatcher.typingctx)
     target = dispatcher.targetctx.subtarget(typing_context=rules)
-    return compile_extra(rules, target, dispatcher.py_func, args, return_type, flags, {}, library, _Passes)
+    return compile_extra(rules, target, dispatcher.py_func, args, return_type, flags, {}, library, _ShortPipeline)
 
 
-class _Part(CPUDispatcher):
+class _PartDispatcher(CPUDispatcher):
     """A function called by kernels, compiled only as far as they need and once for all numeric arguments.
 
     numba would compile it again for each constant argument.
@@ -152,7 +152,7 @@ class _Part(CPUDispatcher):
         """Return numba's compilation of the function for some argument types."""
         flags, target = Flags(), self.targetctx
         flags.no_compile = True
-        library = _Unfinished(target.codegen(), self.py_func.__qualname__)
+        library = _UnoptimisedLibrary(target.codegen(), self.py_func.__qualname__)
         result = _translated(self, args, return_type, flags, library)
         # The key by which callers find it: numba uses the Python-callable function, which does not exist here.
         name = object()
@@ -170,10 +170,10 @@ class _Part(CPUDispatcher):
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Return a function that kernels may call; it is compiled together with the first kernel that calls it."""
-    return _Part(function, {"nopython": True, "no_cpython_wrapper": True, **_OPTIONS})
+    return _PartDispatcher(function, {"nopython": True, "no_cpython_wrapper": True, **_OPTIONS})
 
 
-class _KeptFor(FunctionCache):
+class _SourceKeyedCache(FunctionCache):
     """The cache of a function, keyed by the text of source files instead of the function's own file."""
 
     def __init__(self, function: Callable[..., Any], sources: str) -> None:
@@ -202,7 +202,7 @@ def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Ca
     def compile_or_load(function: Callable[..., Any]) -> Any:
         kernel = _kernel(function)
         try:
-            kernel._cache = _KeptFor(function, sources_of(folder))
+            kernel._cache = _SourceKeyedCache(function, sources_of(folder))
             with _without_collections():
                 kernel.compile(signature)
         except (OSError, RuntimeError):
