@@ -57,8 +57,9 @@ def decorrelation(
 
 
 class LastError(NamedTuple):
-    """The walked error of F tracks at their last sighting: its covariance (F, 3, 3) in the channels, px^2, and
-    ``gain`` (F, 3, 3 W), its covariance with the decorrelated residuals.
+    """The error of F tracks due to walk and offset at their last sighting, px.
+
+    ``cov`` (F, 3, 3) px^2 is its covariance in the channels, ``gain`` (F, 3, 3 W) that with the decorrelated residuals.
     """
 
     cov: Array
