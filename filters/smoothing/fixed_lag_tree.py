@@ -9,10 +9,10 @@ update costs no more. A dummy variable follows the newest state, for the conditi
 (``indeterminate``).
 
 A variable that makes the system indeterminate is held weakly at its value. A landmark that does so again in the same
-frame is dropped, and so are landmarks without a determined depth in a clique for which GTSAM names another variable.
-For a state, the first cause is rounding in the normal equations: the window is then solved by QR, which takes ten times
-as long, until vision has been available again for the length of the window. In either case a new tree is built from the
-factors of the old one, with the same estimates.
+frame is dropped, and so are landmarks without a determined depth in a clique for which GTSAM names another variable. If
+a state does so for the first time, the cause is rounding in the normal equations: the window is then solved by QR,
+which takes ten times as long, until vision has been available again for the length of the window. In either case a new
+tree is built from the factors of the old one, with the same estimates.
 
 Chained sightings are relinearised about the latest estimates in every frame, and everything else must be linearised
 there with them. A direction that neither motion nor vision observes, such as an exchange of tilt and accelerometer
@@ -178,7 +178,7 @@ class FixedLagTree:
         known = [key for key in (*self._landmark_stamps_ns, *self._state_stamps_ns) if key not in new]
         factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
         self._add(factors, values, slots, _key_list(known))
-        # QR eliminates singular systems without an error: it appears here, before anything is marginalised.
+        # QR eliminates singular systems without an error; solving raises it here, before anything is marginalised.
         self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
         still_there = [key for key in leaving if self._isam.valueExists(key)]

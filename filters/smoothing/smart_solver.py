@@ -17,8 +17,8 @@ from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 
 MOST_ITERATIONS = 5
-# Newton's method converges quadratically: after a step of so few sigmas of all states together the next is of a tenth
-# of one, and is taken with the next frame. If a step gains hardly anything, further ones gain nothing.
+# Newton's method converges quadratically: after a step shorter than this, in sigmas of all states together, the next is
+# a tenth of a sigma, and is taken with the next frame. If a step gains hardly anything, further ones gain nothing.
 LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
 # Used only after a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than
 # the information on position and heading in the world, and would fix these.

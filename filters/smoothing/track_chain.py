@@ -155,7 +155,7 @@ def without_jumps(
 class ChainedFactors:
     """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' norms.
 
-    With ``freedom``, the remaining error of a track is Student-t distributed as a whole, with so many degrees of
+    With ``freedom``, the remaining error of a track is Student-t distributed as a whole, with that number of degrees of
     freedom: a track with larger errors than the others throughout, such as one on a vehicle, has a smaller weight
     throughout (Lange, Little & Taylor 1989, "Robust statistical modeling using the t distribution", eq. 3).
     """
