@@ -99,8 +99,7 @@ def test_by_default_all_estimators_obey_one_gate_and_one_loss() -> None:
     outliers = DEFAULTS.outliers
     assert outliers.smoother_gate_factor == 1.0
     assert outliers.joint_huber == outliers.filter_huber == outliers.smoother_huber == outliers.batch_huber
-    assert outliers.gate_probability is not None and outliers.batch_cut_probability is not None
-    assert 1.0 - outliers.batch_cut_probability == outliers.gate_probability
+    assert outliers.gate_probability == 0.99
 
 
 def test_settings_cannot_be_changed() -> None:

@@ -45,9 +45,9 @@ _CHANGED = partial(msgspec.structs.replace, POLICIES["robust"])
 _HUBER = ("joint_huber", "filter_huber", "smoother_huber")
 CANDIDATES: dict[str, Outliers] = {
     **POLICIES,
-    "robust-gate-95": _CHANGED(gate_probability=0.95, batch_cut_probability=0.05),
+    "robust-gate-95": _CHANGED(gate_probability=0.95),
     "robust-huber-2.8": _CHANGED(**dict.fromkeys(_HUBER, 2.8)),
-    "robust-gate-99.99": _CHANGED(gate_probability=0.9999, batch_cut_probability=1e-4),
+    "robust-gate-99.9": _CHANGED(gate_probability=0.999),
     "robust-smoothers-4-x": _CHANGED(smoother_gate_factor=4.0),
 }
 

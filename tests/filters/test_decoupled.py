@@ -25,12 +25,12 @@ def accepted_share(sequence: Sequence) -> float:
 
 @pytest.mark.parametrize(
     ("scenario", "least"),
-    # A consistent filter passes 99.9 %. Without cross-covariances ours is too sure of its pose: measured over seeds, it
-    # passes 99.81 % on the drive, 99.77 % in flight, and on the IMU drive, where velocity and biases are too sure as
-    # well, 99.3 %. Less would mean that it starves itself of measurements.
-    [(DRIVE, 0.997), (FLIGHT, 0.996), (DRIVE_IMU, 0.98)],
+    # A consistent filter passes 99 %. Without cross-covariances ours is too sure of its pose: measured over seeds, it
+    # passes 98.7 % on the drive, 98.8 % in flight, and on the IMU drive, where velocity and biases are too sure as well,
+    # 97.4 %. Less would mean that it starves itself of measurements.
+    [(DRIVE, 0.98), (FLIGHT, 0.98), (DRIVE_IMU, 0.95)],
     ids=["drive", "flight", "drive-imu"],
 )
 def test_the_gate_lets_the_inliers_of_a_simulated_run_pass(scenario, least):
     share = np.mean([accepted_share(simulate(replace(scenario, duration_s=30.0), seed)) for seed in range(2)])
-    assert least < share < 0.9995
+    assert least < share < 0.994

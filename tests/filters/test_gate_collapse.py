@@ -1,7 +1,7 @@
 """Where the gate of the decoupled filter collapses its run is diverged, and no other rung is.
 
 A gate at 95 % refuses what a state is off by as soon as its covariance is a little too small, and without corrections
-the state runs off: the policy by default, at 99.9 %, spares the same filter that on the same recording.
+the state runs off: the policy by default, at 99 %, spares the same filter that on the same recording.
 """
 
 from dataclasses import replace

