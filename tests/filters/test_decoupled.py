@@ -26,8 +26,8 @@ def accepted_share(sequence: Sequence) -> float:
 @pytest.mark.parametrize(
     ("scenario", "least"),
     # A consistent filter passes 99 %. Without cross-covariances ours is too sure of its pose: measured over seeds, it
-    # passes 98.7 % on the drive, 98.8 % in flight, and on the IMU drive, where velocity and biases are too sure as well,
-    # 97.4 %. Less would mean that it starves itself of measurements.
+    # passes 98.7 % on the drive, 98.8 % in flight, and on the IMU drive, where velocity and biases are too sure as
+    # well, 97.4 %. Less would mean that it starves itself of measurements.
     [(DRIVE, 0.98), (FLIGHT, 0.98), (DRIVE_IMU, 0.95)],
     ids=["drive", "flight", "drive-imu"],
 )

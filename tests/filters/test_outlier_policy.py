@@ -95,8 +95,8 @@ def test_joint_filters_count_in_full_what_passes_their_gate_and_nothing_else(pul
 def test_the_common_policy_holds_from_its_loss_on_and_drops_beyond_its_gate(pull, name, held_at):
     """Loss and gate, 1.5 and 3.37 sigma of the innovation, have the landmark's variance in it, and the pose's.
 
-    The loss begins at 2.1 sigma of the sighting and the gate at 5.1. A joint filter counts a larger innovation with more
-    noise, and moves the landmark the less for it, so that its pull still grows up to the gate.
+    The loss begins at 2.1 sigma of the sighting and the gate at 5.1. A joint filter counts a larger innovation with
+    more noise, and moves the landmark the less for it, so that its pull still grows up to the gate.
     """
     at_one = pull(name, 1.0, "robust")
     assert at_one > 100.0 * NOTHING_M
