@@ -4,6 +4,7 @@ The position of a landmark seen once, far away, in a later nearby image is uncer
 often, by a fraction of a pixel. Poses are taken as exact, because a landmark shares the error of the poses that saw it.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -20,6 +21,7 @@ class KnownLandmarks:
         self._rig = rig
         self._points: dict[int, Array] = {}
         self._information: dict[int, Array] = {}
+        self._sightings = Counter[int]()
 
     def __contains__(self, track_id: int) -> bool:
         """Say whether a track has a landmark."""
@@ -43,6 +45,7 @@ class KnownLandmarks:
         if not frame.track_ids.size:
             return
         ids = frame.track_ids.tolist()
+        self._sightings.update(ids)
         points = [placed[i] if i in placed else self._points[i] for i in ids]
         expected = stereo.predict(np.array(points), T_world_imu, self._rig)
         H = left_only.whitener(frame.uvs_px, self._rig) @ left_only.seen_rows(frame.uvs_px, expected.d_uv_d_point)
@@ -64,6 +67,11 @@ class KnownLandmarks:
         for i in track_ids:
             self._points.pop(i, None)
             self._information.pop(i, None)
+            self._sightings.pop(i, None)
+
+    def confirmed(self, track_ids: Iterable[int]) -> BoolArray:
+        """Say which of the tracks (N,) have a landmark that more than one sighting agrees on."""
+        return np.array([self._sightings[i] > 1 for i in track_ids], dtype=bool)
 
     def of(self, track_ids: Iterable[int]) -> tuple[Array, Array]:
         """Return the points (n, 3) m of some known tracks and the covariances (n, 3, 3) m^2 of their errors."""

@@ -32,6 +32,9 @@ FEWEST_REFUSED = 3
 _STEPS = 5
 # A step that changes residuals by less than this, in sigma and as a root mean square, is the last.
 _LEAST_STEP = 0.01
+# A landmark that began with an outlier is far from all later sightings: while one sighting alone determines a landmark,
+# that one and the new one both have to be sound.
+_MOST_MISMATCHED_PAIRS = 1.0 - (1.0 - MOST_MISMATCHED) ** 2
 # The loss of batch between its first and its last solve.
 _LOSS = Cauchy(2.0)
 
@@ -84,7 +87,7 @@ class OutlierCheck:
         dof = left_only.degrees_of_freedom(uvs_px)
         bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
         far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
-        if far.mean() > MOST_MISMATCHED:
+        if far.mean() > np.where(known.confirmed, MOST_MISMATCHED, _MOST_MISMATCHED_PAIRS).mean():
             return np.zeros_like(known.rows)
         result = known.rows.copy()
         result[known.rows] = far
@@ -94,18 +97,21 @@ class OutlierCheck:
 class _KnownSightings(NamedTuple):
     """The sightings of known landmarks: which (N,) of a frame's they are, (n, 3) px, and the landmarks.
 
-    ``points`` (n, 3) are in m, ``covs`` (n, 3, 3) in m^2.
+    ``confirmed`` (n,) are the landmarks that more than one sighting agrees on, ``points`` (n, 3) are in m, ``covs``
+    (n, 3, 3) in m^2.
     """
 
     rows: BoolArray
     uvs_px: Array
+    confirmed: BoolArray
     points: Array
     covs: Array
 
     @classmethod
     def of(cls, frame: StereoFrame, landmarks: KnownLandmarks) -> Self:
         rows = landmarks.among(frame.track_ids.tolist())
-        return cls(rows, frame.uvs_px[rows], *landmarks.of(frame.track_ids[rows].tolist()))
+        ids = frame.track_ids[rows].tolist()
+        return cls(rows, frame.uvs_px[rows], landmarks.confirmed(ids), *landmarks.of(ids))
 
 
 class _AgreeingRejections(NamedTuple):

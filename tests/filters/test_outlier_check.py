@@ -104,3 +104,25 @@ def test_a_sighting_of_an_unknown_landmark_is_no_outlier():
     assert not check.outliers(packet.frame, none, expected).any()
     moved = replace(expected, T_world_imu=se3_inverse(expected.T_world_imu))
     assert not check.outliers(packet.frame, none, moved).any()
+
+
+def test_landmarks_that_began_with_an_outlier_do_not_put_the_state_in_doubt():
+    """A third of the landmarks is wrong, and a third of what is seen of the others: far are more than half."""
+    sequence, rng = simulate(CLEAN, 3), np.random.default_rng(0)
+    packet, expected = expected_states(sequence)[20]
+    points, frame = landmarks_of(CLEAN, 3), packet.frame
+    before, pose = expected_states(sequence)[19][0].frame, sequence.truth.T_world_imu[packet.index]
+    both = np.intersect1d(before.track_ids, frame.track_ids)
+    seen = before.select(np.isin(before.track_ids, both))
+    began_wrong, seen_wrong = rng.permutation(both)[: both.size // 3], rng.permutation(both)[: both.size // 3]
+    moved = {i: points[i] + (2.0 if i in began_wrong else 0.0) for i in both.tolist()}
+    landmarks = KnownLandmarks(sequence.rig)
+    landmarks.see(seen, moved, sequence.truth.T_world_imu[packet.index - 1], share=1.0)
+    struck = frame.select(np.isin(frame.track_ids, both))
+    off = np.where(np.isin(struck.track_ids, seen_wrong)[:, None], 40.0, 0.0) * np.array([1.0, 1.0, -1.0])
+    struck = replace(struck, uvs_px=struck.uvs_px + off)
+    found = OutlierCheck(sequence.rig, POLICY).outliers(struck, landmarks, replace(expected, T_world_imu=pose))
+    wrong = np.isin(struck.track_ids, np.union1d(began_wrong, seen_wrong))
+    assert wrong.mean() > 0.5
+    assert found[wrong].mean() > 0.9
+    assert found[~wrong].mean() < 0.1
