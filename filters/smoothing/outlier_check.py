@@ -87,7 +87,11 @@ class OutlierCheck:
         dof = left_only.degrees_of_freedom(uvs_px)
         bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
         far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
-        if far.mean() > np.where(known.confirmed, MOST_MISMATCHED, _MOST_MISMATCHED_PAIRS).mean():
+        if known.confirmed.any():
+            is_state_wrong = far[known.confirmed].mean() > MOST_MISMATCHED
+        else:
+            is_state_wrong = far.mean() > _MOST_MISMATCHED_PAIRS
+        if is_state_wrong:
             return np.zeros_like(known.rows)
         result = known.rows.copy()
         result[known.rows] = far
