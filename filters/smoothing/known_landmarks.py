@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import left_only, stereo
-from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 
 
 class KnownLandmarks:
@@ -40,7 +40,7 @@ class KnownLandmarks:
         """Add the sightings of a frame from a pose (4, 4), of known landmarks and of those ``placed`` here.
 
         Each has a weight in (0, 1], ``share``. With a track noise model, errors persist from sighting to sighting, and
-        only the newest sighting predicts how far the next one will be from the landmark.
+        only the newest sighting in both images predicts how far the next one will be from the landmark.
         """
         if not frame.track_ids.size:
             return
@@ -49,9 +49,13 @@ class KnownLandmarks:
         points = [placed[i] if i in placed else self._points[i] for i in ids]
         expected = stereo.predict(np.array(points), T_world_imu, self._rig)
         H = left_only.whitener(frame.uvs_px, self._rig) @ left_only.seen_rows(frame.uvs_px, expected.d_uv_d_point)
-        for i, point, told in zip(ids, points, share * (np.swapaxes(H, 1, 2) @ H), strict=True):
-            before = self._information.get(i) if self._rig.track_noise is None else None
-            self._points[i], self._information[i] = point, told if before is None else before + told
+        self._points.update(zip(ids, points, strict=True))
+        information = zip(ids, share * (np.swapaxes(H, 1, 2) @ H), strict=True)
+        if self._rig.track_noise is None:
+            self._information.update({i: self._information.get(i, 0.0) + one for i, one in information})
+        else:
+            in_both = ~is_left_only(frame.uvs_px)
+            self._information.update({i: one for (i, one), both in zip(information, in_both, strict=True) if both})
 
     def move(self, points: Mapping[int, Array]) -> None:
         """Update the points of landmarks."""

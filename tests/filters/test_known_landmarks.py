@@ -14,7 +14,7 @@ from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.settings import POLICIES
-from toolkit.simulation import DRIVE, simulate
+from toolkit.simulation import DRIVE, SCENARIOS, simulate
 from toolkit.track_noise import TrackNoise
 
 RIG, COUNT = DRIVE.rig, 4000
@@ -90,6 +90,36 @@ def test_sightings_that_count_for_a_share_tell_as_much_less():
 def test_where_errors_are_taken_along_the_newest_sighting_alone_counts():
     walking = replace(RIG, track_noise=TrackNoise(np.full(3, 0.1), np.full(3, 0.1), np.full(3, 0.5)))
     np.testing.assert_allclose(told_by(walking, 1.0, 7), told_by(RIG, 1.0, 1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [None, TrackNoise(np.full(3, 0.1), np.full(3, 0.1), np.full(3, 0.5))])
+def test_a_sighting_without_the_right_image_leaves_the_depth_known(noise):
+    """Alone it determines no depth. Where sightings err alike, it replaces none that did."""
+    rig = replace(RIG, track_noise=noise)
+    landmarks, point = KnownLandmarks(rig), landmarks_ahead()[:1]
+    both_px = stereo.predict(point, np.eye(4), rig).uv_px
+    for uvs_px in (both_px, both_px * [1.0, np.nan, 1.0]):
+        landmarks.see(StereoFrame(0, IDS[:1], uvs_px, np.zeros(1, dtype=int)), {0: point[0]}, np.eye(4), 1.0)
+    once, (cov,) = told_by(RIG, 1.0, 1), landmarks.of([0])[1]
+    assert np.linalg.eigvalsh(once - cov).min() > -1e-9 * np.trace(once)
+    if noise is not None:
+        np.testing.assert_allclose(cov, once, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "smart", "isam2"])
+def test_smoothers_told_of_tracks_noise_go_on_where_the_right_image_is_missing(name, run_estimator):
+    drive = simulate(replace(SCENARIOS["drive-realistic"], duration_s=1.0), 0)
+    uv_px, lacks = drive.observations.uv_px.copy(), np.random.default_rng(0).random(len(drive.observations)) < 0.3
+    lacks[np.unique(drive.observations.track_id, return_index=True)[1]] = False
+    uv_px[lacks, 1] = np.nan
+    noise = TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
+    left_alone = replace(
+        drive,
+        observations=replace(drive.observations, uv_px=uv_px),
+        rig=replace(drive.rig, track_noise=noise),
+    )
+    run = run_estimator(name, left_alone)
+    assert run.status == "ok", run.log
 
 
 def test_a_landmark_that_was_dropped_starts_anew():
