@@ -10,7 +10,8 @@ tree"):
   replaces it in the tree.
 
 The causal answer is the newest state. For the final answer everything is relinearised until the error no longer falls,
-which gives the optimum of all factors in the graph. A landmark is dropped, and the log says so, if it falls behind the
+which gives the optimum of all factors in the graph. If the residuals there give tracks less weight than they had, it is
+solved for once more with that weight. A landmark is dropped, and the log says so, if it falls behind the
 camera, makes the system indeterminate, or has more sightings rejected by its gate than it was built from while the
 rejected ones agree.
 
@@ -31,12 +32,13 @@ from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.linearisation_error import linearised_badly
 from filters.smoothing.robust_schedule import CHAIN_STOPPING
+from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.factors import L, X, landmark_keys
 from toolkit.models.motion import state_cov
-from toolkit.sequence import Packet
+from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark a variable, bridge; one step a frame, old ones frozen"
@@ -62,7 +64,7 @@ class Isam2:
         if setup.rig.track_noise is not None:
             self._chained = ChainedPast(setup.rig, setup.settings.outliers.smoother_huber, FROZEN_AFTER_FRAMES + 1)
         self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m, self._chained)
-        self._stamps_ns: list[int] = []
+        self._stamps_ns, self._used = list[int](), list[StereoFrame]()
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
@@ -70,6 +72,7 @@ class Isam2:
         self._note(packet, self._tree.see(landmark_keys(packet.frame.track_ids.tolist())))
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
+        self._used.append(packet.frame.select(is_among(packet.frame.track_ids, np.array(extension.landmark_ids))))
         recovery = self._tree.add(extension.factors, extension.values, extension.state_keys, extension.chained)
         self._note(packet, recovery)
         estimate = self._newest(extension, packet)
@@ -83,18 +86,34 @@ class Isam2:
         return estimate
 
     def finish(self) -> Finished:
-        """Solve for every state and landmark, relinearising all of them until the error no longer falls."""
-        graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
-        beside, stopping = (None, _LAST_STOPPING) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
-        start = self._tree.values()
-        landmarks = FirstImages.in_graph(graph, self._rig) if beside is None else beside
-        values, _, _, converged, _ = solve(graph, start, stopping, self._progress, landmarks=landmarks)
-        if beside is not None:
-            graph.push_back(beside.linearised(values))
+        """Solve for every state and landmark, with the weight that tracks have by their residuals at the solution."""
+        graph, values, converged = self._solved(self._tree.graph(), self._tree.values())
+        T_world_imu = np.array([values.atPose3(X(k)).matrix() for k in range(len(self._stamps_ns))])
+        if self._builder.learn_from_all(self._used, T_world_imu, self._points(values)):
+            graph, values, converged = self._solved(graph, values)
+        motion = self._builder.motion
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
-        points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), motion)
-        return Finished(trajectory, Landmarks.of(points), converged, (*self._builder.log(), *self._log, *log))
+        landmarks = Landmarks.of(self._points(values))
+        return Finished(trajectory, landmarks, converged, (*self._builder.log(), *self._log, *log))
+
+    def _solved(
+        self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, bool]:
+        """Relinearise all until the error no longer falls; return the graph, the values and whether it converged.
+
+        Chained sightings, which are not in the graph given, are linear in the one returned.
+        """
+        graph = self._builder.brought_up_to_date(graph)
+        beside, stopping = (None, _LAST_STOPPING) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
+        landmarks = FirstImages.in_graph(graph, self._rig) if beside is None else beside
+        solution = solve(graph, start, stopping, self._progress, landmarks=landmarks)
+        if beside is not None:
+            graph.push_back(beside.linearised(solution.values))
+        return graph, solution.values, solution.converged
+
+    def _points(self, values: gtsam.Values) -> dict[int, Array]:
+        return {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
 
     def _learn(self, packet: Packet) -> None:
         """Measure the residual correlation of tracks in an earlier frame, whose pose has settled."""

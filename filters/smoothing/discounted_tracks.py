@@ -83,6 +83,7 @@ class DiscountedTracks:
     """
 
     def __init__(self, setup: Setup) -> None:
+        self._setup = setup
         self._rig, self._huber = setup.rig, setup.settings.outliers.smoother_huber
         self._correlation = ResidualCorrelation.of(setup)
         self._beside_imu = setup.motion_kind == "imu"
@@ -118,6 +119,14 @@ class DiscountedTracks:
         for frame, pose in zip(frames, T_world_imu, strict=True):
             self.settle(frame, pose)
         self._correlation.settle_last()
+
+    def relearned(
+        self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]
+    ) -> "DiscountedTracks":
+        """Return the weight measured from nothing but residuals of points (3,) m at the final poses (K, 4, 4)."""
+        anew = DiscountedTracks(self._setup)
+        anew.learn_from_all(frames, T_world_imu, points)
+        return anew
 
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Add the next frame whose pose (4, 4) will hardly change any more."""

@@ -105,6 +105,19 @@ class GraphBuilder:
         points = {i: known[i] for i in seen_often(self._used.values()) if i in known}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
 
+    def learn_from_all(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> bool:
+        """Use all sightings in the graph for the weight of tracks, at the final poses (K, 4, 4) and points (3,) m.
+
+        Return whether it fell. Of the weight measured during the run and this one, the smaller holds: each misses some
+        of the correlation, the first because few sightings have determined a landmark yet.
+        """
+        points = {i: points[i] for i in seen_often(frames) if i in points}
+        anew = self._tracks.relearned(frames, T_world_imu, points)
+        fell = anew.share < self._tracks.share
+        if fell:
+            self._tracks = anew
+        return fell
+
     @property
     def is_outdated(self) -> bool:
         """Say whether the weight of sightings in the graph differs much from their present weight."""
