@@ -98,4 +98,4 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_r
         for sequence in (paused, jumped):
             reported = clock_jump.check(Evidence(sequence))
             assert isinstance(reported, Undecided)
-            assert "do not tell whether time passed" in reported.why
+            assert "do not determine whether time passed" in reported.why

@@ -1,4 +1,4 @@
-"""Stamps that come unevenly while the images do not: told, and never where images are lost or come unevenly."""
+"""Stamps that come unevenly while the images do not: reported, and never where images are lost or come unevenly."""
 
 import re
 from dataclasses import replace
