@@ -142,7 +142,7 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
         extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(i), np.ones(3), information))
     recovery = window.add(extension, 0)
     assert [line.split(" ", 3)[0] for line in recovery.log] == ["l6", "l6"]
-    assert "is held weakly" in recovery.log[0]
+    assert "has a weak prior at its value" in recovery.log[0]
     assert "was dropped" in recovery.log[1]
     assert recovery.dropped == {6}
     assert not window.values().exists(L(6))

@@ -144,4 +144,4 @@ def test_images_alone_do_not_tell_the_scale(run_estimator):
 
 
 def test_what_the_scale_came_to_is_reported_with_its_prior():
-    assert "+1.20 +- 0.30 % longer than the rig says (prior 0 +- 1 %)" in ScaleState(0.01).message_of(0.012, 0.003)
+    assert "+1.20 +- 0.30 % longer than the rig's (prior 0 +- 1 %)" in ScaleState(0.01).message_of(0.012, 0.003)
