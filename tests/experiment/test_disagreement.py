@@ -88,7 +88,7 @@ def test_one_that_parts_and_whose_corrections_cannot_be_checked_is_no_witness_ag
     far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
     held = row("seed-ekf", far, cov)
     scored = held.outcomes[0].outputs["causal"]
-    notes = replace(scored, scores=Scores(scored.scores.values, {TREND: "the estimator holds its biases"}))
+    notes = replace(scored, scores=Scores(scored.scores.values, {TREND: "the estimator does not estimate biases"}))
     held = Row("causal", (replace(held.outcomes[0], outputs={"causal": notes}),))
     motion = row("dead-reckoning", poses, cov)
     dispute = Dispute.of([motion, held])

@@ -118,7 +118,7 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
     comparison: Comparison, rescored: Rescored
 ) -> None:
-    harm = "explains withheld tracks worse than dead reckoning: it misses them 3.00 +- 0.10 times as far"
+    harm = "explains withheld tracks worse than dead reckoning: its reprojection error is 3.00 +- 0.10 times"
 
     def given(row: Row) -> Scores:
         is_first = row.estimator == comparison.lines[0].estimator
