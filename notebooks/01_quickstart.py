@@ -89,7 +89,7 @@ result.table("ATE SE(3)", "reproj held-out", "NIS mean")
 #   columns are there if the truth is.
 # - **reproj held-out** needs no truth. One track in ten is hidden from all estimators. Their poses must predict where
 #   the cameras saw those points; the number is the median error in pixels. Nobody can win it by fitting harder.
-# - **NIS** compares the surprises a filter met with those it expected: 1 is honest, more is too sure of itself.
+# - **NIS** compares the surprises a filter met with those it expected: 1 is honest, more is overconfident.
 #
 # `causal` is what an estimator said at each frame, knowing the past only; `final` is what it said at the end; `both`
 # stands where the two are the same, as with a filter. A smoother has seen the future, so the table keeps them apart.

@@ -194,9 +194,9 @@ for part, px in (("white", card.noise.white_px), ("walk", card.noise.walk_px), (
 # %% [markdown]
 # ## Counted for what they tell
 #
-# That tracks are like this shows while an estimator runs: white noise leaves residuals that do not know of each other.
-# Filters with a window and smoothers measure the correlation, and have tracks count for less where there is one. That
-# is what they do unless told otherwise; above, `match_tracks` was off. Nobody has to say what the tracks are like.
+# An estimator can detect this correlation while it runs: white noise leaves uncorrelated residuals.
+# Filters with a window and smoothers measure the correlation, and give tracks less weight where there is one. That
+# is the default; above, `match_tracks` was off. The noise of the tracks need not be stated.
 
 # %%
 matched = compare(**SOURCE, estimators=CHOSEN)

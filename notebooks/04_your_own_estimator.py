@@ -163,7 +163,7 @@ print("two-view:", find("two-view").summary())
 # ## Does it know its own error?
 #
 # Now it can run in other processes, over many seeds. The NEES is the squared error over the covariance that the
-# estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
+# estimator states: 1 is honest, more is overconfident (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
 over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=4, max_frames=25)

@@ -288,7 +288,7 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"from_s": 5.0, "to_s": 2.0}, "from 5 s to 2 s"),
         ({"to_s": float("nan")}, "from 0 s to nan s"),
         ({"settings": "window"}, "settings is a str"),
-        ({"estimators": []}, "nothing is to be compared"),
+        ({"estimators": []}, "there is nothing to compare"),
         ({"estimators": [3]}, "estimators has an int, expected names"),
         ({"estimators": 3}, "estimators has an int, expected names"),
         ({"estimators": {"mine": find("ekf").load()}}, "functions build\\(setup\\) go by name into own"),

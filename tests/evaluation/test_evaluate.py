@@ -94,7 +94,7 @@ def test_a_run_over_a_tenth_of_the_path_does_not_win(scene, vislam, capsys) -> N
     short = next(run for run in found["runs"] if run["estimator"] == "short")
     assert short["status"] == "failed"
     assert short["metrics"]["ate_se3_m"] < 0.01
-    assert "covers 9.9 % of the truth's time, and 50 % is asked for" in capsys.readouterr().out
+    assert "covers 9.9 % of the truth's time, and 50 % is required" in capsys.readouterr().out
     assert vislam("evaluate", "truth.tum", "short.tum", "--least-coverage", "5", "--quiet") == 0
 
 

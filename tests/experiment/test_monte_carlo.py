@@ -198,7 +198,7 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) 
     for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
-        assert "too sure of itself" in " ".join(text.split())
+        assert "overconfident" in " ".join(text.split())
     assert max(map(len, comparison_text(over).splitlines())) <= 100
 
 

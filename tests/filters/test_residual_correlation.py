@@ -1,4 +1,4 @@
-"""Tracks count for less where residuals along them are correlated, by as much as that costs, and in full where not."""
+"""Tracks have less weight where residuals along them are correlated, by as much as that costs, else full weight."""
 
 from dataclasses import replace
 

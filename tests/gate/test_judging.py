@@ -118,7 +118,7 @@ def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline, gate):
 @pytest.mark.parametrize(
     ("was", "now", "fails"),
     [
-        (4.0, 4.4, True),  # too sure of itself, and more so
+        (4.0, 4.4, True),  # overconfident, and more so
         (4.0, 3.6, False),  # nearer to honest
         (0.30, 0.27, True),  # timid, and more so
         (0.30, 0.33, False),

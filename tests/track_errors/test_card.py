@@ -90,7 +90,7 @@ def test_a_report_has_the_card_where_the_noise_was_fitted(walking: Sequence) -> 
     assert "fitted to the whole recording, which causal answers know too early" in comparison_text(
         comparison, width=None
     )
-    assert any("causal answers know it too early" in fact for fact in report.words.facts)
+    assert any("causal answers use it too early" in fact for fact in report.words.facts)
 
 
 def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:

@@ -77,7 +77,7 @@ def test_too_few_tracks_are_refused_with_what_to_do(exact: Sequence) -> None:
 
 
 def test_a_calibration_that_suits_no_motion_is_refused_in_one_line(walking: Sequence) -> None:
-    with pytest.raises(DataError, match="no motion of the camera suits the tracks"):
+    with pytest.raises(DataError, match="no motion of the camera fits the tracks"):
         fit_track_noise(identity_intrinsics(walking.truncated(50)))
 
 

@@ -55,7 +55,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not (self.estimators or self.own or self.trajectories):
-            raise SettingsError("nothing is to be compared: name an estimator, or a trajectory of another system")
+            raise SettingsError("there is nothing to compare: name an estimator, or a trajectory of another system")
         if self.max_frames is not None and not self.max_frames >= 2:
             raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
         if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:

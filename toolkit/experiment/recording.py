@@ -268,11 +268,11 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
     at_rest, counts = without_moving_tracks(sequence, prior)
     share = counts.sightings / max(counts.of_sightings, 1)
     fact = (
-        f"not given to estimators, for it moves against the motion and most other tracks (tracks.leave_out_moving): "
+        f"not given to estimators, because they contradict the motion and most other tracks (tracks.leave_out_moving): "
         f"{share:.1%} of the sightings, of {counts.tracks} of {counts.of_tracks} tracks"
     )
     if counts.undecided_frames:
-        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to tell"
+        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to decide"
     provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
     return replace(at_rest, provenance=provenance), share
 
@@ -305,9 +305,9 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     """
     used = used if fit_s is None else _first_seconds(used, fit_s)
     fitted = fit_track_noise(used)
-    basis = "all that is used of the recording, so that causal answers know it too early"
+    basis = "all that is used of the recording, so that causal answers use it too early"
     if fit_s is not None:
-        basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
+        basis = f"the first {fit_s:g} s, which causal answers of that time use too early"
     fact = f"noise of tracks, fitted to {basis}: {summary_of(fitted, whole.rig.cov_uv_px2)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig

@@ -130,13 +130,13 @@ def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
     """Return the start from the specific force alone, if there is any, and in its source why vision was not used."""
     if isinstance(sequence.noise, TwistChangeNoise):
         sigmas = [GAUGE_SIGMA, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, TURN_SIGMA]
-        source = f"the first frame as the world; velocity and turn rate unknown and taken for zero, for {why}"
+        source = f"the first frame as the world; velocity and turn rate unknown and assumed to be zero, because {why}"
         return Prior(np.eye(4), np.zeros(3), np.zeros(6), np.diag(np.repeat(sigmas, 3) ** 2), source)
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
     cov = 0.5 * (cov + cov.T)
-    source = f"the specific force; velocity unknown and taken for zero, for {why}"
+    source = f"the specific force; velocity unknown and assumed to be zero, because {why}"
     return Prior(se3(attitude, np.zeros(3)), np.zeros(3), np.zeros(6), cov, source)
 
 
