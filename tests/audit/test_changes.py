@@ -76,7 +76,7 @@ def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
 @pytest.mark.parametrize("scenario", ["drive-imu", "flight"])
 def test_a_camera_clock_that_is_set_on_the_way_is_reported(scenario: str) -> None:
     reported = messages(audit(faults.camera_clock_step(sound(scenario), 0.08)))["clock-change"]
-    found = re.search(r"part by (-?\d+) \+- (\d+) ms", reported)
+    found = re.search(r"changes by (-?\d+) \+- (\d+) ms", reported)
     assert found is not None
     assert float(found[1]) == pytest.approx(-80.0, abs=3.0 * float(found[2]))
 
@@ -101,7 +101,7 @@ def test_a_camera_clock_that_is_set_by_little_is_reported_within_its_error(durat
     flight = simulate(replace(SCENARIOS["flight-realistic"], duration_s=duration_s), 102)
     symptom = check(Evidence(faults.camera_clock_step(flight, 0.025)))
     assert isinstance(symptom, Symptom)
-    found = re.search(r"part by (-?\d+) \+- (\d+) ms", symptom.detail)
+    found = re.search(r"changes by (-?\d+) \+- (\d+) ms", symptom.detail)
     assert found is not None
     # Printed to a millisecond.
     assert float(found[1]) == pytest.approx(-25.0, abs=3.0 * float(found[2]) + 0.5)

@@ -30,7 +30,7 @@ def test_a_clock_that_is_set_by_steps_is_reported_with_its_size_and_cut_at(
     dose_s = steps * float(np.diff(sound.frames_s[:2])[0])
     found = clock_jump.check(Evidence(faults.clock_jump(sound, dose_s, seed)))
     if scenario == "flight" and isinstance(found, Undecided):  # its tracks tell half of a step on some seeds only
-        assert abs(steps) < 1.0 and "leap together" in found.why
+        assert abs(steps) < 1.0 and "jump together" in found.why
         return
     assert isinstance(found, Symptom) and found.harmful and found.remedy is not None
     match = re.search(r"set by ([-+][\d.]+) s at", found.detail)

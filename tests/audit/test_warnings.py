@@ -171,7 +171,7 @@ def test_a_tenth_of_tracks_that_slide_is_reported_where_the_noise_is_right(scena
     assert 1.0 < float(match[1]) < 10.0  # some slide by less than four standard deviations a frame
     # With twice the noise stated they are beneath it.
     beneath = scatter_of(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
-    assert beneath is None or ("times too large" in beneath and "miss by more" not in beneath)
+    assert beneath is None or ("times too large" in beneath and "have residuals of more than" not in beneath)
 
 
 def scatter_of(sequence: Sequence) -> str | None:

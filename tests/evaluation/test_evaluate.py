@@ -346,7 +346,7 @@ def test_an_estimate_that_stays_looks_one_way_or_leaps_is_remarked_and_a_sound_o
     assert "ate_se3_m" not in notes["sound"]
     assert "stands still" in notes["stays"]["ate_se3_m"]
     assert "orientations are all one" in notes["one_way"]["ate_se3_deg"]
-    assert "leaps, 2 time(s), the farthest by 30" in notes["leaps"]["ate_se3_m"]
+    assert "jumps, 2 time(s), the farthest by 30" in notes["leaps"]["ate_se3_m"]
     assert re.search(r" (19|29)\.9 s after its first pose", notes["leaps"]["ate_se3_m"])
 
 

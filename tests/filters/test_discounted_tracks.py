@@ -187,4 +187,4 @@ def test_neighbours_count_beside_odometry_whose_white_noise_is_larger_than_what_
     tracks = DiscountedTracks(Setup(sequence.rig, noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
     tracks.learn_from_all(*clusters_err_as_one)
     assert tracks.share < 0.3
-    assert ("neighbours as one" in tracks.messages[0]) == counts
+    assert ("neighbours have a common error" in tracks.messages[0]) == counts

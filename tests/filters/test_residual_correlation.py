@@ -85,7 +85,7 @@ def learnt_of_pairs(rig, correlation, counts_neighbours):
 def test_landmarks_count_for_less_by_the_neighbours_that_err_as_one(drive):
     alone, beside = (learnt_of_pairs(drive.rig, 0.8, counts) for counts in (False, True))
     assert "neighbours" not in alone.messages[0]
-    assert "neighbours as one" in beside.messages[0]
+    assert "neighbours have a common error" in beside.messages[0]
     assert beside.share < 0.6 * alone.share
 
 

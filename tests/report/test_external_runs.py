@@ -71,7 +71,7 @@ def test_the_truth_in_any_format_is_without_error_and_says_what_it_cannot_tell(
     assert scores.notes["nees_pose_mean"] == "the estimator states no covariance"
     assert scores.notes["total_s"] == "not run here"
     assert "not run here" in run.log[0]
-    assert "stands as final" in run.log[1]
+    assert "listed as final" in run.log[1]
 
 
 def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording: Sequence) -> None:

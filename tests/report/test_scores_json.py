@@ -111,7 +111,7 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
         "band": [0.0, 4.0],
     }
     words = [line for line in note_lines(leaning) if "contradicted" in line]
-    assert words[0].startswith("steady is contradicted: its tracks turn its state one way, 5.2")
+    assert words[0].startswith("steady is contradicted: the corrections by its tracks have one direction, 5.2")
     assert "by chance at most 4.00" in words[0]
 
 

@@ -45,7 +45,7 @@ def test_white_noise_comes_out_white(white_fit: Fit) -> None:
     # c is the mean of two columns of 1 px, d their difference, v the mean of two rows; 600 tracks are good for 3 %.
     np.testing.assert_allclose(white_fit.noise.white_px, [np.sqrt(0.5), np.sqrt(2.0), np.sqrt(0.5)], rtol=0.1)
     stated_px2 = 2.0**2 * np.diag([1.0, 1.0, 0.5])
-    assert "each sighting by itself" in summary_of(white_fit, stated_px2)
+    assert "independent between sightings" in summary_of(white_fit, stated_px2)
     times = re.search(
         r"recording's own 1.41/2.83/1.41 px in c/d/v, ([\d.]+) times that", summary_of(white_fit, stated_px2)
     )

@@ -76,7 +76,7 @@ REPORTED = {
         CAUSAL,
         "its answer to frame 0 differs where the packets from frame 2 on are withheld",
     ),
-    "look-ahead through what another run left": (CAUSAL, "another one where the packets"),
+    "look-ahead through what another run left": (CAUSAL, "differs where the packets"),
     "covariance not positive definite": (
         COVARIANCES,
         "the covariance of its answer to frame 7 is not positive definite",
@@ -185,7 +185,7 @@ def test_too_sure_and_too_timid_are_distinguished_from_honest() -> None:
     alarms = sum(bool(inconsistency((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
     assert alarms <= 8  # of 2000 at 0.1 % two are expected; a Poisson of 2 exceeds 8 once in four thousand
     assert "overconfident" in inconsistency([2.5] * 8)
-    assert "less sure" in inconsistency([0.3] * 8)
+    assert "less certain" in inconsistency([0.3] * 8)
 
 
 def test_a_covariance_with_units_far_apart_is_sound() -> None:

@@ -359,4 +359,4 @@ def _summary_lines(found: Differences, moved: int, shown: int) -> Iterator[str]:
         rate = f"{100.0 * FALSE_ALARM_RATE:g} %"
         yield f"chance: {found.tests} tests, {how}, which share a false-alarm rate of {rate} (Holm)"
     else:
-        yield "chance: one run on each side tells nothing of it; compare over --seeds"
+        yield "chance: unknown from one run on each side; compare over --seeds"
