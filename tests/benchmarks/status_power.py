@@ -12,14 +12,14 @@ recording all of that is a false alarm, and so is the mark timid.
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
 thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`, `fourth`,
 `fifth`, `sixth`, `seventh` and `eighth` are draws of others yet, with one recording drawn for every fault. In `sixth`
-and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be judged by, beside
+and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be tested by, beside
 one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and two by
 two, as they meet faults, and what any of these comparisons says is a false alarm.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
 
-With --keep DIRECTORY every run is pickled there, and what is there already is judged by the code as it is, not run.
+With --keep DIRECTORY every run is pickled there, and what is there already is evaluated by the code as it is, not run.
 """
 
 import argparse
@@ -263,7 +263,7 @@ def _unless_refused(make: Callable[[], Result]) -> Result | str:
 
 
 def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
-    """Run an estimator, or judge the run that is kept by the code as it is."""
+    """Run an estimator, or evaluate the run that is kept by the code as it is."""
     if kept is not None and kept.exists():
         run: Run = pickle.loads(kept.read_bytes())
         log = tuple(line for line in run.log if not line.startswith("the trajectory diverged"))

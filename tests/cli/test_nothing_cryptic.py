@@ -1,4 +1,4 @@
-"""Names of others act on nothing, sizes are judged before a run, and a misspelt name gets the nearest one."""
+"""Names of others act on nothing, sizes are checked before a run, and a misspelt name gets the nearest one."""
 
 import json
 import os

@@ -16,8 +16,8 @@ from toolkit.gate.interleaved import (
     MARGIN,
     MOST_PAIRS,
     TimedPairs,
+    check_speeds,
     compare_speed,
-    judge_speeds,
     pairs_needed,
     timers,
     unpacked,
@@ -45,7 +45,7 @@ def findings(ratio: float, checks: int, seed: int) -> list[list[str]]:
     """Return what is found of eight estimators in each of some checks, the first of them slower."""
     rng = np.random.default_rng(seed)
     return [
-        [v.finding for v in judge_speeds([timed(ratio if i == 0 else 1.0, rng) for i in range(8)], "v1", 0.05)]
+        [v.finding for v in check_speeds([timed(ratio if i == 0 else 1.0, rng) for i in range(8)], "v1", 0.05)]
         for _ in range(checks)
     ]
 
@@ -65,7 +65,7 @@ def test_a_run_that_was_interrupted_spoils_nothing():
     rng = np.random.default_rng(5)
     one = timed(1.0, rng, 20)
     one.cpu_s[3, 1] *= 50.0
-    (verdict,) = judge_speeds([one], "v1", 0.05)
+    (verdict,) = check_speeds([one], "v1", 0.05)
     assert verdict.finding == "same"
     assert abs(verdict.change_percent) < 5.0
 

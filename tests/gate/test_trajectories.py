@@ -120,7 +120,7 @@ def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_checked(vislam, caps
     messages = " ".join(capsys.readouterr().out.split())
     assert "lap: sequence is missing: results/lap.tum: 3 columns" in messages
     assert "maze: sequence is missing: no trajectory of it is in results; the baseline has maze/0.txt" in messages
-    assert "not in the baseline, and not judged: new" in messages
+    assert "not in the baseline, and not checked: new" in messages
 
 
 def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):

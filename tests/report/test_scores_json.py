@@ -51,7 +51,7 @@ def test_key_order_is_stable(document: dict[str, Any]) -> None:
         assert list(run["metrics"]) == list(describe())
 
 
-def test_what_the_audit_could_not_judge_is_reported(comparison: Comparison, document: dict[str, Any]) -> None:
+def test_what_the_audit_could_not_decide_is_reported(comparison: Comparison, document: dict[str, Any]) -> None:
     assert comparison.undecided
     assert document["undecided"] == comparison.undecided
 

@@ -40,7 +40,7 @@ class MarginRecord(Struct, frozen=True, kw_only=True):
     """When a metric of simulated sequences is worse."""
 
     worse: Worse
-    margin_percent: Annotated[Percent, Meta(description="the mean worsening that nobody minds")]
+    margin_percent: Annotated[Percent, Meta(description="the mean worsening that is tolerated")]
 
 
 class BoundRecord(Struct, frozen=True, kw_only=True):

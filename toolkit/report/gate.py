@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 from toolkit.errors import printable
 from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
-from toolkit.gate.judging import SHOWN
+from toolkit.gate.case_check import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict, check_document
 from toolkit.metrics import known_metrics
 from toolkit.report.prose import WIDTH, Width, section

@@ -56,7 +56,7 @@ def finding_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason why faults could not be judged, behind their names."""
+    """Yield a line for each reason why faults could not be decided, behind their names."""
     by_reason: dict[str, list[str]] = {}
     for fault, why in undecided.items():
         by_reason.setdefault(why, []).append(fault)

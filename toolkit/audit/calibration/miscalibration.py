@@ -107,7 +107,7 @@ def _undecided(least_rad: float, by_velocity: bool) -> str | None:
         return None
     cause = "wheel slip that lasts for seconds is as large" if by_velocity else "too little change of rotation"
     hidden = (
-        "any rotation of it" if not np.isfinite(least_rad) else (f"a rotation of it by less than {least_rad:.2f} rad")
+        "any rotation of it" if not np.isfinite(least_rad) else f"a rotation of it by less than {least_rad:.2f} rad"
     )
     return f"the camera's orientation: {hidden} would not show, for {cause}"
 
