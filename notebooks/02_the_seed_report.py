@@ -231,7 +231,7 @@ print(f"after the repair, gyro less cameras is still {bias:.2f} deg/s in the med
 print(f"{bias * repaired.duration_s:.0f} degrees of heading over the whole recording")
 
 # %% [markdown]
-# As given, the cameras say left where the gyro says right: the calibration names the axes of the car differently than
+# As given, the camera turns left where the gyro turns right: the calibration names the axes of the car otherwise than
 # the velocities do. A filter that believes both is pulled apart.
 #
 # The offset that remains is the gyro's constant error. It has no repair in the data; an estimator has to estimate it.

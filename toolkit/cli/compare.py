@@ -101,7 +101,7 @@ def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
     add_output_arguments(
         parser,
         "the content of metrics.json or seeds.json, a line a SEQUENCE, no table",
-        ("the run directory has everything"),
+        "the run directory has everything",
     )
 
 

@@ -190,7 +190,7 @@ def _turned(fields: Fields) -> Iterator[str]:
     """Yield that the cameras are not parallel, where they are not."""
     turned_deg = _turned_deg(fields)
     if turned_deg > np.rad2deg(_TURNED_RAD):
-        yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is taken to be rectified"
+        yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
 def _sightings(parts: _Parts, features: StoredArray) -> Observations:

@@ -21,7 +21,7 @@ from toolkit.geometry import Array, se3
 from toolkit.measured_motion import MotionNoise, MotionSamples, TwistSamples
 from toolkit.models.noise import mems_imu, twist_noise
 
-_NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is taken (noise.motion_scale scales it)"
+_NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
 _STATED = "the noise of the IMU is as its file states it"
 _PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
 
@@ -127,7 +127,7 @@ def _not_joined(source: Source) -> str:
     other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
     tf = "/tf_static and no fixed transform of /tf" if source.chosen.moving else "/tf_static"
     return (
-        f"{source.path}: nothing tells where the camera is on the body: no {tf} joins the frames "
+        f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
         f"{source.frames.body!r} and {source.frames.left!r}; {_PUT_BESIDE}{other}"
     )
 

@@ -242,7 +242,7 @@ def _check_order(parts: Sequence[Path], readers: Sequence[Any]) -> None:
         if later.message_count and later.start_time < earlier.end_time:
             overlap_s = (earlier.end_time - later.start_time) / NS_PER_S
             raise DataError(
-                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so both are no parts of one recording; "
+                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so they are not parts of one recording; "
                 "name one of them"
             )
 

@@ -31,8 +31,8 @@ from toolkit.simulation.scenarios import stereo_cov_px2
 PIXEL_SIGMA_PX = 0.5
 ACCEL_FACTOR, GYRO_FACTOR = 8.0, 3.0
 _INFLATED = (
-    f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
-    "one, as measured in flight against the truth"
+    f"white noise of the accelerometer and the gyro assumed to be {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the "
+    "stated one, as measured in flight against the truth"
 )
 _AS_STATED = "the noise of the IMU is as its file states it"
 _DENSITIES = {
