@@ -136,7 +136,7 @@ def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
     if not listed.pairs:
         return (
             f"no image of {chosen.left.name} has one of {chosen.right.name} within 1 ms ({listed.stamps} left ones); a "
-            "stereo pair is taken at one instant: synchronise the cameras, or mend the stamps"
+            "stereo pair is taken at one instant: synchronise the cameras, or correct the stamps"
         )
     moved = chosen.imu or chosen.twist
     ranges = ((listed.pairs[0].t_ns, listed.pairs[-1].t_ns), (int(motion.t_ns.min()), int(motion.t_ns.max())))

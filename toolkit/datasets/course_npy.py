@@ -177,7 +177,9 @@ def _baseline_m(fields: Fields) -> float:
         )
     baseline_m = float(np.linalg.norm(left[:3, 3] - right[:3, 3]))
     if not baseline_m > 0.0:
-        raise DataError(f"{fields.path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; mend one")
+        raise DataError(
+            f"{fields.path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; correct one"
+        )
     return baseline_m
 
 

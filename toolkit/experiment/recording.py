@@ -187,7 +187,7 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
     if isinstance(source, Sequence):
         sequence, wrong = source, why_not_sightings(source)
         if wrong:
-            raise DataError(f"{source.name}: {wrong}; mend the sequence (Observations.sorted sorts)")
+            raise DataError(f"{source.name}: {wrong}; correct the sequence (Observations.sorted sorts)")
     elif source in SCENARIOS:
         check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")

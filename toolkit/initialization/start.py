@@ -97,7 +97,7 @@ def start_from_truth(sequence: Sequence) -> Prior:
         t_s, positions = truth.t_ns[neighbours] / NS_PER_S, truth.T_world_imu[neighbours, :3, 3]
         v_world = (positions[-1] - positions[0]) / (t_s[-1] - t_s[0])
     cov = np.diag(np.repeat([0.01, 0.01, 0.05, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
-    return Prior(truth.T_world_imu[row], v_world, np.zeros(6), cov, "the truth at the first frame, as asked for")
+    return Prior(truth.T_world_imu[row], v_world, np.zeros(6), cov, "the truth at the first frame, as requested")
 
 
 def _own_frame() -> Prior:

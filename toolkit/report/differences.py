@@ -258,7 +258,7 @@ class MetricChangeRecord(Struct, frozen=True, kw_only=True):
     change_percent: float | None
     moved: Annotated[bool, Meta(description="by more than a millionth")]
     p: Annotated[float | None, Meta(description="that it is the same on average, corrected for all tests")]
-    beyond_chance: Annotated[bool | None, Meta(description="null where too few runs tell")]
+    beyond_chance: Annotated[bool | None, Meta(description="null where there are too few runs")]
 
 
 class DiffRecord(Struct, frozen=True, kw_only=True):

@@ -149,7 +149,7 @@ def _marks(comparison: Comparison) -> Iterator[str]:
                 continue
             yield (
                 f"{_name_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
-                f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
+                f"{_figure(found.high)} contains 95 % of consistent estimators however correlated their errors"
                 f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
             )
 

@@ -248,7 +248,7 @@ class Report(Struct, frozen=True, kw_only=True):
     steps: tuple[StepTimes, ...]
     maps: tuple[DrawnMap, ...]
     words: Messages
-    card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where asked for")] = UNSET
+    card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where requested")] = UNSET
     frames: Annotated[
         tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
     ] = UNSET

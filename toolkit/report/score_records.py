@@ -116,7 +116,7 @@ class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
     """What the recordings of all seeds have in common."""
 
     name: Annotated[str, Meta(description="the sequence's name")]
-    source: Annotated[str, Meta(description="as it was asked for")]
+    source: Annotated[str, Meta(description="as it was requested")]
     frames: Annotated[Count, Meta(description="camera frames")]
     duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
     motion: Motion

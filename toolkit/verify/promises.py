@@ -307,4 +307,6 @@ def inconsistency(nees_means: list[float]) -> str:
     if low <= mean <= high:
         return ""
     how = "overconfident" if mean > high else "less certain than it could be"
-    return f"it is {how}: mean pose NEES {mean:.3g}, and {low:.2f} to {high:.2f} holds 99.9 % of consistent estimators"
+    return (
+        f"it is {how}: mean pose NEES {mean:.3g}, and {low:.2f} to {high:.2f} contains 99.9 % of consistent estimators"
+    )

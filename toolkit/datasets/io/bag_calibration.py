@@ -164,7 +164,7 @@ def _pair(source: Source) -> tuple[RectifiedPair, RectifiedPair | None, str]:
         if not (baseline_m > 0.0 and left_rect.pinhole_px[0] > 0.0):
             raise DataError(
                 f"{what[1]}: the images are rectified, P has no baseline (Tx is 0), and no /tf_static joins the two "
-                f"cameras; mend P, or {_PUT_BESIDE} and name the raw images"
+                f"cameras; correct P, or {_PUT_BESIDE} and name the raw images"
             )
         given = already_rectified(left_rect.pinhole_px, baseline_m, _size(infos[0]))
         # The frame of an image is the camera's own; R turns it into the rectified one's.
