@@ -115,7 +115,7 @@ def test_faults_that_are_kept_are_not_repaired() -> None:
     assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
 
 
-def test_only_the_ladder_tells_what_its_rungs_change(result: Result) -> None:
+def test_only_the_ladder_states_what_its_rungs_change(result: Result) -> None:
     assert not result.comparison.changes
     assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
 

@@ -42,7 +42,7 @@ HELD_OUT_ONE_IN = 10
 # The fact stating that the recording has no tracks.
 NO_FEATURES = "no image features in this file"
 # The fact stating that the extrinsic may be inverted, or in camera axes x forward, y left, z up.
-EXTRINSIC_IN_DOUBT = "the extrinsic's direction and camera axes are not certain in this format"
+EXTRINSIC_UNCERTAIN = "the extrinsic's direction and camera axes are not certain in this format"
 # The fact stating that the recording gives one image row for both images of a sighting.
 ONE_ROW_FOR_BOTH = "one row v stands for both images of a sighting in this file"
 # Longest name of a recording or a trajectory: it becomes part of file names, for which systems allow 255 bytes.

@@ -105,7 +105,7 @@ def information(graph, values):
     return whole[:9, :9], whole[:9, 9:], whole[9:, 9:], np.linalg.solve(whole, messages)
 
 
-def test_what_left_a_window_tells_the_share_of_landmarks_given_states_and_all_of_states(past):
+def test_what_left_a_window_determines_the_share_of_landmarks_given_states_and_all_of_states(past):
     graph, values = past
     landmarks, across, states, step = information(graph, values)
     made = discounted_past(graph, values, SHARE)

@@ -190,7 +190,7 @@ def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
     assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0
 
 
-def test_the_condition_of_a_landmark_tells_that_its_depth_is_unknown():
+def test_the_condition_of_a_landmark_shows_that_its_depth_is_unknown():
     factors, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i, sigma_m in ((1, 1.0), (2, 1e5)):
         at.insert(L(i), np.zeros(3))

@@ -222,7 +222,7 @@ def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
 
 
 @pytest.mark.parametrize("index", [0, 7, 2**56 - 1])
-def test_a_key_tells_its_kind_as_a_symbol_of_gtsam_does(index):
+def test_the_kind_of_a_key_is_that_of_gtsams_symbol(index):
     for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index), "s": SCALE}.items():
         assert kind_of(key) == kind == chr(gtsam.Symbol(key).chr())
 

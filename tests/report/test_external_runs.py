@@ -135,7 +135,7 @@ def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence, s
     assert len(run.final) == recording.frame_count
 
 
-def test_a_straight_drive_w_first_is_named_though_no_gyro_tells(tmp_path: Path) -> None:
+def test_a_straight_drive_w_first_is_named_though_no_gyro_decides(tmp_path: Path) -> None:
     recording = simulate(replace(DRIVE, duration_s=10.0), seed=2)
     assert isinstance(recording.motion, TwistSamples)
     still = replace(recording.motion, w_radps=np.zeros_like(recording.motion.w_radps))

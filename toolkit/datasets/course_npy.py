@@ -44,7 +44,7 @@ from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import (
-    EXTRINSIC_IN_DOUBT,
+    EXTRINSIC_UNCERTAIN,
     NO_FEATURES,
     Observations,
     Provenance,
@@ -155,7 +155,7 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
         frames_t_ns=t_ns,
         observations=seen,
         motion=TwistSamples(t_ns, v_mps, w_radps),
-        provenance=Provenance("course-npy", str(parts.path), (*facts, *_turned(fields), EXTRINSIC_IN_DOUBT)),
+        provenance=Provenance("course-npy", str(parts.path), (*facts, *_turned(fields), EXTRINSIC_UNCERTAIN)),
     )
 
 

@@ -114,7 +114,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         if recording.noise.tracks == "fitted":
             whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
         elif recording.noise.tracks == "correlated":
-            whole = _with_doubts(whole, _cut(whole, recording))
+            whole = _with_contradiction(whole, _cut(whole, recording))
         if recording.card and card is None:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
@@ -289,13 +289,13 @@ def _stated_track_noise(requested: Noise) -> TrackNoise:
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
 
 
-def _with_doubts(whole: Sequence, used: Sequence) -> Sequence:
+def _with_contradiction(whole: Sequence, used: Sequence) -> Sequence:
     """Return the whole recording, with a fact where the tracks that are used contradict the stated noise."""
     assert used.rig.track_noise is not None
-    doubt = contradicted(used.rig.track_noise, used)
-    if doubt is None:
+    contradiction = contradicted(used.rig.track_noise, used)
+    if contradiction is None:
         return whole
-    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, doubt)))
+    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, contradiction)))
 
 
 def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> tuple[Sequence, Card]:

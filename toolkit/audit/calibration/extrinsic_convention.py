@@ -17,7 +17,7 @@ from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.parts.robust import Scalar, mean_in_sigmas, slope
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
-from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence
+from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
 
 # Least mean difference of the logarithms of two readings' residuals, in its own standard errors. The file allows all
 # readings, so the difference only has to be beyond chance (intervals are correlated over about a second).
@@ -34,7 +34,7 @@ _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0
 def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Find which of the four readings of the extrinsic the tracks follow, and take it."""
     sequence = evidence.sequence
-    if EXTRINSIC_IN_DOUBT not in sequence.provenance.facts:
+    if EXTRINSIC_UNCERTAIN not in sequence.provenance.facts:
         return None
     if evidence.intervals is None:
         return evidence.blind
@@ -113,7 +113,7 @@ def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
 
 def _settled(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
     """Return the sequence with this extrinsic, and without the fact that its convention is in doubt."""
-    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_IN_DOUBT)
+    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_UNCERTAIN)
     provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is read {reading}"))
     return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
 
