@@ -92,8 +92,8 @@ def _stamps(evidence: Evidence) -> _Wrong | None:
         return None
     return _Wrong(
         f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and their rate of rotation {rotation.value:.3g} "
-        f"+- {rotation.error:.1g} times the camera's: the stamps run {speed.value:.3g} times too fast, "
-        "so they are not in seconds",
+        f"+- {rotation.error:.1g} times the camera's: the stamps run {speed.value:.3g} times as fast as "
+        "time, so they are not in seconds",
         None,
     )
 
