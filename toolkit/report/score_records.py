@@ -214,7 +214,8 @@ class Seeds(Struct, frozen=True, kw_only=True):
     sequence: SequenceOfSeeds
     seeds: Annotated[tuple[int, ...], Meta(description="in order")]
     hashes: Annotated[
-        tuple[str | None, ...], Meta(description="of what was read under each seed; null where no run ended")
+        tuple[str | None, ...],
+        Meta(description="of what was read under each seed; null where every run's process died"),
     ]
     start: Annotated[str, Meta(description="where every run started")]
     estimators: Annotated[tuple[str, ...], Meta(description="in order")]
