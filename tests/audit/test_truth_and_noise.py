@@ -145,7 +145,7 @@ def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
     assert truth_mismatch.check(Evidence(sequence)) is None
 
 
-@pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y turned (positions alone)"])
+@pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y changed (positions alone)"])
 def test_a_truth_in_exchanged_axes_is_reported_with_those(flight: Sequence, words: str) -> None:
     truth = truth_of(flight)
     (exchange,) = (one for one in exchanges() if one.description == words)

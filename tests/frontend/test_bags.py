@@ -305,7 +305,7 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
 @pytest.mark.parametrize(
     ("left_out", "pattern"),
     [
-        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one beside"),
+        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one with"),
         ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
         ("image_raw", "holds no images that can be read.*; there are /cam0/camera_info"),
         ("", "holds no images that can be read.*; there are no topics"),

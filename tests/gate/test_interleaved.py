@@ -153,7 +153,7 @@ def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
         ("--help", "'--help' is no revision of this checkout"),
         ("", "'' is no revision of this checkout"),
         ("no.whl", "no.whl: it is no wheel that can be read (No such file or directory); build one"),
-        ("empty.whl", "empty.whl brings no code of what runs here"),
+        ("empty.whl", "empty.whl does not contain the code that runs here"),
     ],
 )
 def test_a_version_that_cannot_be_had_is_reported(tmp_path, monkeypatch, capsys, version, expected):
