@@ -178,7 +178,7 @@ def _print_row(what: str, every: list[Column], size: Size, planted: tuple[str, s
 
 
 def _changed(every: list[Column], name: str) -> str:
-    """Return which metrics are told to be computed otherwise where the ATE is a mean; of the pool's seeds all count."""
+    """Return the metrics reported as computed differently where the ATE is a mean; all of the pool's seeds count."""
     found = set[str]()
     for source in CASES:
         of_it = [column for column in every if (column.where.sequence, column.where.estimator) == (source, name)]

@@ -180,7 +180,10 @@ def test_a_revision_that_a_shallow_clone_lacks_is_to_be_fetched(tmp_path, monkey
 def test_outside_of_a_checkout_and_without_git_a_wheel_is_requested(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    with pytest.raises(BaselineError, match=r"HEAD: no checkout; stand in one, or name a wheel \(fatal: not a git"):
+    with pytest.raises(
+        BaselineError,
+        match=r"HEAD: the current directory is not in a checkout; change to one, or name a wheel \(fatal: not a git",
+    ):
         unpacked("HEAD").__enter__()
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BaselineError, match=r"git cannot be run \(No such file or directory\); name a wheel"):

@@ -304,7 +304,9 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     for name in trajectories:
         plain = plain_name(name)
         if len(plain) > LONGEST_NAME:
-            raise UsageError(f"--trajectory: a name of {len(plain)} characters is none of a file; choose a shorter one")
+            raise UsageError(
+                f"--trajectory: a name of {len(plain)} characters is too long for a file; choose a shorter one"
+            )
         if not plain or plain in taken:
             why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
             raise UsageError(f"--trajectory: the name {name} {why}; choose another")

@@ -244,8 +244,9 @@ def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Match
         raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
-            f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
-            f"the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, or allow more with --max-dt"
+            f"{estimate.path}: {len(matched)} of its poses match the truth in time; it covers "
+            f"{range_s(estimate.t_ns)}, the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, "
+            "or allow more with --max-dt"
         )
     return matched
 

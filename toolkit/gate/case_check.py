@@ -72,7 +72,7 @@ def check_case(
         return collected
     if before.hashes != now.hashes:
         collected.notes.append(
-            f"{case.source}: the same measurements but for their last bits, which this processor rounds differently"
+            f"{case.source}: the same measurements except for their last bits, which this processor rounds differently"
         )
     for estimator, was in before.runs.items():
         if estimator in now.absent or estimator not in now.runs:
@@ -145,7 +145,7 @@ def _check_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: Chec
         return
     where, now = pairs.where, pairs.after
     if np.ptp(now) > SHOWN * np.abs(now).max():
-        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
+        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} has changed in every run")
     was, is_ = float(np.median(pairs.before)), float(np.median(now))
     collected.verdicts.append(check_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
 

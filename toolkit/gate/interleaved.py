@@ -271,9 +271,15 @@ def _unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def _unpack_revision(revision: str, folder: Path) -> None:
-    top = _git("rev-parse", "--show-toplevel", otherwise=f"{revision}: no checkout; stand in one, or name a wheel")
+    top = _git(
+        "rev-parse",
+        "--show-toplevel",
+        otherwise=f"{revision}: the current directory is not in a checkout; change to one, or name a wheel",
+    )
     shallow = _git("rev-parse", "--is-shallow-repository", otherwise=revision).strip() == b"true"
-    deepen = "fetch it, for this clone is shallow (git fetch --unshallow)" if shallow else "name one that git log shows"
+    deepen = (
+        "fetch it, because this clone is shallow (git fetch --unshallow)" if shallow else "name one that git log shows"
+    )
     unknown = f"{revision!r} is no revision of this checkout; {deepen}, or name a wheel"
     commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", otherwise=unknown)
     archive = _git("archive", commit.decode().strip(), otherwise=unknown, folder=top.decode().removesuffix("\n"))

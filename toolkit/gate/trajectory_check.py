@@ -149,7 +149,7 @@ def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scori
     """Return the scores of a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
     now = given.scored(sequence, scoring, before)
     if now.truth_hash != before.truth_hash:
-        raise DataError(f"{now.truth} is another truth than the baseline's; make a new baseline")
+        raise DataError(f"{now.truth} differs from the baseline's truth; make a new baseline")
     return now.scores
 
 

@@ -257,7 +257,7 @@ class MetricChangeRecord(Struct, frozen=True, kw_only=True):
     after: float | None
     change_percent: float | None
     moved: Annotated[bool, Meta(description="by more than a millionth")]
-    p: Annotated[float | None, Meta(description="that it is the same on average, corrected for all tests")]
+    p: Annotated[float | None, Meta(description="p-value of equal means, corrected for all tests")]
     beyond_chance: Annotated[bool | None, Meta(description="null where there are too few runs")]
 
 

@@ -21,7 +21,7 @@ from toolkit.report.table import MISSING, Table, as_markdown, as_text, number
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
     "moved": "moved",
-    "changed metric": "computed otherwise",
+    "changed metric": "computed differently",
     "missing": "missing",
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
