@@ -80,7 +80,7 @@ def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
     assert "consistency" not in built["runs"][-1]  # it failed without an answer
     words = [line for line in note_lines(timid) if "timid" in line]
     assert words[0] == (
-        "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 holds 95 % of consistent estimators however "
+        "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 contains 95 % of consistent estimators however "
         "correlated their errors"
     )
 
