@@ -31,7 +31,7 @@ from toolkit.models.stacked_factors import stacked
 from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("dellaert2017factor", "gtsam")
-RUNG, CHANGE = 120, "+ all relinearised to convergence, in the end: Huber, Cauchy, cut; IMU as stated"
+RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut; IMU as stated"
 RULES = {"window": "it keeps every state", "disparity_scale": True, "bridge_gaps": True, "match_tracks": True}
 DEFAULT = True
 

@@ -28,7 +28,7 @@ from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
-RUNG, CHANGE = 30, "+ cross-covariances, first estimates or anew, inverse depth, share, matched"
+RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth, share, IMU matched"
 RULES = {"tracks": "a landmark in its state has no state for the error of its track", "match_tracks": True}
 
 # With an IMU a landmark may have moved from its first estimate by this share of its distance before it is restarted.

@@ -31,7 +31,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 90, "+ relinearisation; sightings kept at once; all landmarks; each gated once placed"
+RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
 RULES = {"bridge_gaps": True, "match_tracks": True}
 
 
@@ -112,7 +112,7 @@ class FixedLag:
         rows = np.flatnonzero(behind_camera(points, newest.T_world_imu, self._rig))
         log = {seen[row]: "fell behind the camera" for row in rows}
         contradicted = self._builder.contradicted() & self._last_seen_ns.keys()
-        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        log |= dict.fromkeys(contradicted, "was inconsistent with its next sightings")
         if log:
             recovery = self._tree.drop(log.keys())
             lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]

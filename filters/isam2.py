@@ -41,7 +41,7 @@ from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 110, "+ every state and landmark a variable, bridge; one step a frame, old ones frozen"
+RUNG, CHANGE = 110, "+ every state and landmark kept, bridge; one step a frame, old variables frozen"
 RULES = {"window": "it keeps every state", "bridge_gaps": True, "match_tracks": True}
 
 # A landmark tens of kilometres away never stops moving, although no pose moves with it: the last solve converges by
@@ -143,7 +143,7 @@ class Isam2:
         behind = behind_camera(points, estimate.T_world_imu, self._rig).tolist()
         log = {i: "fell behind the camera" for i, is_behind in zip(seen, behind, strict=True) if is_behind}
         contradicted = {i for i in self._builder.contradicted() if self._tree.has(L(i))}
-        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        log |= dict.fromkeys(contradicted, "was inconsistent with its next sightings")
         if log:
             recovery = self._tree.drop(map(L, log))
             lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]

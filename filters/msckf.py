@@ -8,7 +8,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf",)
 RULES = {"bridge_gaps": True, "match_tracks": True}
-RUNG, CHANGE = 60, "+ past poses, bridge; tracks at once but kept at end, by share; usual errors, 1 step"
+RUNG, CHANGE = 60, "+ past poses, bridge; one update a track, at its end, by share; usual errors, 1 step"
 
 
 def build(setup: Setup) -> Estimator:

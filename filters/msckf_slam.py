@@ -8,7 +8,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf", "li2013high")
 RULES = {"bridge_gaps": True, "match_tracks": True}
-RUNG, CHANGE = 80, "+ long-lived landmarks, in metres"
+RUNG, CHANGE = 80, "+ long-lived landmarks in the state, in metres"
 DEFAULT = True
 
 

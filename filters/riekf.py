@@ -28,7 +28,7 @@ from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
-RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with pose; share by IMU"
+RUNG, CHANGE = 40, "+ right-invariant error, Jacobians at latest estimates, anchors; share with an IMU"
 RULES = {
     "tracks": "a landmark in its state has no state for the error of its track",
     "match_tracks": ("imu",),

@@ -22,13 +22,13 @@ from toolkit.models.state import Belief
 from toolkit.sequence import Packet
 
 # Used instead of zero, which has no inverse: a bias of 1e-8 rad/s turns the pose by 1e-6 rad in 100 s.
-_HELD_VARIANCE = 1e-16
+_FIXED_VARIANCE = 1e-16
 
 CITES = ("kang_vislam",)
-RUNG, CHANGE = 10, "+ vision, as the report has it: pose and map by turns, biases held, no gate"
+RUNG, CHANGE = 10, "+ vision as in the report: map and pose updated in turn, biases fixed, no gate"
 RULES = {
     "outliers": "the report's filter has neither gate nor loss",
-    "tracks": "the report's filter knows white noise only",
+    "tracks": "the report's filter models white noise only",
 }
 
 
@@ -72,5 +72,5 @@ def _without_biases(belief: Belief) -> Belief:
     """Return the belief with its biases fixed at their values, because the report's state has none."""
     cov, biases = belief.cov.copy(), belief.layout.biases
     cov[biases], cov[:, biases] = 0.0, 0.0
-    cov[biases, biases] = _HELD_VARIANCE * np.eye(biases.stop - biases.start)
+    cov[biases, biases] = _FIXED_VARIANCE * np.eye(biases.stop - biases.start)
     return replace(belief, cov=cov)

@@ -35,7 +35,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
-RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, gone with window; no bridge"
+RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept; no bridge"
 RULES = {"match_tracks": True}
 
 
@@ -69,7 +69,7 @@ class Smart:
         try:
             self._solution = solve_window(tracked.window, self._camera)
         except EstimatorError as refusal:
-            self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
+            self._log.append(f"frame {packet.index}: {refusal}; the window starts again at this frame")
             self._complete_all()
             self._settle(len(self._tracked.window.keys))
             tracked = self._started(packet)

@@ -75,7 +75,7 @@ result.figures["top_all"]
 
 # %% [markdown]
 # Grey dots are the landmarks that the smoother found: house fronts, parked cars, trees. The road is straight here, and
-# the three lines lie on each other. What tells them apart is in the numbers.
+# the three lines lie on each other. Their differences are in the numbers.
 #
 # ## How good are they?
 
@@ -89,16 +89,16 @@ result.table("ATE SE(3)", "reproj held-out", "NIS mean")
 #   columns are there if the truth is.
 # - **reproj held-out** needs no truth. One track in ten is hidden from all estimators. Their poses must predict where
 #   the cameras saw those points; the number is the median error in pixels. Nobody can win it by fitting harder.
-# - **NIS** compares the surprises a filter met with those it expected: 1 is honest, more is too sure of itself.
+# - **NIS** compares a filter's innovations with those it expected: 1 is consistent, more is overconfident.
 #
-# `causal` is what an estimator said at each frame, knowing the past only; `final` is what it said at the end; `both`
-# stands where the two are the same, as with a filter. A smoother has seen the future, so the table keeps them apart.
+# `causal` is an estimator's answer at each frame, from the past only; `final` is its answer at the end; `both`
+# stands where the two are the same, as with a filter. A smoother has used the future, so the table keeps them apart.
 
 # %% [markdown]
 # ## The same with exact truth
 #
 # `drive-imu` is a simulation: a car with an IMU, with noise like that of a real one. Its truth is exact, so here the
-# errors mean what they say. Its first 15 seconds will do. Every seed draws another noise; this is seed 0.
+# errors are exact, too. Its first 15 seconds will do. Every seed draws another noise; this is seed 0.
 
 # %%
 simulated = toolkit.compare("drive-imu", ["dead-reckoning", "ekf", "batch"], max_frames=150)

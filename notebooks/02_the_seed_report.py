@@ -68,7 +68,7 @@ for number, sequence in recordings.items():
 # %% [markdown]
 # ## As the report did it
 #
-# The report takes a recording as it is. So do we for now: `keep=faults()` tells the toolkit to repair nothing.
+# The report takes a recording as it is. So do we for now: with `keep=faults()` the toolkit repairs nothing.
 
 # %%
 THE_REPORT = ("dead-reckoning", "mapping", "seed-ekf")
@@ -118,7 +118,7 @@ show_figures("dead-reckoning", ("Figure 1: trajectory, Dataset 10", "Figure 2: t
 # %% [markdown]
 # ### Figures 3 and 4: landmarks mapped from that trajectory
 #
-# Each landmark is a small Kalman filter of its own, and the trajectory is believed as it is.
+# Each landmark is a small Kalman filter of its own, and the trajectory is assumed to be exact.
 
 # %%
 show_figures("mapping", ("Figure 3: landmarks, Dataset 10", "Figure 4: landmarks, Dataset 03"))
@@ -161,7 +161,7 @@ print(*as_given["03"].runs["seed-ekf"].log, sep="\n")
 #
 # ## What the data hide
 #
-# The **audit** looks for faults using the data alone. It knows nothing of this file.
+# The **audit** looks for faults using the data alone. It has no information about this file.
 
 # %%
 audits: dict[str, Audit] = {number: audit(sequence) for number, sequence in recordings.items()}
@@ -231,8 +231,8 @@ print(f"after the repair, gyro less cameras is still {bias:.2f} deg/s in the med
 print(f"{bias * repaired.duration_s:.0f} degrees of heading over the whole recording")
 
 # %% [markdown]
-# As given, the cameras say left where the gyro says right: the calibration names the axes of the car differently than
-# the velocities do. A filter that believes both is pulled apart.
+# As given, the camera turns left where the gyro turns right: the calibration names the axes of the car otherwise than
+# the velocities do. A filter that uses both is pulled apart.
 #
 # The offset that remains is the gyro's constant error. It has no repair in the data; an estimator has to estimate it.
 # The report's state has no place for it.
@@ -272,8 +272,8 @@ print(f"  a smoother                         {held_out_px['repaired', 'batch']:.
 # %% [markdown]
 # ## Which fault does what?
 #
-# Dataset 03 has no ground truth, so metres cannot be told. In a simulation they can: the same drive, clean, and with
-# one fault at a time. Nothing is repaired.
+# Dataset 03 has no ground truth, so errors in metres are unknown. In a simulation they are known: the same drive,
+# clean, and with one fault at a time. Nothing is repaired.
 
 # %%
 variants = {
@@ -299,7 +299,7 @@ axes.legend(ncols=4)
 plt.show()
 
 # %% [markdown]
-# - **Stale frames** ruin a filter that believes every match. A gate throws the wrong ones out.
+# - **Stale frames** ruin a filter that uses every match. A gate rejects the wrong ones.
 # - **Mixed axes** ruin everything that looks at images, gates or not: every match is wrong in the same way.
 # - **A gyro bias** ruins what has no place for it, dead reckoning and the report's filter; the others estimate it.
 #

@@ -46,10 +46,10 @@ for rung in rungs:
 # ## In simulation, over seeds
 #
 # `flight` is a hand-held camera with an IMU. Every seed draws a new start, new biases and new noise. The truth is
-# exact, so we can ask two questions: how large is the error, and **does the estimator know how large it is**?
+# exact, so we can ask two questions: how large is the error, and **does the estimator state how large it is**?
 #
-# The second is answered by the NEES: the squared error over the covariance that the estimator itself states. For an
-# honest estimator it is 1 on average; chance lets the mean over several seeds scatter within a known band.
+# The second is answered by the NEES: the squared error over the covariance that the estimator itself states. For a
+# consistent estimator it is 1 on average; chance lets the mean over several seeds scatter within a known band.
 
 # %%
 SEEDS, FRAMES = 3, 20
@@ -67,16 +67,16 @@ print(*consistency_lines(over.comparison), sep="\n")
 # Three steps of the ladder can be seen here.
 #
 # **Count every measurement once.** The lowest filters use the same sightings to correct the map by the pose and the
-# pose by the map, and forget that both now share their errors. Their covariance shrinks far faster than their error:
-# the NEES leaves its band by orders of magnitude. A filter that is so sure of itself no longer listens. Dead reckoning,
-# with its large error, is honest: it knows that it knows little.
+# pose by the map, and neglect that the errors of both are now correlated. Their covariance shrinks far faster than
+# their error: the NEES leaves its band by orders of magnitude. A filter that is so overconfident gives new measurements
+# hardly any weight. Dead reckoning, with its large error, is consistent: it states a large covariance.
 #
-# **Remember what depends on what.** With all cross-covariances in one Gaussian the NEES comes down to its band. What
-# the filter says about its own error is now true.
+# **Remember what depends on what.** With all cross-covariances in one Gaussian the NEES comes down to its band. The
+# covariance that the filter states is now right.
 #
-# **Do not decide too early.** A filter linearises each sighting once, where it believes to be at that moment. If that
-# was wrong, the sighting stays wrong for good. A smoother keeps the sighting itself and linearises again when it knows
-# better.
+# **Do not linearise too early.** A filter linearises each sighting once, at its estimate of that moment. If that was
+# wrong, the linearisation stays wrong for good. A smoother keeps the sighting itself and linearises again at a better
+# estimate.
 
 # %%
 rows = {row.estimator: row for row in over.comparison.rows}  # the final one stays
@@ -118,14 +118,14 @@ for (estimator, output), values in over.metrics.items():
 # %% [markdown]
 # ## A real drive
 #
-# So much for a world whose measurements are what the estimators are told: white noise of a known size. With the course
+# So much for a world whose measurements are as the estimators assume: with white noise of a known size. With the course
 # file 0027 at hand, here are the first 40 s of it (KITTI raw 2011_09_30_drive_0027: real stereo, and velocities with
 # noise added by the course). Without it, the built-in `drive-realistic` stands in, a simulation whose tracks err as
 # those of KITTI do.
 #
 # On a drive we look first at the KITTI benchmark's **drift in percent** of the way, and at the error after fitting
 # **heading and position**. An SE(3) fit may also tilt the world, which hides errors of height, and on a single drive it
-# tells good estimators apart by luck.
+# distinguishes good estimators by luck.
 
 # %%
 CHOSEN = ["dead-reckoning", "ekf", "msckf-fej", "batch"]
@@ -146,9 +146,9 @@ white = compare(**SOURCE, estimators=CHOSEN, settings=IN_FULL)
 white.table(*COLUMNS)
 
 # %% [markdown]
-# The smoother no longer wins by the factors of the simulation: on a real drive a filter may well be as good. And what
-# it says of its own error is too little, its NEES is above 1. More measurements did not help as much as it believed. So
-# what are they like?
+# The smoother no longer wins by the factors of the simulation: on a real drive a filter may well be as good. And the
+# error it states is too small, its NEES is above 1. More measurements did not help as much as it assumed. So what are
+# they like?
 #
 # ## Tracks are not white
 #
@@ -192,11 +192,11 @@ for part, px in (("white", card.noise.white_px), ("walk", card.noise.walk_px), (
     print(f"{part:7}" + "  ".join(f"{name} {value:.2f} px" for name, value in zip("cdv", px, strict=True)))
 
 # %% [markdown]
-# ## Counted for what they tell
+# ## Weighted by their information
 #
-# That tracks are like this shows while an estimator runs: white noise leaves residuals that do not know of each other.
-# Filters with a window and smoothers measure the correlation, and have tracks count for less where there is one. That
-# is what they do unless told otherwise; above, `match_tracks` was off. Nobody has to say what the tracks are like.
+# An estimator can detect this correlation while it runs: white noise leaves uncorrelated residuals.
+# Filters with a window and smoothers measure the correlation, and give tracks less weight where there is one. That
+# is the default; above, `match_tracks` was off. The noise of the tracks need not be stated.
 
 # %%
 matched = compare(**SOURCE, estimators=CHOSEN)
@@ -212,15 +212,15 @@ for name, run in matched.runs.items():
 # Each channel (c mean column, d disparity, v row) walks by about a tenth of a pixel a frame, beside which its white
 # noise, of a few hundredths, hardly counts.
 #
-# An estimator told white noise takes the twentieth sighting of a track for as much information as the second. But
-# most of it is the error of the one before, once more. It averages what does not average out: its answer is worse than
-# it could be, and its covariance shrinks faster than its error. The smoother believes in *all* sightings at once, so
-# **it suffers most**; a filter that forgets is spared a part.
+# An estimator that assumes white noise counts the twentieth sighting of a track for as much information as the second.
+# But most of it is the error of the one before, once more. It averages what does not average out: its answer is worse
+# than it could be, and its covariance shrinks faster than its error. The smoother uses *all* sightings at once, so **it
+# suffers most**; a filter that marginalises the past is spared a part.
 #
-# ## Told what they are like
+# ## With the fitted noise stated
 #
-# More can be told: `noise.tracks=fitted` hands the fitted noise, with all of its parts, to every estimator that can use
-# it. The decoupled `ekf` cannot, nor can dead reckoning, so their lines stay as they are.
+# More can be stated: `noise.tracks=fitted` gives the fitted noise, with all of its parts, to every estimator that can
+# use it. The decoupled `ekf` cannot, nor can dead reckoning, so their lines stay as they are.
 
 # %%
 fitted.table(*COLUMNS)
@@ -233,7 +233,7 @@ for row in fitted.comparison.lines:
 
 # %%
 def show_change(before: Result, after: Result, metrics: dict[str, str]) -> None:
-    """Draw a metric a panel: what each estimator that sees said last, told white noise (open) and fitted (filled)."""
+    """Draw a metric a panel: final answers of estimators with vision, white noise stated (open) and fitted (filled)."""
     _, panels = plt.subplots(1, len(metrics), figsize=(10, 2.2), sharey=True)
     for axes, (key, words) in zip(panels, metrics.items(), strict=True):
         for name in CHOSEN[1:]:
@@ -262,29 +262,31 @@ for name in CHOSEN:
 # %% [markdown]
 # Where tracks err as the model has it, as in the simulation that stands in for 0027, both gain over white noise in
 # full. On 0027 itself both lose, the filter even its way: real errors have tails that no Gaussian has, the fitted noise
-# is that of the bulk of the tracks, and a gate that believes in it throws many good tracks away. What to tell an
-# estimator is more than [the noise of the bulk](../docs/tracks.md), and to count all tracks for less, as above, did
-# better on that drive than the whole model.
+# is that of the bulk of the tracks, and a gate by that noise rejects many good tracks. What to state to an estimator is
+# more than [the noise of the bulk](../docs/tracks.md), and to count all tracks for less, as above, did better on that
+# drive than the whole model.
 #
 # One drive is one draw of luck again. So the last step is a simulation with such tracks, where the truth is exact and
-# seeds can be repeated: the smoother once told white, and once told the walk and the offset that were planted.
+# seeds can be repeated: the smoother once with white noise stated, and once with the walk and the offset that were
+# planted.
 
 # %%
 PLANTED = {"tracks": "correlated", "track_walk_px": 0.11, "track_offset_px": 0.9}
 errors_m = {}
-for told, noise in {"white": IN_FULL["noise"], "as they are": PLANTED}.items():
+for stated, noise in {"white": IN_FULL["noise"], "as they are": PLANTED}.items():
     again = compare("drive-realistic", "batch", **SIMULATED, settings={"noise": noise})
-    errors_m[told] = np.array(again.comparison.rows[-1].values("ate_yaw_m"))
-    print(f"told {told:11}  mean ATE yaw {1000 * errors_m[told].mean():.0f} mm")
+    errors_m[stated] = np.array(again.comparison.rows[-1].values("ate_yaw_m"))
+    print(f"stated {stated:11}  mean ATE yaw {1000 * errors_m[stated].mean():.0f} mm")
 ratio = errors_m["as they are"] / errors_m["white"]
-print("told as they are over told white, seed by seed:", ", ".join(f"{one:.2f}" for one in ratio))
+print("as they are over white, seed by seed:", ", ".join(f"{one:.2f}" for one in ratio))
 
 # %% [markdown]
-# Told what its measurements are like, the smoother makes more of them.
+# With the right noise stated, the smoother is more accurate.
 #
 # ## What it costs
 #
-# Processor time per frame on the drive, told white noise, the finish included, to one digit: it depends on the machine.
+# Processor time per frame on the drive, with white noise stated, the finish included, to one digit: it depends on the
+# machine.
 
 # %%
 for run in white.runs.values():
@@ -295,11 +297,11 @@ for run in white.runs.values():
 # ## What remains
 #
 # The smoother wins because it counts every measurement once, remembers what depends on what, linearises late, and, at
-# the end, knows the future. The first two a filter can have as well: a joint filter is as honest as the smoother. The
-# third it can have in part, by iterating. The fourth it cannot.
+# the end, uses the future. The first two a filter can have as well: a joint filter is as consistent as the smoother.
+# The third it can have in part, by iterating. The fourth it cannot.
 #
-# And it wins where what it is told of its measurements holds. It takes them all at their word, so it pays most for a
-# wrong one, and gains most from the right one.
+# And it wins where the stated noise of its measurements is right. It uses them all with that noise, so it loses most by
+# a wrong one, and gains most from the right one.
 #
 # Try other seeds and lengths, and look at your own recording; each is one command:
 #

@@ -11,8 +11,8 @@
 # %% [markdown]
 # # 4. Write your own estimator
 #
-# Thirty lines are enough for an estimator that sees. We write one, compare it with the others, ask whether it knows its
-# own error, make a file of it, and let the gate guard it. All of this runs on simulated data, which are built in.
+# Thirty lines are enough for an estimator with vision. We write one, compare it with the others, test whether it states
+# its own error, make a file of it, and let the gate guard it. All of this runs on simulated data, which are built in.
 
 # %%
 import importlib
@@ -41,8 +41,8 @@ from toolkit.sequence import Packet, StereoFrame
 # %% [markdown]
 # ## The idea
 #
-# Between two frames the car moves a little. The velocities say how, with noise. The cameras say it, too: the points
-# they measured in the last frame must appear in this frame where the motion puts them. We weigh the two by their
+# Between two frames the car moves a little. The velocities measure how, with noise. The cameras measure it, too: the
+# points they measured in the last frame must appear in this frame where the motion puts them. We weigh the two by their
 # covariances. That is one step of a Kalman filter, for the motion between two frames.
 #
 # What an estimator needs to be: `build(setup)` makes one, `step(packet)` answers for a frame from the past alone, and
@@ -163,7 +163,7 @@ print("two-view:", find("two-view").summary())
 # ## Does it know its own error?
 #
 # Now it can run in other processes, over many seeds. The NEES is the squared error over the covariance that the
-# estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
+# estimator states: 1 is consistent, more is overconfident (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
 over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=4, max_frames=25)

@@ -230,7 +230,7 @@ class Map:
         return known, frame.uvs_px[rows]
 
     def correct(self, known: list[int], uvs: np.ndarray, T: np.ndarray) -> None:
-        """Correct landmarks by their measurements from a pose that is believed as it is."""
+        """Correct landmarks by their measurements from a pose that is assumed to be exact."""
         T_cam_world = inverse(T @ rig.T_imu_cam)
         for track, z in zip(known, uvs, strict=True):
             q = T_cam_world[:3, :3] @ self.points[track] + T_cam_world[:3, 3]
@@ -302,7 +302,7 @@ print("the derivative to the pose is right")
 
 # %%
 def correct_pose(T: np.ndarray, cov: np.ndarray, points: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Correct a pose and its covariance by N landmarks that are believed as they are."""
+    """Correct a pose and its covariance by N landmarks that are assumed to be exact."""
     information, vector, weight = np.linalg.inv(cov), np.zeros(6), np.linalg.inv(rig.cov_uv_px2)
     for point, z in zip(points, uvs, strict=True):
         expected, H = d_pose(point, T)
@@ -385,9 +385,9 @@ off_m = np.linalg.norm(mine[-1][:3, 3] - sequence.truth.T_world_imu[FRAMES - 1, 
 print(f"at the end your filter states {1e3 * sigma_m:.1f} mm and is off by {1e3 * off_m:.0f} mm")
 
 # %% [markdown]
-# Before you believe the trajectory, look at **NEES pose**: the squared error over the covariance that is stated, 1 for
-# a filter that knows itself. This one uses every measurement twice, for the map and then, as if the map were exact, for
-# the pose. Its covariance collapses, and from then on it listens to nobody.
+# Before you use the trajectory, look at **NEES pose**: the squared error over the covariance that is stated, 1 for a
+# consistent filter. This one uses every measurement twice, for the map and then, as if the map were exact, for the
+# pose. Its covariance collapses, and from then on measurements hardly correct it.
 #
 # **What to do about it**, one step at a time, is the ladder of [notebook 3](03_why_the_smoother_wins.ipynb): let the
 # landmark's uncertainty into the innovation and put up a gate (`ekf`), keep pose and landmarks in one state

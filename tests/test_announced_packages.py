@@ -168,7 +168,7 @@ def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer
     sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
     assert sequence.prior is not None
     run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
-    with pytest.raises(ExtensionError, match=r"answer\.py: score answers with Scores of \['answer'\], here with"):
+    with pytest.raises(ExtensionError, match=r"answer\.py: score must return Scores of \['answer'\], and returned"):
         metrics.score_run(run, "causal", sequence)
 
 
@@ -184,7 +184,7 @@ def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp
         {"theirs.py": DATASET.replace("return replace(", "return str(").replace(", name=", ") or (")},
     )
     (tmp_path / "some.file").write_text("theirs")
-    with pytest.raises(ExtensionError, match=r"theirs\.py answered with a str; it returns a Sequence"):
+    with pytest.raises(ExtensionError, match=r"theirs\.py returned a str; it must return a Sequence"):
         datasets.load_sequence(str(tmp_path / "some.file"))
 
 

@@ -115,7 +115,7 @@ def test_faults_that_are_kept_are_not_repaired() -> None:
     assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
 
 
-def test_only_the_ladder_tells_what_its_rungs_change(result: Result) -> None:
+def test_only_the_ladder_states_what_its_rungs_change(result: Result) -> None:
     assert not result.comparison.changes
     assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
 
@@ -288,7 +288,7 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"from_s": 5.0, "to_s": 2.0}, "from 5 s to 2 s"),
         ({"to_s": float("nan")}, "from 0 s to nan s"),
         ({"settings": "window"}, "settings is a str"),
-        ({"estimators": []}, "nothing is to be compared"),
+        ({"estimators": []}, "there is nothing to compare"),
         ({"estimators": [3]}, "estimators has an int, expected names"),
         ({"estimators": 3}, "estimators has an int, expected names"),
         ({"estimators": {"mine": find("ekf").load()}}, "functions build\\(setup\\) go by name into own"),

@@ -108,8 +108,8 @@ def of_trajectory(**changed: Any) -> End:
 @pytest.mark.parametrize(
     ("end", "why"),
     [
-        (lambda sound: None, "finish answered with None; it returns a Finished"),
-        (lambda sound: sound.trajectory, "finish answered with a Trajectory"),
+        (lambda sound: None, "finish returned None; it must return a Finished"),
+        (lambda sound: sound.trajectory, "finish returned a Trajectory"),
         (lambda sound: replace(sound, trajectory=[]), "the trajectory of its finish is a list"),
         (lambda sound: replace(sound, landmarks=None), "the landmarks of its finish are None"),
         (lambda sound: replace(sound, log="all is well"), "the log of its finish is a str"),
@@ -138,7 +138,7 @@ def test_a_finish_that_answers_otherwise_fails_its_run_and_keeps_the_causal_answ
 def test_who_answers_nothing_at_all_has_failed(sequence: Sequence) -> None:
     done = run(sequence, lambda sound, _: None, lambda sound: Finished(Trajectory.of([]), Landmarks.none()))
     assert done.status == "failed"
-    assert "it answered for no frame" in done.log[0]
+    assert "it returned no estimate for any frame" in done.log[0]
 
 
 def test_an_estimator_that_ends_the_program_ends_its_run_alone(sequence: Sequence) -> None:

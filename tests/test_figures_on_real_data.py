@@ -119,12 +119,10 @@ def more_px(one_px: Array, other_px: Array) -> float:
     return float(np.median(one_px) - np.median(other_px))
 
 
-def test_on_03_the_smoother_told_what_the_filter_is_told_is_better_and_finds_the_bias_too(
-    dataset_03, run_on, run_estimator
-):
+def test_on_03_the_smoother_with_the_filters_noise_is_better_and_finds_the_bias_too(dataset_03, run_on, run_estimator):
     """The filter counts all tracks in full. One test, for the run takes ten seconds and workers do not share it."""
-    told = Settings(noise=Noise(match_tracks=False))
-    smoothed = run_estimator("batch", dataset_03.sequence, dataset_03.prior, settings=told)
+    full_weight = Settings(noise=Noise(match_tracks=False))
+    smoothed = run_estimator("batch", dataset_03.sequence, dataset_03.prior, settings=full_weight)
     assert_gyro_bias_of_03(smoothed)
     assert more_px(held_out_px(smoothed, dataset_03), held_out_px(run_on("ekf", dataset_03), dataset_03)) < -0.01
 

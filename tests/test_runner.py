@@ -1,4 +1,4 @@
-"""The runner: what it keeps, how it judges, and that one estimator's failure stays its own."""
+"""The runner: what it keeps, how it sets the status, and that one estimator's failure stays its own."""
 
 import time
 from dataclasses import replace

@@ -237,5 +237,5 @@ def test_a_noise_or_calibration_that_can_be_none_is_named(part: str, key: str, v
 def test_motion_of_which_no_sample_is_finite_is_not_to_be_dropped_row_by_row() -> None:
     frames = at_ms(0, 100, 200)
     nothing = TwistSamples(frames, np.full((3, 3), np.nan), np.full((3, 3), np.nan))
-    with pytest.raises(DataError, match="none of its 3 motion samples is finite: look at who wrote them"):
+    with pytest.raises(DataError, match="none of its 3 motion samples is finite: check the program that wrote them"):
         list(sequence_of(frames, nothing).packets())

@@ -86,7 +86,8 @@ def _out_of_reach(trajectory: Trajectory, sequence: Sequence) -> str | None:
         return None
     k = int(np.argmax(beyond))
     return (
-        f"at estimate {k} it is {gone_m[k]:.3g} m from its first, and what was measured goes {reach_m[k]:.3g} m at most"
+        f"at estimate {k} it is {gone_m[k]:.3g} m from its first, and the measured motion covers {reach_m[k]:.3g} m "
+        "at most"
     )
 
 
@@ -107,7 +108,7 @@ def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = No
     Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error, or the
     stated noise of tracks is less than their real noise.
     """
-    doubt = "" if track_noise is None else ", or its tracks err more than it was told (noise.tracks)"
+    doubt = "" if track_noise is None else ", or its tracks have larger errors than it assumes (noise.tracks)"
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])

@@ -221,7 +221,7 @@ def checked_finish(answer: Any, frames_t_ns: IntArray, answered: bool) -> Finish
     Raises EstimatorError where it is no Finished, is about stamps that are no frames' (F,), or about nothing at all.
     """
     if not isinstance(answer, Finished):
-        raise EstimatorError(f"finish answered with {type_of(answer)}; it returns a Finished")
+        raise EstimatorError(f"finish returned {type_of(answer)}; it must return a Finished")
     trajectory, landmarks = answer.trajectory, answer.landmarks
     if not isinstance(trajectory, Trajectory):
         raise EstimatorError(f"the trajectory of its finish is {type_of(trajectory)}; it is a Trajectory")
@@ -237,7 +237,7 @@ def checked_finish(answer: Any, frames_t_ns: IntArray, answered: bool) -> Finish
     _check_array("points_world of its landmarks", landmarks.points_world, ((len(landmarks), 3),), required=True)
     _check_array("cov of its landmarks", landmarks.cov, ((len(landmarks), 3, 3),), required=False)
     if not answered and not count:
-        raise EstimatorError("it answered for no frame, neither in step nor in finish")
+        raise EstimatorError("it returned no estimate for any frame, neither in step nor in finish")
     return answer
 
 

@@ -105,8 +105,8 @@ class EstimatorEntry:
 
     def obeys(self, rule: str, motion_kind: MotionKind | None = None) -> bool:
         """Say whether the estimator obeys a common rule, one of :data:`RULES`, beside a kind of motion or any."""
-        says = self._rules().get(rule, RULES[rule])
-        return motion_kind in says if isinstance(says, tuple) else says is True
+        value = self._rules().get(rule, RULES[rule])
+        return motion_kind in value if isinstance(value, tuple) else value is True
 
     def ignores(self) -> Mapping[str, str]:
         """Return the common rules that the estimator does not obey although most do, and why."""
@@ -115,10 +115,10 @@ class EstimatorEntry:
     def _rules(self) -> Mapping[str, bool | str | tuple[str, ...]]:
         rules = self.found.constants().get("RULES", {})
         declared = rules if isinstance(rules, dict) else {"": False}
-        if not all(rule in RULES and _is_said_of_a_rule(what) for rule, what in declared.items()):
+        if not all(rule in RULES and _is_rule_value(what) for rule, what in declared.items()):
             raise EstimatorError(
-                f"estimator {self.name}: RULES in {self.found.path.name} maps some of {', '.join(RULES)} to True, "
-                f"to kinds of motion ({', '.join(MOTION_KINDS)}), or to the reason why the estimator does not obey it"
+                f"estimator {self.name}: RULES in {self.found.path.name} has to map some of {', '.join(RULES)} to "
+                f"True, to kinds of motion ({', '.join(MOTION_KINDS)}), or to the reason why it does not obey the rule"
             )
         return declared
 
@@ -154,7 +154,7 @@ class EstimatorEntry:
         return cast(Build, module.build)
 
 
-def _is_said_of_a_rule(what: object) -> bool:
+def _is_rule_value(what: object) -> bool:
     if isinstance(what, tuple):
         return bool(what) and set(what) <= set(MOTION_KINDS)
     return what is True or (isinstance(what, str) and bool(what))

@@ -42,7 +42,7 @@ HELD_OUT_ONE_IN = 10
 # The fact stating that the recording has no tracks.
 NO_FEATURES = "no image features in this file"
 # The fact stating that the extrinsic may be inverted, or in camera axes x forward, y left, z up.
-EXTRINSIC_IN_DOUBT = "the extrinsic's direction and camera axes are not certain in this format"
+EXTRINSIC_UNCERTAIN = "the extrinsic's direction and camera axes are not certain in this format"
 # The fact stating that the recording gives one image row for both images of a sighting.
 ONE_ROW_FOR_BOTH = "one row v stands for both images of a sighting in this file"
 # Longest name of a recording or a trajectory: it becomes part of file names, for which systems allow 255 bytes.
@@ -345,13 +345,13 @@ def check_runnable(sequence: Sequence) -> None:
         if backwards.size:
             raise DataError(
                 f"{name}: the stamp of {what} {backwards[0] + 1} is not after the one before it; "
-                "mend the stamps; 'vislam check-data' says what is wrong with all of them"
+                "correct the stamps; 'vislam check-data' says what is wrong with all of them"
             )
     samples, sightings = np.isfinite(motion.values).all(axis=1), is_measured(sequence.observations.uv_px)
     for what, sound in (("motion sample", samples), ("observation", sightings)):
         bad = np.flatnonzero(~sound)
         if bad.size and bad.size == sound.size:
-            raise DataError(f"{name}: none of its {bad.size} {what}s is finite: look at who wrote them")
+            raise DataError(f"{name}: none of its {bad.size} {what}s is finite: check the program that wrote them")
         if bad.size:
             raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]
@@ -382,7 +382,9 @@ def check_stated(sequence: Sequence) -> None:
     for key, value in positive.items():
         smallest = float(np.min(value))
         if not (smallest > 0.0 and np.isfinite(value).all()):
-            raise DataError(f"{sequence.name}: {key} is {smallest:g}, expected a positive number; mend the recording")
+            raise DataError(
+                f"{sequence.name}: {key} is {smallest:g}, expected a positive number; correct the recording"
+            )
     centre = np.array([rig.cx_px, rig.cy_px])
     fixed = {"rig.cx_px or cy_px": centre, "rig.T_imu_cam": rig.T_imu_cam, "gravity_world": sequence.gravity_world}
     for key, value in fixed.items():

@@ -70,7 +70,7 @@ class MatchedNoise:
         if most < _LEAST_REPORTED:
             return ()
         return (
-            f"the tracks contradict the IMU: its noise was taken for up to {most:.1f} times what is stated "
+            f"the tracks contradict the IMU: its noise was assumed up to {most:.1f} times as large as stated "
             f"({usual:.1f} at the median); check stamps, calibration and the stated noise",
         )
 

@@ -103,10 +103,10 @@ class ResidualCorrelation:
         if self.share > _MOST_REPORTED:
             return ()
         together = self._neighbours.erring_as_one(self.correlation)
-        neighbours = f" {together:.1f} neighbours as one," if together > 1.0 else ""
+        neighbours = f" {together:.1f} neighbours have a common error," if together > 1.0 else ""
         return (
             f"residuals along {self._of} are correlated, {self.correlation:.2f} from frame to frame,{neighbours} and "
-            f"not white as stated: {self._of} came to count for {self.share:.2f} of their information",
+            f"not white as stated: {self._of} were given {self.share:.2f} of their information in the end",
         )
 
     def learn(self, sightings: TrackSightings, points: Array, poses: Array) -> None:

@@ -8,7 +8,7 @@ the newest in the root. The last covariance of the oldest and the first of the n
 update costs no more. A dummy variable follows the newest state, for the condition number of the cliques
 (``indeterminate``).
 
-A variable that makes the system indeterminate is held weakly at its value. A landmark that does so again in the same
+A variable that makes the system indeterminate gets a weak prior at its value. A landmark that does so again in the same
 frame is dropped, and so are landmarks without a determined depth in a clique for which GTSAM names another variable. If
 a state does so for the first time, the cause is rounding in the normal equations: the window is then solved by QR,
 which takes ten times as long, until vision has been available again for the length of the window. In either case a new
@@ -33,7 +33,7 @@ from filters.smoothing.indeterminate import (
     ties_of_the_last,
     undetermined,
     variable_named,
-    weak_hold,
+    weak_prior,
     without_gaps,
 )
 from toolkit.errors import EstimatorError
@@ -118,7 +118,7 @@ class FixedLagTree:
     ) -> Recovery:
         """Add factors and values, remove some factors, and solve until nothing is indeterminate."""
         log: list[str] = []
-        held, dropped = set[int](), set[int]()
+        with_prior, dropped = set[int](), set[int]()
         for _ in range(MOST_RECOVERIES):
             try:
                 self._update(factors, values, dropped_slots)
@@ -135,15 +135,15 @@ class FixedLagTree:
                         factors, values = self._without(culprit, factors, values)
                         dropped.add(gtsam.Symbol(culprit).index())
                     key, remedy = culprits[0], f"and was dropped, {len(culprits)} in all"
-                elif key in held and kind_of(key) == "l":
+                elif key in with_prior and kind_of(key) == "l":
                     factors, values = self._without(key, *self._emptied())
                     dropped.add(gtsam.Symbol(key).index())
-                    remedy = "though held, and was dropped"
+                    remedy = "although fixed by a weak prior, and was dropped"
                 else:
                     factors, values = self._emptied()
-                    factors.add(weak_hold(key, values))
-                    held.add(key)
-                    remedy = "and is held weakly where it was"
+                    factors.add(weak_prior(key, values))
+                    with_prior.add(key)
+                    remedy = "and has a weak prior at its value"
                 log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
             else:
                 behind, self._behind = self._behind, set()
@@ -216,9 +216,9 @@ class FixedLagTree:
             return gtsam.NonlinearFactorGraph()
         keys = self._chained.keys()
         estimates = self._latest(new, keys)
-        held = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
-        in_tree = [key for key in held if self._isam.valueExists(key)]
-        at = _joined(self._isam.getLinearizationPoint().extract(in_tree), new, held)
+        fixed = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
+        in_tree = [key for key in fixed if self._isam.valueExists(key)]
+        at = _joined(self._isam.getLinearizationPoint().extract(in_tree), new, fixed)
         return self._chained.factors(estimates, _joined(at, estimates, keys))
 
     def _latest(self, new: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
@@ -269,7 +269,7 @@ class FixedLagTree:
                 kept.add(factor)
         if kept.keys().count(key):
             self._landmark_stamps_ns[key] = self._oldest_ns - 1
-            kept.add(weak_hold(key, values))
+            kept.add(weak_prior(key, values))
         else:
             values.erase(key)
             self._forget([key])

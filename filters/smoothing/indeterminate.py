@@ -87,7 +87,7 @@ def _scaled(information: Array) -> Array:
     return np.asarray(information / np.outer(root, root))
 
 
-def weak_hold(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
+def weak_prior(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
     """Return a weak prior on a variable at its value."""
     at = values.extract([key])
     size = at.dim()

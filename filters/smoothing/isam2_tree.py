@@ -23,7 +23,7 @@ from filters.smoothing.indeterminate import (
     ties_of_the_last,
     undetermined,
     variable_named,
-    weak_hold,
+    weak_prior,
     without_gaps,
 )
 from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
@@ -79,7 +79,7 @@ class Isam2Tree:
         ``seen`` are its sightings and its number if the tree is to chain them. Raises EstimatorError where the system
         stays indeterminate after all recoveries.
         """
-        sees = any(kind_of(key) == "l" for key in list(values.keys()))
+        has_landmarks = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
         self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
         if seen is not None and self._chained is not None:
@@ -96,7 +96,7 @@ class Isam2Tree:
         factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
         added = self._update(factors, values, cached, moved, [*stale, *old_ties])
         # Only after the update: a landmark dropped by the return to Cholesky may be one of the frame's.
-        back = self._back_to_cholesky(sees)
+        back = self._back_to_cholesky(has_landmarks)
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def _with_the_last_tied(
@@ -228,12 +228,12 @@ class Isam2Tree:
         at.insert(estimates.extract([key for key in keys if not at.exists(key)]))
         return Places(estimates, at)
 
-    def _held(self) -> gtsam.KeyList:
+    def _not_relinearised(self) -> gtsam.KeyList:
         """Return the keys that GTSAM must not relinearise: all except those marked for it."""
-        held = gtsam.KeyList(self._frozen.keys)
+        fixed = gtsam.KeyList(self._frozen.keys)
         for key in (*(self._frozen.others - self._to_relinearise), LAST):
-            held.push_back(key)
-        return held
+            fixed.push_back(key)
+        return fixed
 
     def _unchain(self, landmarks: list[int]) -> None:
         if self._chained is not None:
@@ -264,10 +264,10 @@ class Isam2Tree:
                     self._landmarks.add(key)
         self._slot_count += factors.size()
         new = list(factors.keys())
-        leaving, held = self._leaving(), self._held()
+        leaving, fixed = self._leaving(), self._not_relinearised()
         order, anew = (self._order(new, new), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
-            self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)
+            self.isam.update(factors, values, [*moved, *dropped_slots], order, fixed, anew)
             self._solve_back()
         except RuntimeError as refusal:
             return self._recovered(refusal)
@@ -348,8 +348,8 @@ class Isam2Tree:
                 log.append(f"{gtsam.Symbol(key).string()} was indeterminate to rounding: solved by QR for some frames")
                 self._factorization, self._frames_by_qr = "QR", 0
             else:
-                log.append(f"{gtsam.Symbol(key).string()} was indeterminate and is held weakly where it was")
-                factors.add(weak_hold(key, values))
+                log.append(f"{gtsam.Symbol(key).string()} was indeterminate and has a weak prior at its value")
+                factors.add(weak_prior(key, values))
             try:
                 self._rebuild(factors, values)
             except RuntimeError as again:
@@ -358,9 +358,9 @@ class Isam2Tree:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
-    def _back_to_cholesky(self, sees: bool) -> Recovery:
+    def _back_to_cholesky(self, has_landmarks: bool) -> Recovery:
         """Return from QR, which costs ten times as much, once vision has been available again for some frames."""
-        self._frames_by_qr += sees
+        self._frames_by_qr += has_landmarks
         if self._factorization == "CHOLESKY" or self._frames_by_qr <= QR_FRAMES:
             return Recovery([], set())
         self._factorization = "CHOLESKY"

@@ -100,9 +100,9 @@ class LandmarkSteps:
         A disparity near zero is also damped by its size: for a landmark whose best disparity is negative, beyond
         infinity, the linear system predicts a decrease that no step achieves.
         """
-        held, disparity_px = share * np.maximum(self.information, _LEAST_INFORMATION), np.abs(self.seen.image[:, 1])
-        held[:, 1] += np.where(disparity_px < _SMALL_DISPARITY_PX, np.square(0.5 / disparity_px), 0.0)
-        roots = np.sqrt(held)[..., None] * np.eye(3)
+        damped, disparity_px = share * np.maximum(self.information, _LEAST_INFORMATION), np.abs(self.seen.image[:, 1])
+        damped[:, 1] += np.where(disparity_px < _SMALL_DISPARITY_PX, np.square(0.5 / disparity_px), 0.0)
+        roots = np.sqrt(damped)[..., None] * np.eye(3)
         of_pose = roots @ self.seen.by_pose
         graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(3)
         keys = zip(map(L, self.seen.track_ids.tolist()), map(X, self.seen.first.tolist()), strict=True)

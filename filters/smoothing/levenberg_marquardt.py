@@ -132,7 +132,7 @@ class _SolveState(Protocol):
     @property
     def error(self) -> float: ...
     @property
-    def held_back(self) -> bool: ...
+    def is_limited(self) -> bool: ...
     def values(self) -> gtsam.Values: ...
 
 
@@ -161,9 +161,9 @@ def _solved(
         advance(iteration - 1)
         before, here = here.error, solver.advanced(here)
         little = before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease)
-        if little and not here.held_back:
+        if little and not here.is_limited:
             return Solution(here.values(), here.error, iteration, converged=True)
-        enough = before - here.error <= stopping.enough * here.error and not here.held_back
+        enough = before - here.error <= stopping.enough * here.error and not here.is_limited
     return Solution(here.values(), here.error, stopping.max_iterations, converged=enough)
 
 
@@ -172,7 +172,7 @@ class _GtsamState(NamedTuple):
 
     optimizer: gtsam.LevenbergMarquardtOptimizer
     error: float
-    held_back: bool = False
+    is_limited: bool = False
 
     @property
     def damping(self) -> float:
@@ -190,7 +190,7 @@ class _DampedState(NamedTuple):
     reached: gtsam.Values
     error: float
     damping: float
-    held_back: bool = False
+    is_limited: bool = False
 
     def values(self) -> gtsam.Values:
         """Return the values."""
@@ -260,7 +260,7 @@ class _GraphSolver:
                 ):
                     break
             damping *= _DAMPING_FACTOR
-        return here._replace(held_back=False)
+        return here._replace(is_limited=False)
 
     def _step(
         self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
@@ -293,7 +293,7 @@ class _ImageSolver:
             return self._in_metres.stepped(here, self._images.taken, _DAMPING_IN_IMAGES)
         there = self._in_metres.advanced(here)
         if self._in_metres.overshot:
-            return _DampedState(there.values(), there.error, _DAMPING_IN_IMAGES, held_back=True)
+            return _DampedState(there.values(), there.error, _DAMPING_IN_IMAGES, is_limited=True)
         return there
 
 
@@ -303,7 +303,7 @@ class _LandmarkState(NamedTuple):
     reached: gtsam.Values
     error: float
     share: float
-    held_back: bool
+    is_limited: bool
 
     def values(self) -> gtsam.Values:
         """Return the values."""
@@ -319,7 +319,7 @@ class _LandmarkSolver:
 
     def started(self, values: gtsam.Values, error: float) -> _LandmarkState:
         """Return the initial state of the solve."""
-        return _LandmarkState(values, error, _FIRST_SHARE, held_back=False)
+        return _LandmarkState(values, error, _FIRST_SHARE, is_limited=False)
 
     def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
         return _joined(self._graph.linear(values), steps.sightings)
@@ -334,7 +334,7 @@ class _LandmarkSolver:
             if there is not None:
                 return there
             share *= _DAMPING_FACTOR
-        return here._replace(held_back=False)
+        return here._replace(is_limited=False)
 
     def _tried(
         self, here: _LandmarkState, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
@@ -343,22 +343,22 @@ class _LandmarkSolver:
         step = self._step(linear, steps, share)
         if step is None:
             return None
-        promised = here.error - linear.error(step)
+        predicted = here.error - linear.error(step)
         there = self._at(steps, step, share)
-        if here.error - there.error < _LEAST_GAIN_RATIO * promised:
+        if here.error - there.error < _LEAST_GAIN_RATIO * predicted:
             # The minimum along the step of the parabola with the predicted slope and the error found at its end.
-            part = promised / (2.0 * promised - (here.error - there.error))
-            shorter = self._at(steps, step.scale(part), share, held_back=part < _LEAST_PART)
+            part = predicted / (2.0 * predicted - (here.error - there.error))
+            shorter = self._at(steps, step.scale(part), share, is_limited=part < _LEAST_PART)
             there = shorter if shorter.error < there.error or np.isnan(there.error) else there
         return there if there.error <= here.error else None
 
     def _at(
-        self, steps: LandmarkSteps, step: gtsam.VectorValues, share: float, held_back: bool = False
+        self, steps: LandmarkSteps, step: gtsam.VectorValues, share: float, is_limited: bool = False
     ) -> _LandmarkState:
         there = steps.taken(step)
         error = self._graph.error(there) + self._beside.error(there)
         next_share = max(share / _DAMPING_FACTOR, _LEAST_SHARE)
-        return _LandmarkState(there, error, next_share, held_back or share > _FREE_SHARE)
+        return _LandmarkState(there, error, next_share, is_limited or share > _FREE_SHARE)
 
     def _step(self, linear: gtsam.GaussianFactorGraph, steps: LandmarkSteps, share: float) -> gtsam.VectorValues | None:
         """Return the damped step; None if the linear system does not determine it."""

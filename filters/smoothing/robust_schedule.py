@@ -137,7 +137,7 @@ def _solve_chained(
     dof = left_only.degrees_of_freedom(sightings.uv_px)
     jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers, dof)
     sightings, frames = without_jumps(sightings, frames, jumped)
-    last = replace(robust, sightings=sightings, loss=Squares()).held(_only_seen(values, frames))
+    last = replace(robust, sightings=sightings, loss=Squares()).with_fixed_weights(_only_seen(values, frames))
     return _solve_last(motion, last, frames, values, CHAIN_STOPPING, progress)
 
 

@@ -51,7 +51,7 @@ class ScaleState:
 
     def message_of(self, scale: float, sigma: float) -> str:
         """Return the log line about the scale."""
-        message = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
+        message = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig's"
         if sigma > _UNDETERMINED * self.prior_sigma:
-            return f"{message}: the measurements do not tell, and that is the prior"
+            return f"{message}: the measurements do not determine it, and that is the prior"
         return f"{message} (prior 0 +- {100.0 * self.prior_sigma:g} %)"

@@ -171,16 +171,16 @@ class Evaluated:
     def error(self) -> float:
         """The cost of the window."""
         prior, off = self.window.prior, self.off_prior
-        held = float(0.5 * off @ prior.information @ off - prior.vector @ off)
-        return held + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
+        of_prior = float(0.5 * off @ prior.information @ off - prior.vector @ off)
+        return of_prior + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
 
     def linearised(self) -> System:
         """Return the normal equations."""
-        window, count, held = self.window, len(self.window.keys), len(self.off_prior)
+        window, count, size = self.window, len(self.window.keys), len(self.off_prior)
         d = window.size
         information, vector = self._of_motion(count * d)
-        information[:held, :held] += window.prior.information
-        vector[:held] += window.prior.vector - window.prior.information @ self.off_prior
+        information[:size, :size] += window.prior.information
+        vector[:size] += window.prior.vector - window.prior.information @ self.off_prior
         vision = self.vision.reduced()
         information.reshape(count, d, count, d)[:, :6, :, :6] += vision.information.reshape(count, 6, count, 6)
         vector.reshape(count, d)[:, :6] += vision.vector.reshape(count, 6)
@@ -211,11 +211,11 @@ def _joined_graph(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.Nonline
 def _off_prior(window: SmartWindow) -> Array:
     """Return the deviation (D,) of the prior's states from its linearisation point."""
     about = window.prior.about
-    held = [key for key in window.all_keys if about.exists(key)]
-    if not held:
+    keys = [key for key in window.all_keys if about.exists(key)]
+    if not keys:
         return np.zeros(0)
-    delta = about.localCoordinates(window.values.extract(held))
-    return np.concatenate([delta.at(key) for key in held])
+    delta = about.localCoordinates(window.values.extract(keys))
+    return np.concatenate([delta.at(key) for key in keys])
 
 
 def _lower_factor(matrix: Array) -> Array:

@@ -183,7 +183,7 @@ class ChainedFactors:
         in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
         return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
-    def held(self, values: gtsam.Values) -> "ChainedFactors":
+    def with_fixed_weights(self, values: gtsam.Values) -> "ChainedFactors":
         """Return the chains as least squares: each innovation keeps its weight at the values."""
         seen = self.sightings
         sigma_px = seen.chain.sigma_px / np.sqrt(self.weights(self.innovations(values)))[:, None]

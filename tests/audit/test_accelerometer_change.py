@@ -27,7 +27,7 @@ def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
     match = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
     assert match is not None and match[4] == ("more" if dose > 1.0 else "less")
     assert float(match[1]) == pytest.approx(0.5 * duration_s, abs=1.0)
-    # Half of what tracks that creep make of it, and three standard errors as they are rounded.
+    # Half of what drifting tracks make of it, and three standard errors as they are rounded.
     assert float(match[2]) == pytest.approx(9.81 * abs(dose - 1.0), abs=0.08 + 3.0 * float(match[3]) + 0.02)
 
 

@@ -29,7 +29,10 @@ def messages(outcome: Audit) -> dict[str, str]:
 
 def test_odometry_that_is_faster_from_the_middle_on_is_reported_with_its_error() -> None:
     reported = messages(audit(faults.changed_speed(sound("drive"), 1.08)))["scale-change"]
-    found = re.search(r"from about (\d+) s on the odometry is ([\d.]+) \+- ([\d.]+) % faster", reported)
+    found = re.search(
+        r"from about (\d+) s on the odometry's speed relative to the camera's is ([\d.]+) \+- ([\d.]+) % higher",
+        reported,
+    )
     assert found is not None
     assert float(found[1]) == pytest.approx(6.0, abs=1.2)  # a tenth of the recording
     assert float(found[2]) == pytest.approx(8.0, abs=3.0 * float(found[3]))
@@ -73,7 +76,7 @@ def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
 @pytest.mark.parametrize("scenario", ["drive-imu", "flight"])
 def test_a_camera_clock_that_is_set_on_the_way_is_reported(scenario: str) -> None:
     reported = messages(audit(faults.camera_clock_step(sound(scenario), 0.08)))["clock-change"]
-    found = re.search(r"part by (-?\d+) \+- (\d+) ms", reported)
+    found = re.search(r"changes by (-?\d+) \+- (\d+) ms", reported)
     assert found is not None
     assert float(found[1]) == pytest.approx(-80.0, abs=3.0 * float(found[2]))
 
@@ -98,7 +101,7 @@ def test_a_camera_clock_that_is_set_by_little_is_reported_within_its_error(durat
     flight = simulate(replace(SCENARIOS["flight-realistic"], duration_s=duration_s), 102)
     symptom = check(Evidence(faults.camera_clock_step(flight, 0.025)))
     assert isinstance(symptom, Symptom)
-    found = re.search(r"part by (-?\d+) \+- (\d+) ms", symptom.detail)
+    found = re.search(r"changes by (-?\d+) \+- (\d+) ms", symptom.detail)
     assert found is not None
     # Printed to a millisecond.
     assert float(found[1]) == pytest.approx(-25.0, abs=3.0 * float(found[2]) + 0.5)
@@ -165,9 +168,9 @@ def test_mismatches_beneath_a_noise_that_is_stated_too_large_are_reported_by_the
     clean = faults.wrong_noise(sound("drive"), 2.0)
     only_the_noise = messages(audit(clean))["track-scatter"]
     assert "stated 2 times too large" in only_the_noise
-    assert "miss by more" not in only_the_noise
+    assert "have residuals of more than" not in only_the_noise
     reported = messages(audit(faults.exchanged_tracks(clean, 0.1, 1)))["track-scatter"]
-    found = re.search(r"frame ([\d.]+)% \+- ([\d.]+)% of the sightings miss", reported)
+    found = re.search(r"frame ([\d.]+)% \+- ([\d.]+)% of the sightings have residuals of more", reported)
     assert found is not None
     # An exchanged sighting spoils the step to it and the one from it: nearly twice the share, less those lost as pairs.
     assert 10.0 < float(found[1]) < 20.0
@@ -184,7 +187,7 @@ def test_twists_that_come_beside_every_frame_are_reported_where_the_tracks_allow
 ) -> None:
     reported = messages(audit(faults.camera_clock(sound("drive"), late_s)))["time-offset"]
     assert f"to be shifted by {-1e3 * late_s:+.0f} ms" in reported
-    assert "does not tell that from none" in reported
+    assert "which is consistent with zero as well" in reported
 
 
 def test_twists_at_the_frames_or_at_another_rate_are_no_clock_that_is_off() -> None:
@@ -207,7 +210,7 @@ def test_frames_are_not_shifted_where_the_gyro_alone_is_late(samples: int) -> No
     found = audit(late)
     offset = next(finding for finding in found.findings if finding.fault == "time-offset")
     assert offset.warning
-    assert "the gyro alone is off" in offset.detail
+    assert "the gyro alone is shifted" in offset.detail
     np.testing.assert_array_equal(found.sequence.frames_t_ns, late.frames_t_ns)
     assert "the frames are shifted by it" in messages(audit(faults.camera_clock(clean, -0.1 * samples)))["time-offset"]
 

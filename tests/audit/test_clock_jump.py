@@ -30,7 +30,7 @@ def test_a_clock_that_is_set_by_steps_is_reported_with_its_size_and_cut_at(
     dose_s = steps * float(np.diff(sound.frames_s[:2])[0])
     found = clock_jump.check(Evidence(faults.clock_jump(sound, dose_s, seed)))
     if scenario == "flight" and isinstance(found, Undecided):  # its tracks tell half of a step on some seeds only
-        assert abs(steps) < 1.0 and "leap together" in found.why
+        assert abs(steps) < 1.0 and "jump together" in found.why
         return
     assert isinstance(found, Symptom) and found.harmful and found.remedy is not None
     match = re.search(r"set by ([-+][\d.]+) s at", found.detail)
@@ -98,4 +98,4 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_r
         for sequence in (paused, jumped):
             reported = clock_jump.check(Evidence(sequence))
             assert isinstance(reported, Undecided)
-            assert "do not tell whether time passed" in reported.why
+            assert "do not determine whether time passed" in reported.why

@@ -42,7 +42,7 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
 def test_tracks_with_a_walk_or_an_offset_of_their_own_are_reported_and_white_ones_are_not(flight: Sequence) -> None:
     drive = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3)
     assert reported(flight) == reported(drive) == []
-    assert "each errs by itself" in reported(track_faults.track_walk(flight, 4.0, 3))[0]
+    assert "where independent errors have -0.5" in reported(track_faults.track_walk(flight, 4.0, 3))[0]
     assert "noise.tracks=fitted" in reported(track_faults.match_offset(drive, 3.0, 3))[0]
 
 

@@ -1,4 +1,4 @@
-"""Velocities and rates in each other's place are exchanged again, and what has another unit is not taken for that."""
+"""Velocities and rates in each other's place are exchanged back, and what has another unit is not taken for that."""
 
 from dataclasses import replace
 

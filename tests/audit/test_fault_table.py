@@ -79,8 +79,8 @@ CASES = [
     Case(stamps_in, 1000.0, "units", "blocks", "they are not in seconds"),
     Case(stamps_in, 0.001, "units", "blocks", "they are not in seconds"),
     Case(samples_stamped_in, 1000.0, "sparse-motion", "blocks", "check both"),
-    Case(mirrored, 0.0, "mixed-axes", "blocks", "images that are mirrored look so", TWIST),
-    Case(mirrored, 0.0, "accelerometer-axes", "blocks", "images that are mirrored look so", IMU),
+    Case(mirrored, 0.0, "mixed-axes", "blocks", "mirrored images have the same effect", TWIST),
+    Case(mirrored, 0.0, "accelerometer-axes", "blocks", "mirrored images have the same effect", IMU),
     Case(faults.shifted_pixels, 5000.0, "intrinsics", "blocks", "lies outside the sightings"),
     Case(faults.baseline_unit, 1000.0, "units", "repaired", "it is in millimetres, 0.54 m", TWIST),
     Case(faults.baseline_unit, 1000.0, "units", "blocks", "baseline_m is 110", IMU),
@@ -125,10 +125,10 @@ CASES = [
     Case(faults.displaced_camera, 1.0, "lever-arm", "warned", "the camera is off by", IMU),
     Case(faults.outlier_tracks, 0.6, "track-scatter", "warned", "times as much as the stated noise"),
     Case(faults.linear_unit, 0.8, "miscalibration", "warned", "times gravity", IMU),
-    Case(faults.alternate_frames_late, 0.02, "uneven-stamps", "warned", "the camera's motion follows", TWIST),
-    Case(faults.frame_jitter, 0.015, "uneven-stamps", "warned", "the camera's motion follows", TWIST),
+    Case(faults.alternate_frames_late, 0.02, "uneven-stamps", "warned", "the camera's motion shows", TWIST),
+    Case(faults.frame_jitter, 0.015, "uneven-stamps", "warned", "the camera's motion shows", TWIST),
     Case(faults.truth_clock_rate, 1.04, "truth-clock", "warned", "times as fast by the truth's stamps"),
-    Case(faults.unwritten_orientations, 1.0, "truth-mismatch", "warned", "all orientations of the truth are one"),
+    Case(faults.unwritten_orientations, 1.0, "truth-mismatch", "warned", "all orientations of the truth are equal"),
     Case(faults.gyro_axis_scale, 0.85, "gyro-scale", "warned", "times as fast as the camera about"),
     Case(faults.coarse_samples, 0.1, "coarse-samples", "warned", "in steps of 0.1 rad/s"),
     Case(faults.blackout, 1.0, "thin-vision", "warned", "s ("),
@@ -175,7 +175,7 @@ def test_the_fault_is_named_with_the_right_verdict(case: Case, scenario: str) ->
 @every_case
 def test_nothing_is_blessed_that_blocks_or_was_not_checked(case: Case, scenario: str) -> None:
     outcome = audited(case.plant, case.dose, scenario)
-    blessed = "nothing is left that spoils a result" in audit_text(outcome)
+    blessed = "no fault is left that invalidates a result" in audit_text(outcome)
     assert blessed == (case.verdict == "repaired" and not outcome.undecided)
     assert ("not decidable: " in audit_text(outcome)) == bool(outcome.undecided)
 

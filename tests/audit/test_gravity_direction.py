@@ -43,7 +43,7 @@ def test_in_a_world_whose_axes_are_all_far_from_gravity_it_blocks() -> None:
     assert "no axis of the world is near" in finding.detail
 
 
-def test_a_truth_that_turns_otherwise_than_the_gyro_tells_nothing_of_gravity() -> None:
+def test_a_truth_that_rotates_differently_from_the_gyro_shows_nothing_of_gravity() -> None:
     """Its body axes are others: what they make of the samples falls anywhere."""
     sound = recorded("flight")
     assert sound.truth is not None

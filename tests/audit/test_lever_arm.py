@@ -53,7 +53,7 @@ def test_a_place_counts_beyond_four_standard_errors() -> None:
     assert messages(recorded(), (0.015 + 4.1 * 0.02) * one, 0.02) is not None
 
 
-def test_a_translation_is_named_by_the_slip_that_explains_it() -> None:
+def test_a_translation_is_named_by_the_mistake_that_explains_it() -> None:
     sequence = apart()
     rotation, given = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     for lacking_m, slip in (

@@ -58,7 +58,7 @@ def test_the_indoor_recording_whose_gyro_is_late_keeps_its_stamps() -> None:
     """Its truth's rotations are the gyro's of 0.15 s later, and its velocities are not: ekf was a seventh worse off."""
     indoors = part("utias/dataset3.mat", 633, 1266)
     found = audit(indoors)
-    assert "the gyro alone is off" in warnings_of(found)["time-offset"]
+    assert "the gyro alone is shifted" in warnings_of(found)["time-offset"]
     np.testing.assert_array_equal(found.sequence.frames_t_ns, indoors.frames_t_ns)
 
 

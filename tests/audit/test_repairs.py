@@ -205,7 +205,7 @@ def test_nothing_is_concluded_from_tracks_whose_axes_are_left_to_choose() -> Non
     outcome = audit(faults.inverted_extrinsic(drive))
     assert [(found.fault, found.blocking) for found in outcome.findings] == [("mixed-axes", True)]
     assert "choose one" in outcome.findings[0].detail
-    assert outcome.undecided["extrinsic-translation"].startswith("mixed-axes must be mended")
+    assert outcome.undecided["extrinsic-translation"].startswith("mixed-axes must be corrected")
     assert outcome.sequence.prior is drive.prior
 
 

@@ -44,7 +44,7 @@ def test_two_percent_of_scale_are_reported_with_their_error(
 def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction(seed: int) -> None:
     found = steady_difference.check(Evidence(faults.shifted_centre(drive(seed), 12.0, seed)))
     assert isinstance(found, Symptom)
-    match = re.search(r"which is (\d+) px of the principal point", found.detail)
+    match = re.search(r"equivalent to (\d+) px of the principal point", found.detail)
     assert match is not None and float(match[1]) == pytest.approx(12.0, abs=2.5)
 
 

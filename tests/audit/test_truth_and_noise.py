@@ -77,7 +77,7 @@ def test_a_truth_that_runs_backwards_is_reported(drive: Sequence) -> None:
     truth = truth_of(drive)
     found = with_truth(drive, Truth(truth.t_ns, truth.T_world_imu[::-1]))
     assert isinstance(found, Symptom)
-    assert "but for one whose poses run backwards" in found.detail
+    assert "only for a truth whose poses run backwards" in found.detail
 
 
 def test_a_truth_of_another_flight_is_reported(flight: Sequence) -> None:
@@ -111,8 +111,8 @@ def test_a_truth_that_leaps_or_is_not_finite_is_reported(recording: str, request
     sequence = request.getfixturevalue(recording)
     truth = truth_of(sequence)
     for rows, added, expected in (
-        (slice(len(truth.t_ns) // 2, None), 30.0, "leaps 1 time(s), the farthest by 30 m"),
-        (slice(20, 21), 1e150, "leaps 2 time(s), the farthest by 1e+150 m"),
+        (slice(len(truth.t_ns) // 2, None), 30.0, "jumps 1 time(s), the farthest by 30 m"),
+        (slice(20, 21), 1e150, "jumps 2 time(s), the farthest by 1e+150 m"),
         (slice(20, 23), np.nan, "3 of"),
     ):
         T_world_imu = truth.T_world_imu.copy()
@@ -145,13 +145,13 @@ def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
     assert truth_mismatch.check(Evidence(sequence)) is None
 
 
-@pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y turned (positions alone)"])
+@pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y changed (positions alone)"])
 def test_a_truth_in_exchanged_axes_is_reported_with_those(flight: Sequence, words: str) -> None:
     truth = truth_of(flight)
     (exchange,) = (one for one in exchanges() if one.description == words)
     found = with_truth(flight, replace(truth, T_world_imu=exchange.reread(truth.T_world_imu)))
     assert isinstance(found, Symptom)
-    assert f"but for one with {words}" in found.detail
+    assert f"only for a truth with {words}" in found.detail
 
 
 def test_a_truth_of_other_times_or_none_is_not_checked(drive: Sequence) -> None:

@@ -63,6 +63,6 @@ def test_orientations_that_were_not_written_are_reported(scenario: str) -> None:
     faulty = faults.unwritten_orientations(simulated(scenario, 33))
     symptom = truth_mismatch.check(Evidence(faulty))
     assert isinstance(symptom, Symptom)
-    assert "all orientations of the truth are one" in symptom.detail
+    assert "all orientations of the truth are equal" in symptom.detail
     assert faulty.truth is not None
     assert np.ptp(faulty.truth.T_world_imu[:, :3, 3], axis=0).max() > 0.0

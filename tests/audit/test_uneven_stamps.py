@@ -1,4 +1,4 @@
-"""Stamps that come unevenly while the images do not: told, and never where images are lost or come unevenly."""
+"""Stamps that come unevenly while the images do not: reported, and never where images are lost or come unevenly."""
 
 import re
 from dataclasses import replace
@@ -30,7 +30,7 @@ def with_frames_lost(sequence: Sequence) -> Sequence:
 def test_stamps_that_the_cameras_motion_does_not_follow_are_reported(scenario: str, fault: faults.Fault) -> None:
     found = uneven_stamps.check(Evidence(fault(simulated(scenario), 0.015, 3)))
     assert isinstance(found, Symptom) and found.warns
-    match = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+    match = re.search(r"motion shows (\S+) \+- (\S+) of", found.detail)
     assert match is not None
     # None of it, and less: a stamp that is late lengthens one step and shortens the next by the same.
     assert -0.5 < float(match[1]) < 0.1
@@ -54,7 +54,7 @@ def test_every_other_frame_late_is_reported_whichever_steps_are_more_and_where_f
     for sequence in (late, with_frames_lost(late)):
         found = uneven_stamps.check(Evidence(sequence))
         assert isinstance(found, Symptom)
-        reported = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+        reported = re.search(r"motion shows (\S+) \+- (\S+) of", found.detail)
         assert reported is not None
         assert -0.25 < float(reported[1]) < 0.1
 
@@ -71,7 +71,7 @@ def test_the_motion_follows_all_of_the_steps_where_stamps_are_right() -> None:
     assert followed.value == pytest.approx(1.0, abs=4.0 * followed.error + 0.02)
 
 
-def test_a_vehicle_that_stands_tells_nothing() -> None:
+def test_a_vehicle_that_stands_decides_nothing() -> None:
     standing = faults.frame_jitter(faults.standstill(simulated("drive"), 8.0, 1), 0.015, 3)
     camera = Evidence(standing).camera_motion
     still = np.linalg.norm(camera.v_mps, axis=1) < 0.05

@@ -38,7 +38,7 @@ import gate_pool
 
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
-from toolkit.gate.judging import changed_metrics
+from toolkit.gate.case_check import changed_metrics
 from toolkit.gate.significance import Pairs, Where, holm, moved_p, worse_p
 from toolkit.progress import silent
 
@@ -178,7 +178,7 @@ def _print_row(what: str, every: list[Column], size: Size, planted: tuple[str, s
 
 
 def _changed(every: list[Column], name: str) -> str:
-    """Return which metrics are told to be computed otherwise where the ATE is a mean; of the pool's seeds all count."""
+    """Return the metrics reported as computed differently where the ATE is a mean; all of the pool's seeds count."""
     found = set[str]()
     for source in CASES:
         of_it = [column for column in every if (column.where.sequence, column.where.estimator) == (source, name)]
@@ -241,7 +241,7 @@ def print_speeds_in_turn(times: Path) -> None:
         for _ in range(checks):
             k = int(rng.integers(len(every)))
             drawn = [_drawn_turns(one, slower if i == k else 1.0, rng) for i, one in enumerate(every)]
-            verdicts = list(interleaved.judge_speeds(drawn, "before", FALSE_ALARM_RATE))
+            verdicts = list(interleaved.check_speeds(drawn, "before", FALSE_ALARM_RATE))
             failed[k] += verdicts[k].finding == "regressed" if slower > 1.0 else any(v.fails for v in verdicts)
             counts += [len(one.cpu_s) for one in drawn]
         print(f"{slower:5.2f} times the time: {100.0 * failed.sum() / checks:5.1f} % fail; {np.mean(counts):.0f} pairs")

@@ -9,7 +9,7 @@ A *planted regression* of p percent multiplies the error of every pose of a side
 1 + p u / 100 with u uniform in 0 ... 2, drawn anew for each run: p percent in expectation, with a spread of its own of
 0.58 p percent, and seen by ATE and NEES only.
 
-*Planted changes* are such as a commit makes by mistake; they read what side 0 reads, and are judged against side 0:
+*Planted changes* are such as a commit makes by mistake; they read what side 0 reads, and are compared with side 0:
 noise stated 5 % too large, first estimates dropped, a sign of the camera's lever arm, an ATE that is a mean.
 """
 
@@ -76,7 +76,7 @@ def worsened(trajectory: Trajectory | None, sequence: Sequence, factor: float) -
 
 
 def scores(run: Run, sequence: Sequence, percent: float) -> dict[str, dict[str, float | None]]:
-    """Return the metrics the gate judges on a simulated sequence, by kind of output; held-out only without a plant."""
+    """Return the metrics the gate checks on a simulated sequence, by kind of output; held-out only without a plant."""
     files = (ate, nees, held_out, nis) if percent == 0.0 else (ate, nees)
     found: dict[str, dict[str, float | None]] = {}
     for output in ("causal",) if run.final_is_causal else ("causal", "final"):

@@ -4,7 +4,7 @@
 
 For a simulated export with raw IMU samples and exact truth. A quintic spline through the poses at the frames is the
 motion, exact by definition; each landmark is where all sightings of its track put it; pixels, IMU samples and biases
-are drawn with the noise that the recording states. So an estimator is judged on draws that nobody has chosen it by.
+are drawn with the noise that the recording states. So an estimator is evaluated on draws that nobody has chosen it by.
 
 A line a length of the window, all of it the mean over draws of what changes against the first length, in log: the
 deviation of heading that the filter states at the end and that of its position, which differ little between draws, and

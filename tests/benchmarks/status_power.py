@@ -5,21 +5,21 @@ away. The recording is audited and run as a user would; then the truth is put ba
 position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
 that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
 overconfident or contradicted, where a note says that its gate refused much, that it explains withheld tracks worse
-than dead reckoning, that it parts from the measured motion or rests on a motion that others dispute, or where the audit
-found something in its recording, repaired or not; faults that could not be judged do not count. In a sound recording
-all of that is a false alarm, and so is the mark timid.
+than dead reckoning, that it differs from the measured motion or uses a motion alone that others contradict, or where
+the audit found something in its recording, repaired or not; faults that could not be decided do not count. In a sound
+recording all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
 thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`, `fourth`,
 `fifth`, `sixth`, `seventh` and `eighth` are draws of others yet, with one recording drawn for every fault. In `sixth`
-and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be judged by, beside
+and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be tested by, beside
 one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and two by
 two, as they meet faults, and what any of these comparisons says is a false alarm.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
 
-With --keep DIRECTORY every run is pickled there, and what is there already is judged by the code as it is, not run.
+With --keep DIRECTORY every run is pickled there, and what is there already is evaluated by the code as it is, not run.
 """
 
 import argparse
@@ -38,7 +38,7 @@ import numpy as np
 from toolkit.errors import VislamError
 from toolkit.estimate import Output, Run, Status
 from toolkit.experiment.comparison import Row, consistency_of
-from toolkit.experiment.disagreement import Dispute
+from toolkit.experiment.disagreement import MotionTest
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
 from toolkit.metrics import Evaluation, ate, score_run
@@ -171,12 +171,12 @@ class Ended:
     log: Sequence[str] = ()
     refuses: bool = False
     harms: bool = False
-    disputes: bool = False
+    contradicts: bool = False
 
     @property
     def is_reported(self) -> bool:
         """Say whether its status, its mark, a note, or the audit tells of a fault."""
-        by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms or self.disputes
+        by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms or self.contradicts
         return bool(self.found) or self.status != "ok" or by_mark or by_notes
 
     @property
@@ -243,15 +243,15 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
             outcome = outcome_of(run, prepared.sequence, 0)
             rows[name] = [row for row in (Row(output, (outcome,)) for output in OUTPUTS) if not row.repeats_causal]
             lines[name] = _scored(one, run, outcome, prepared, replace(prepared.sequence, truth=recorded.truth))
-    disputing = {name for names in comparisons(scenario) for name in _who_disputes(rows, names)}
+    contradicting = {name for names in comparisons(scenario) for name in _contradicting_or_contradicted(rows, names)}
     for name, line in lines.items():
-        yield replace(line, disputes=name in disputing)
+        yield replace(line, contradicts=name in contradicting)
 
 
-def _who_disputes(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
+def _contradicting_or_contradicted(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
     """Return of the estimators of a comparison who parts from the measured motion, or rests on one in doubt."""
-    dispute = Dispute.of(row for name in names for row in rows.get(name, ()))
-    return {one.row.estimator for one in dispute.too_far} | set(dispute.uncorrected if dispute.doubts_motion else ())
+    test = MotionTest.of(row for name in names for row in rows.get(name, ()))
+    return {one.row.estimator for one in test.too_far} | set(test.uncorrected if test.is_contradicted else ())
 
 
 def _unless_refused(make: Callable[[], Result]) -> Result | str:
@@ -263,7 +263,7 @@ def _unless_refused(make: Callable[[], Result]) -> Result | str:
 
 
 def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
-    """Run an estimator, or judge the run that is kept by the code as it is."""
+    """Run an estimator, or evaluate the run that is kept by the code as it is."""
     if kept is not None and kept.exists():
         run: Run = pickle.loads(kept.read_bytes())
         log = tuple(line for line in run.log if not line.startswith("the trajectory diverged"))

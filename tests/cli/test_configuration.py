@@ -240,4 +240,4 @@ def test_what_is_no_duration_is_refused(text: str, capsys: pytest.CaptureFixture
 def test_a_second_file_of_settings_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parser().parse_args(["compare", "drive", "--config", "a.toml", "--config", "b.toml"])
-    assert "--config is there twice; it takes one file, and --set changes" in capsys.readouterr().err
+    assert "--config is given twice; it takes one file, and --set changes" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Names of others act on nothing, sizes are judged before a run, and a misspelt name gets the nearest one."""
+"""Names of others act on nothing, sizes are checked before a run, and a misspelt name gets the nearest one."""
 
 import json
 import os
@@ -134,7 +134,7 @@ def test_what_names_no_file_is_distinguished_from_one_that_is_missing(
 
 
 @pytest.mark.parametrize("words", [("diff", "n" * 5000, "run"), ("compare", "drive", "--workers", "n" * 5000)])
-def test_of_a_word_of_thousands_of_letters_both_ends_are_reported(
+def test_of_an_argument_of_thousands_of_letters_both_ends_are_reported(
     vislam: Vislam, one_line: OneLine, words: tuple[str, ...]
 ) -> None:
     assert vislam(*words) in (2, 3)

@@ -49,7 +49,7 @@ def again(run: Path, without_pixels: WithoutPixels) -> Path:
     (run.parent / "astray.tum").write_text(astray)
     files = {**{f"by {name}": f"ekf.{name}" for name in FORMATS}, "astray": "astray.tum"}
     words = [word for name, file in files.items() for word in ("--trajectory", f"{name}={run.parent / file}")]
-    # What another system made of it is not judged as a run of ours is: the exit status speaks of ours alone.
+    # What another system made of it is not checked as a run of ours is: the exit status is that of ours alone.
     with without_pixels():
         assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
     return run.parent / "again"

@@ -98,7 +98,7 @@ def test_no_two_columns_have_the_same_name():
     assert len(set(names)) == len(names)
 
 
-def test_every_metric_the_gate_judges_has_a_name_there():
+def test_every_metric_the_gate_checks_has_a_name_there():
     checked = {COVERAGE, *DEFAULT_BOUNDS.simulated, *DEFAULT_BOUNDS.recorded}
     assert checked == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
 

@@ -97,7 +97,7 @@ def apart(one: Trajectory, poses: Array) -> float:
 
 @both_kinds
 @pytest.mark.parametrize("name", sorted(discover()))
-def test_an_estimator_answers_the_same_to_a_recording_that_is_told_otherwise(name: str, scenario: str) -> None:
+def test_an_estimator_answers_the_same_to_a_recording_in_other_coordinates(name: str, scenario: str) -> None:
     usual, other = run_on(name, scenario, "as it is"), run_on(name, scenario, "retold")
     assert usual.status == other.status == "ok"
     for one, two in zip(outputs(usual), outputs(other), strict=True):
@@ -118,7 +118,7 @@ def test_no_axis_of_the_world_counts_for_more_than_others(name: str, scenario: s
 
 @both_kinds
 @pytest.mark.parametrize("name", ["ekf", "batch"])
-def test_metrics_are_the_same_of_a_recording_that_is_told_otherwise(name: str, scenario: str) -> None:
+def test_metrics_are_the_same_of_a_recording_in_other_coordinates(name: str, scenario: str) -> None:
     usual = score_run(run_on(name, scenario, "as it is"), "final", recording(scenario)).values
     other = score_run(run_on(name, scenario, "retold"), "final", retold(recording(scenario))).values
     measured = {key for key, value in usual.items() if value is not None} - COSTS
@@ -132,7 +132,7 @@ def started(sequence: Sequence) -> Prior:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_the_start_is_the_same_of_a_recording_that_is_told_otherwise(scenario: str) -> None:
+def test_the_start_is_the_same_of_a_recording_in_other_coordinates(scenario: str) -> None:
     usual, other = started(recording(scenario)), started(retold(recording(scenario)))
     assert usual.source == other.source
     mirror = np.diag([1.0, -1.0, 1.0])
@@ -154,7 +154,7 @@ def test_the_start_is_the_same_of_a_recording_that_is_told_otherwise(scenario: s
         ("flight", faults.displaced_camera),
     ],
 )
-def test_the_audit_finds_the_same_in_a_recording_that_is_told_otherwise(scenario, plant) -> None:
+def test_the_audit_finds_the_same_in_a_recording_in_other_coordinates(scenario, plant) -> None:
     """Counts and verdicts; what was measured beside them has its signs.
 
     A wrong extrinsic told in a mirror is another fault, where it is that of other axes or of the inverse.

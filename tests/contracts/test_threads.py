@@ -1,4 +1,4 @@
-"""Every estimator says the same bits at one thread and at two: what a report shows can be repeated anywhere.
+"""Every estimator gives the same bits at one thread and at two: what a report shows can be repeated anywhere.
 
 The number of threads is settled when the numeric libraries are loaded, so each number has a process of its own.
 """

@@ -81,8 +81,8 @@ def test_each_convention_of_the_extrinsic_is_found_with_noise_and_mismatches(tmp
     # The stereo tracks decide among four candidates; the right one is the simulation's to rounding.
     np.testing.assert_allclose(audited.sequence.rig.T_imu_cam, drive().rig.T_imu_cam, atol=1e-12)
     (reported,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
-    assert reported.endswith(f"the extrinsic is taken {convention}")
-    assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
+    assert reported.endswith(f"the extrinsic is read {convention}")
+    assert f"the extrinsic is read {convention}" in audited.sequence.provenance.facts
 
 
 @pytest.mark.parametrize("convention", [name for name in CONVENTIONS if name.endswith("regular")])
@@ -98,9 +98,9 @@ def test_where_the_camera_is_decides_between_readings_that_look_the_same_way(tmp
     given["v_t"], given["w_t"] = np.split(sequence.motion.values + noise, 2, axis=1)
     given["v_t"], given["w_t"] = given["v_t"][: sequence.frame_count], given["w_t"][: sequence.frame_count]
     audited = audit(load_sequence(str(saved(tmp_path, given))))
-    assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
+    assert f"the extrinsic is read {convention}" in audited.sequence.provenance.facts
     (reported,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
-    assert "in turns the camera's velocity is" in reported
+    assert "during rotation the camera's velocity is" in reported
 
 
 def test_kept_the_convention_is_reported_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def test_nan_stands_for_a_missing_sighting_where_nothing_else_does(course: Cours
     np.testing.assert_array_equal(seen.frame, sound.frame)
 
 
-def test_one_stamp_that_is_no_time_tells_no_unit(course: Course, tmp_path: Path) -> None:
+def test_one_stamp_that_is_no_time_determines_no_unit(course: Course, tmp_path: Path) -> None:
     stamps = course["time_stamps"].astype(float)
     stamps[0, 2] = 1e300
     with pytest.raises(DataError, match=r"time_stamps\[2\] is 1e\+300 s \(1 such stamps\)"):

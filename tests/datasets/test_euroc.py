@@ -326,7 +326,7 @@ TRUTH = "state_groundtruth_estimate0"
 BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
 MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ("no truth", lambda d: shutil.rmtree(d / "mav0" / TRUTH), "no ground truth in mav0/state_groundtruth_estimate0"),
-    ("other clock", shift_truth, "share no 0.2 s"),
+    ("other clock", shift_truth, "overlap by less than 0.2 s"),
     ("no imu", lambda d: (d / "mav0/imu0/data.csv").unlink(), "imu0/data.csv: .*cannot be read"),
     ("no camera yaml", lambda d: (d / "mav0/cam0/sensor.yaml").unlink(), "cam0/sensor.yaml: cannot be read"),
     ("no stamps", lambda d: (d / "mav0/cam0/data.csv").unlink(), "cam0/data.csv: cannot be read"),

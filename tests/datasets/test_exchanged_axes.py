@@ -29,8 +29,8 @@ def of(scenario: str, duration_s: float) -> tuple[Array, Array]:
     "y and z exchanged (positions and quaternions)",
     "y and z exchanged (the whole world)",
     "x and y exchanged (positions alone)",
-    "the sign of z turned (positions alone)",
-    "x, y and z taken from what stands as y, z, x (positions alone)",
+    "the sign of z changed (positions alone)",
+    "x, y and z read from the columns y, z, x (positions alone)",
 ])  # fmt: skip
 def test_exchanged_axes_of_a_path_in_space_are_named(words: str) -> None:
     truth, estimate = of("flight", 8.0)

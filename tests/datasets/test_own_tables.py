@@ -124,7 +124,7 @@ def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Pat
         (lambda text: "# a drive\n\n# of today\n" + text.replace("\n", "\n# next\n\n"), None),
         (lambda text: "# a drive\n#" + text, None),
         (lambda text: "".join(line + ",\n" for line in text.splitlines()), None),
-        (lambda text: text.replace(",", " "), "its columns stand between blanks; separate them by commas"),
+        (lambda text: text.replace(",", " "), "its columns are separated by blanks; separate them by commas"),
         (lambda text: text.replace(",", ";").replace(".", ","), r"line 2: .* is \d+,\d+, .* with a decimal point"),
         (lambda text: text.partition("\n")[2], "holds numbers and no names; its first line names the columns"),
         (lambda text: text.replace("000000,", ","), "t_ns must be in nanoseconds, but the stamps look like"),

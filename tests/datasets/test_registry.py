@@ -68,7 +68,7 @@ def test_what_a_file_is_instead_is_reported(tmp_path: Path, content: bytes, patt
 def test_of_a_folder_of_recordings_some_are_named(course: dict[str, Any], tmp_path: Path) -> None:
     np.savez(tmp_path / "02.npz", **course)
     (tmp_path / "README").write_text("drives")
-    with pytest.raises(DataError, match=r"is no recording, and holds some: name 02\.npz in it"):
+    with pytest.raises(DataError, match=r"is not a recording, but contains some: name 02\.npz in it"):
         load_sequence(str(tmp_path))
 
 

@@ -124,7 +124,7 @@ def test_a_text_that_is_spoilt_beside_its_arrays_is_named(drive: Sequence, tmp_p
 
 def test_the_arrays_by_themselves_are_a_part_of_a_recording(drive: Sequence, tmp_path: Path) -> None:
     vislam_recording.save(drive, tmp_path / "drive")
-    with pytest.raises(DataError, match=r"is a part of a recording: name the whole, .*drive; "):
+    with pytest.raises(DataError, match=r"is a part of a recording: name the whole recording, .*drive; "):
         load_sequence(str(tmp_path / "drive" / "recording.npz"))
 
 
@@ -324,7 +324,7 @@ def test_facts_that_are_no_text_are_refused(drive: Sequence, tmp_path: Path, fac
     text = json.loads((folder / "recording.json").read_text())
     text["provenance"]["facts"] = facts
     (folder / "recording.json").write_text(json.dumps(text))
-    with pytest.raises(DataError, match="provenance holds what is no text"):
+    with pytest.raises(DataError, match="provenance contains a value that is not text"):
         vislam_recording.load(folder)
 
 

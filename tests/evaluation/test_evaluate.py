@@ -94,7 +94,7 @@ def test_a_run_over_a_tenth_of_the_path_does_not_win(scene, vislam, capsys) -> N
     short = next(run for run in found["runs"] if run["estimator"] == "short")
     assert short["status"] == "failed"
     assert short["metrics"]["ate_se3_m"] < 0.01
-    assert "covers 9.9 % of the truth's time, and 50 % is asked for" in capsys.readouterr().out
+    assert "covers 9.9 % of the truth's time, and 50 % is required" in capsys.readouterr().out
     assert vislam("evaluate", "truth.tum", "short.tum", "--least-coverage", "5", "--quiet") == 0
 
 
@@ -346,7 +346,7 @@ def test_an_estimate_that_stays_looks_one_way_or_leaps_is_remarked_and_a_sound_o
     assert "ate_se3_m" not in notes["sound"]
     assert "stands still" in notes["stays"]["ate_se3_m"]
     assert "orientations are all one" in notes["one_way"]["ate_se3_deg"]
-    assert "leaps, 2 time(s), the farthest by 30" in notes["leaps"]["ate_se3_m"]
+    assert "jumps, 2 time(s), the farthest by 30" in notes["leaps"]["ate_se3_m"]
     assert re.search(r" (19|29)\.9 s after its first pose", notes["leaps"]["ate_se3_m"])
 
 

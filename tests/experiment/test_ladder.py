@@ -45,7 +45,7 @@ def test_a_rung_names_a_part_of_the_noise_model_where_it_has_one_that_the_rung_b
         assert (entry.obeys(rule) != before.obeys(rule)) == (word in entry.change()), entry.name
 
 
-def test_the_word_stands_for_every_rung_and_names_count_once() -> None:
+def test_ladder_stands_for_every_rung_and_names_count_once() -> None:
     names = [entry.name for entry in ladder()]
     assert list(find_all(["ladder"])) == names
     assert list(find_all([names[-1], "ladder"])) == [names[-1], *names[:-1]]

@@ -133,8 +133,8 @@ def test_under_the_table_stands_who_differs_from_the_best(over: Comparison) -> N
     assert lines == ["honest causal: ATE none +4.32 ± 0.87 m against astray, paired over 3 seeds"]
     near = [_with_ate(one, one.seed + (0.1 if one.seed % 2 else -0.11)) for one in astray]
     (line,) = paired_lines(replace(over, outcomes=(*honest, *near)))
-    assert re.search(r"paired over 3 seeds: may be chance; \d+ more seeds? would tell a difference as large", line)
-    assert "Who differs from the best?" in report_text(over, {})
+    assert re.search(r"paired over 3 seeds: may be chance; \d+ more seeds? would show a difference as large", line)
+    assert "Which estimators differ from the best?" in report_text(over, {})
 
 
 def _with_ate(outcome: Outcome, ate_m: float) -> Outcome:
@@ -198,7 +198,7 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) 
     for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
-        assert "too sure of itself" in " ".join(text.split())
+        assert "overconfident" in " ".join(text.split())
     assert max(map(len, comparison_text(over).splitlines())) <= 100
 
 

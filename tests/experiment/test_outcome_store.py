@@ -253,9 +253,7 @@ def test_a_damaged_line_is_reported_with_its_number(store: OutcomeStore, tmp_pat
         (b'"sequence_hash":"hash"', b'"sequence_hash":""'),
     ],
 )
-def test_a_line_that_was_edited_is_not_believed(
-    store: OutcomeStore, tmp_path: Path, was: bytes, becomes: bytes
-) -> None:
+def test_a_line_that_was_edited_is_refused(store: OutcomeStore, tmp_path: Path, was: bytes, becomes: bytes) -> None:
     scored = Scored(Scores({**dict.fromkeys(describe()), "ate_se3_m": 0.5}), np.zeros(2), np.zeros(2), 3.0)
     store.keep(UNIT, OUTCOME)
     store.keep(replace(UNIT, seed=3), replace(OUTCOME, seed=3, outputs={"final": scored}))

@@ -171,7 +171,7 @@ def test_a_process_that_dies_once_loses_nothing(jobs: Jobs, work: ModuleType) ->
     assert results == [(name, seed) for seed in (0, 1) for name in ("dead-reckoning", "ekf")]
 
 
-def test_a_process_that_leaves_without_a_word_says_its_status(jobs: Jobs, work: ModuleType) -> None:
+def test_a_process_that_ends_silently_is_reported_with_its_status(jobs: Jobs, work: ModuleType) -> None:
     assert by_place(jobs((0,)), 2, work.leaves) == [LostUnit("its process ended with status 3 before it answered")] * 2
 
 
@@ -203,7 +203,7 @@ def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
     assert "MKL_NUM_THREADS" not in os.environ
 
 
-def test_a_process_that_holds_much_memory_goes_on_without_a_word(
+def test_a_process_with_much_memory_goes_on_without_a_message(
     jobs: Jobs, work: ModuleType, recwarn: pytest.WarningsRecorder
 ) -> None:
     """Where psutil is there, loky takes a recording held in memory for a leak, says so and begins the process anew."""

@@ -57,6 +57,6 @@ def test_what_has_no_variance_is_left_out(compiled):
     assert compiled(before, after).nis == pytest.approx(correction_test(before, after).nis, rel=1e-9)
 
 
-def test_a_correction_that_takes_nothing_away_tells_nothing(compiled):
+def test_a_correction_that_removes_no_covariance_has_no_test(compiled):
     before, _ = corrected(IMU_LAYOUT, 1, 0.0)
     assert compiled(before, replace(before, v_world=before.v_world + 1.0)) == (0.0, 0)

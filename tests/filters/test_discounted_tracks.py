@@ -105,7 +105,7 @@ def information(graph, values):
     return whole[:9, :9], whole[:9, 9:], whole[9:, 9:], np.linalg.solve(whole, messages)
 
 
-def test_what_left_a_window_tells_the_share_of_landmarks_given_states_and_all_of_states(past):
+def test_what_left_a_window_determines_the_share_of_landmarks_given_states_and_all_of_states(past):
     graph, values = past
     landmarks, across, states, step = information(graph, values)
     made = discounted_past(graph, values, SHARE)
@@ -187,4 +187,4 @@ def test_neighbours_count_beside_odometry_whose_white_noise_is_larger_than_what_
     tracks = DiscountedTracks(Setup(sequence.rig, noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
     tracks.learn_from_all(*clusters_err_as_one)
     assert tracks.share < 0.3
-    assert ("neighbours as one" in tracks.messages[0]) == counts
+    assert ("neighbours have a common error" in tracks.messages[0]) == counts

@@ -142,7 +142,7 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
         extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(i), np.ones(3), information))
     recovery = window.add(extension, 0)
     assert [line.split(" ", 3)[0] for line in recovery.log] == ["l6", "l6"]
-    assert "is held weakly" in recovery.log[0]
+    assert "has a weak prior at its value" in recovery.log[0]
     assert "was dropped" in recovery.log[1]
     assert recovery.dropped == {6}
     assert not window.values().exists(L(6))
@@ -190,7 +190,7 @@ def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
     assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0
 
 
-def test_the_condition_of_a_landmark_tells_that_its_depth_is_unknown():
+def test_the_condition_of_a_landmark_shows_that_its_depth_is_unknown():
     factors, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i, sigma_m in ((1, 1.0), (2, 1e5)):
         at.insert(L(i), np.zeros(3))

@@ -130,7 +130,7 @@ def test_after_a_recovery_the_tree_grows_and_drops_as_before():
     assert sorted(tree.landmarks()) == [L(0), L(2)]
 
 
-def test_a_state_that_nothing_holds_is_cached_weakly_and_named():
+def test_a_state_that_nothing_determines_gets_a_weak_prior_and_is_named():
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in (0, 1):
         values.insert(X(k), gtsam.Pose3())
@@ -138,12 +138,12 @@ def test_a_state_that_nothing_holds_is_cached_weakly_and_named():
     tree = Isam2Tree(MOTION, baseline_m=0.1)
     log, _ = tree.add(graph, values, [X(1)])
     assert "solved by QR" in log[0]
-    assert "held weakly" in log[-1]
+    assert "has a weak prior at its value" in log[-1]
     assert tree.read([X(0), X(1)]).size() == 2
 
 
 def test_a_system_beyond_recovery_ends_with_an_error_and_not_with_an_answer():
-    """Of pairs of states that nothing holds, one is held in each recovery."""
+    """Of pairs of states that nothing determines, one gets a prior in each recovery."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     pairs = range(0, 2 * MOST_RECOVERIES, 2)
     for k in pairs:
@@ -223,7 +223,7 @@ def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
 
 
 @pytest.mark.parametrize("index", [0, 7, 2**56 - 1])
-def test_a_key_tells_its_kind_as_a_symbol_of_gtsam_does(index):
+def test_the_kind_of_a_key_is_that_of_gtsams_symbol(index):
     for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index), "s": SCALE}.items():
         assert kind_of(key) == kind == chr(gtsam.Symbol(key).chr())
 

@@ -107,7 +107,7 @@ def test_a_sighting_without_the_right_image_leaves_the_depth_known(noise):
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "smart", "isam2"])
-def test_smoothers_told_of_tracks_noise_go_on_where_the_right_image_is_missing(name, run_estimator):
+def test_smoothers_with_noise_of_tracks_stated_go_on_where_the_right_image_is_missing(name, run_estimator):
     drive = simulate(replace(SCENARIOS["drive-realistic"], duration_s=1.0), 0)
     uv_px, lacks = drive.observations.uv_px.copy(), np.random.default_rng(0).random(len(drive.observations)) < 0.3
     lacks[np.unique(drive.observations.track_id, return_index=True)[1]] = False

@@ -71,12 +71,14 @@ def test_the_scale_settles_where_corrections_are_as_large_as_expected():
 
 
 @pytest.mark.parametrize("name", ["msckf-slam", "fixed-lag"])
-def test_a_sound_imu_is_believed(name, sound, run_estimator):
+def test_the_stated_noise_of_a_sound_imu_is_kept(name, sound, run_estimator):
     assert not tells(run_estimator(name, sound))
 
 
 @pytest.mark.parametrize("name", ["ekf-slam", "msckf-slam", "fixed-lag", "smart"])
-def test_an_imu_that_is_shaken_is_found_and_does_less_harm_unless_it_is_to_be_believed(name, shaken, run_estimator):
+def test_an_imu_that_is_shaken_is_found_and_does_less_harm_unless_its_stated_noise_is_to_be_used(
+    name, shaken, run_estimator
+):
     run = run_estimator(name, shaken)
     assert tells(run)
     as_stated = run_estimator(name, shaken, settings=Settings(noise=Noise(match_imu=False)))
@@ -87,7 +89,7 @@ def test_an_imu_that_is_shaken_is_found_and_does_less_harm_unless_it_is_to_be_be
         assert found[metric] < believed[metric]
 
 
-def test_a_twist_is_believed_whatever_tracks_say(run_estimator):
+def test_the_stated_noise_of_a_twist_is_kept_whatever_tracks_show(run_estimator):
     drive = simulate(replace(DRIVE, duration_s=6.0), 3)
     doubtful = replace(drive, noise=drive.noise.scaled(1.0 / SHAKEN))
     assert not tells(run_estimator("msckf-slam", doubtful))

@@ -123,7 +123,7 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
     oracle.assert_covariances_agree(joint.cov[6:, 6:], cov, 1e-6)
 
 
-def test_what_many_rows_are_compressed_to_tells_the_same_in_products_from_either_side():
+def test_what_many_rows_are_compressed_to_is_the_same_in_products_from_either_side():
     rng = np.random.default_rng(4)
     rows, residuals, P = rng.normal(size=(50, 12)), rng.normal(size=50), rng.normal(size=(30, 30))
     triangle, compressed = multiview.compressed(rows, residuals)

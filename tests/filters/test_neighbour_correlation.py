@@ -103,7 +103,7 @@ def test_tracks_that_are_correlated_count_for_less_by_as_many_neighbours_as_err_
         correlation.add_images(frames, uvs_px, errors, np.zeros((len(frames), 3, 6)))
     together = learnt(frames, uvs_px, errors).erring_as_one(alone.correlation)
     assert beside.share == pytest.approx(alone.share / together, rel=1e-12)
-    assert f"{together:.1f} neighbours as one" in beside.messages[0]
+    assert f"{together:.1f} neighbours have a common error" in beside.messages[0]
     assert "neighbours" not in alone.messages[0]
     assert white.share == 1.0  # what an image shares alone is another matter: tracks that are white change no bit
 

@@ -128,8 +128,8 @@ def test_the_reports_filter_has_no_gate_and_follows_whatever_it_sees(pull):
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_has_slipped(pull, name):
-    """The gate's bound is 2.8 sigma, of a residual of which the fit takes a tenth; slipped is what is beyond 7.9."""
+def test_online_smoothers_limit_a_sighting_from_the_gates_bound_on_and_drop_outlier_tracks(pull, name):
+    """The gate's bound is 2.8 sigma, of a residual of which the fit takes a tenth; beyond 7.9 it is an outlier."""
     at_one = pull(name, 1.0)
     assert at_one > 100.0 * NOTHING_M
     assert pull(name, 2.5) / at_one == pytest.approx(2.5, rel=0.02)
@@ -138,7 +138,7 @@ def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_what_the_other_tracks_deny_is_a_slip_though_the_motion_leaves_it_open(scene, run_estimator, name):
+def test_what_the_other_tracks_contradict_is_an_outlier_though_the_motion_allows_it(scene, run_estimator, name):
     """Off by 9.5 sigma: after a motion that is known half as well the gate alone would let it pass."""
     sequence = scene.with_error(9.5)
     noise = sequence.noise
@@ -154,7 +154,7 @@ def test_what_the_other_tracks_deny_is_a_slip_though_the_motion_leaves_it_open(s
 
 @pytest.mark.parametrize(("share", "believed"), [(0.4, False), (0.6, True)])
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2"])
-def test_where_most_tracks_disagree_none_has_slipped(scene, run_estimator, name, share, believed):
+def test_where_most_tracks_disagree_none_is_an_outlier(scene, run_estimator, name, share, believed):
     """Tracks slip one by one; where more than half disagree it is the state that is doubted."""
     seen, rng = scene.sequence.observations, np.random.default_rng(0)
     rows = np.flatnonzero((seen.frame == FRAME) & ~is_held_out(seen.track_id))
@@ -177,7 +177,7 @@ def test_batch_counts_in_full_what_chance_explains_and_nothing_else(pull):
 
 
 @pytest.mark.parametrize("name", ["msckf", "msckf-fej"])
-def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_slipped_is_tested_again(scene, run_estimator, name):
+def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_jumped_is_tested_again(scene, run_estimator, name):
     """To give up the worst sighting of a track with bad luck would choose measurements by their agreement.
 
     The one track of five views fails from 6.7 sigma on, and is twice beyond its gate from 9.5 on.

@@ -71,7 +71,7 @@ def test_a_landmark_that_begins_far_too_far_away_begins_anew(build, clean, begun
     (right,), _ = point_and_log(build, clean)
     (point,), log = point_and_log(build, begun_far)
     assert [line.split(": ")[1] for line in log] == [
-        f"landmark {TRACK} was contradicted by its next sightings and was dropped"
+        f"landmark {TRACK} was inconsistent with its next sightings and was dropped"
     ]
     # A few of ten sightings fewer, of a pixel each, at thirty metres.
     assert np.linalg.norm(point - right) < 1.0

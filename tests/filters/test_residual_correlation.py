@@ -1,4 +1,4 @@
-"""Tracks count for less where residuals along them are correlated, by as much as that costs, and in full where not."""
+"""Tracks have less weight where residuals along them are correlated, by as much as that costs, else full weight."""
 
 from dataclasses import replace
 
@@ -85,7 +85,7 @@ def learnt_of_pairs(rig, correlation, counts_neighbours):
 def test_landmarks_count_for_less_by_the_neighbours_that_err_as_one(drive):
     alone, beside = (learnt_of_pairs(drive.rig, 0.8, counts) for counts in (False, True))
     assert "neighbours" not in alone.messages[0]
-    assert "neighbours as one" in beside.messages[0]
+    assert "neighbours have a common error" in beside.messages[0]
     assert beside.share < 0.6 * alone.share
 
 
@@ -167,7 +167,7 @@ def test_landmarks_of_the_state_count_for_as_much_as_the_mean_of_their_errors_is
     correlation = 0.6
     found = learnt_by_frame(drive.rig, correlation)
     assert found.share == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.15)
-    assert "tracks of landmarks in the state came to count for" in found.messages[0]
+    assert "tracks of landmarks in the state were given" in found.messages[0]
 
 
 def test_landmarks_whose_residuals_are_hardly_correlated_count_in_full(drive):
@@ -237,4 +237,4 @@ def test_where_noise_of_tracks_is_stated_they_count_as_it_says(walking, run_esti
 
 def tells(run):
     """Say whether the log of a run says that tracks do not count in full."""
-    return any("are correlated" in line and "came to count for" in line for line in run.log)
+    return any("are correlated" in line and "of their information in the end" in line for line in run.log)

@@ -137,11 +137,11 @@ def test_images_alone_do_not_tell_the_scale(run_estimator):
     known, run = (run_estimator("batch", images, settings=settings) for settings in (Settings(), WITH_SCALE))
     found, sigma = scale_reported(run)
     assert sigma > 0.0095 and abs(found) < 0.002
-    assert "do not tell" in run.log[0]
+    assert "do not determine it" in run.log[0]
     travelled_m = np.linalg.norm(images.truth.T_world_imu[-1, :3, 3] - images.truth.T_world_imu[0, :3, 3])
     widened = np.trace(run.final.cov[-1][3:6, 3:6]) - np.trace(known.final.cov[-1][3:6, 3:6])
     assert np.sqrt(widened) == pytest.approx(0.01 * travelled_m, rel=0.2)
 
 
 def test_what_the_scale_came_to_is_reported_with_its_prior():
-    assert "+1.20 +- 0.30 % longer than the rig says (prior 0 +- 1 %)" in ScaleState(0.01).message_of(0.012, 0.003)
+    assert "+1.20 +- 0.30 % longer than the rig's (prior 0 +- 1 %)" in ScaleState(0.01).message_of(0.012, 0.003)

@@ -90,7 +90,7 @@ def test_a_track_that_errs_throughout_counts_less_throughout_and_the_others_as_t
 def test_innovations_held_at_their_weights_are_least_squares_with_the_gradient_of_the_cost(scene):
     frames, poses, points = scene
     robust, values = ChainedFactors(ChainedSightings.of(frames, RIG), RIG, Cauchy(2.0), 2.0), values_of(poses, points)
-    held = robust.held(values)
+    held = robust.with_fixed_weights(values)
     one, other = (
         vision.linearised(values).linearize(values).augmentedHessian(gtsam.Ordering(values.keys()))
         for vision in (robust, held)

@@ -305,14 +305,14 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
 @pytest.mark.parametrize(
     ("left_out", "pattern"),
     [
-        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one beside"),
+        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one with"),
         ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
         ("image_raw", "holds no images that can be read.*; there are /cam0/camera_info"),
         ("", "holds no images that can be read.*; there are no topics"),
         ("/cam0/camera_info", "there is no sensor_msgs/CameraInfo beside /cam0/image_raw"),
         (
             "/tf_static",
-            "nothing tells where the camera is on the body: no /tf_static joins the frames 'imu0' and 'cam0'",
+            "the camera's pose on the body is unknown: no /tf_static connects the frames 'imu0' and 'cam0'",
         ),
     ],
 )
@@ -466,7 +466,7 @@ def with_a_second_imu(ros: Ros, film: list[Item]) -> list[Item]:
     [
         (on_another_clock, r"the images are of .* s and /imu0 of .* s: two clocks"),
         (late, r"no image of /cam0/image_raw has one of /cam1/image_raw within 1 ms \(10 left ones\)"),
-        (of_one_frame, "no /tf_static joins the frames '0' and '0'"),
+        (of_one_frame, "no /tf_static connects the frames '0' and '0'"),
         (with_a_second_imu, r"'base_link' and 'cam0'.*or name another Imu with --topics imu=TOPIC \(/imu0\)"),
     ],
 )
@@ -483,7 +483,7 @@ def test_where_images_have_no_stamp_it_is_when_they_were_recorded(asl: Path, tmp
     ros = Ros.of("ros1")
     bag = load_sequence(str(ros.write(tmp_path / "film.bag", zeroed(ros, bare(ros, asl)))))
     np.testing.assert_array_equal(bag.frames_t_ns, load_sequence(str(asl)).frames_t_ns)
-    assert "20 images have no stamp, and when they were recorded is taken for it" in bag.provenance.facts
+    assert "20 images have no stamp, and the time of recording is used" in bag.provenance.facts
 
 
 def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Path, tmp_path: Path) -> None:
@@ -495,7 +495,7 @@ def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Pa
     with pytest.raises(DataError, match=r"holds 2 bags and no metadata.yaml that joins them: again.mcap, drive.mcap"):
         load_images(str(path))
     (path / "notes.txt").write_text("a drive")
-    with pytest.raises(DataError, match=r"is no recording, and holds some: name again.mcap or drive.mcap in it"):
+    with pytest.raises(DataError, match=r"is not a recording, but contains some: name again.mcap or drive.mcap in it"):
         load_images(str(path))
 
 
@@ -524,7 +524,7 @@ def test_bags_of_ros_1_that_are_no_parts_of_one_recording_are_not_joined(asl: Pa
         DataError, match=r"holds 2 bags: drive.bag, film_0.bag; name one of them, or, if they are parts"
     ):
         load_images(str(split(asl, tmp_path / "two", ("film_0.bag", "drive.bag"))))
-    with pytest.raises(DataError, match=r"film_1.bag: begins .* s before film_0.bag ends, so both are no parts of one"):
+    with pytest.raises(DataError, match=r"film_1.bag: begins .* s before film_0.bag ends, so they are not parts of"):
         load_images(str(split(asl, tmp_path / "turned", ("film_1.bag", "film_0.bag"))))
 
 

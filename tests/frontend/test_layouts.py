@@ -84,7 +84,9 @@ def test_cameras_without_an_imu_are_reported_with_what_to_do(asl: Path) -> None:
 
 @pytest.mark.parametrize("part", ["mav0/cam0/data", "mav0/cam0", "mav0/imu0/data.csv"])
 def test_of_a_part_of_a_recording_the_whole_is_named(asl: Path, part: str) -> None:
-    with pytest.raises(DataError, match=f"is a part of a recording: name the whole, {re.escape(str(asl / 'mav0'))};"):
+    with pytest.raises(
+        DataError, match=f"a part of a recording: name the whole recording, {re.escape(str(asl / 'mav0'))};"
+    ):
         load_sequence(str(asl / part))
 
 
@@ -92,5 +94,5 @@ def test_recordings_are_named_some_levels_below(asl: Path, tmp_path: Path) -> No
     above = tmp_path / "downloads"
     (above / "dataset/sequences").mkdir(parents=True)
     shutil.move(asl, above / "dataset/sequences/00")
-    with pytest.raises(DataError, match=r"is no recording, and holds some: name dataset/sequences/00 in it"):
+    with pytest.raises(DataError, match=r"is not a recording, but contains some: name dataset/sequences/00 in it"):
         load_sequence(str(above))

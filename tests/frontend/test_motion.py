@@ -78,7 +78,7 @@ def test_a_far_point_may_be_off_by_what_its_disparity_leaves_open(rig: Rectified
     off = tracks[0].right_px.copy()
     off[SLIDING, 0] += 0.5
     tracks[0] = Shown(tracks[0].left_px, off)
-    # The pair judged against the first one that has it: the others would be judged against sound pairs.
+    # The pair compared with the first one that has it: the others would be compared with sound pairs.
     rigidity = Rigidity.of(rig, 2.0).after(*tracks[0], np.arange(TRACKS))
     for shown in tracks[1:5]:
         rigidity = rigidity.after(*shown, np.arange(TRACKS))

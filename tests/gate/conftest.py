@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series, installed_releases
-from toolkit.gate.checking import judge_all
-from toolkit.gate.judging import CaseVerdicts, CheckTerms, judge_case
+from toolkit.gate.case_check import CaseVerdicts, CheckTerms, check_case
+from toolkit.gate.checking import check_all
 from toolkit.gate.verdict import Check
 
 SEEDS = tuple(range(24))
@@ -63,11 +63,11 @@ def checked(baseline: Baseline, now: list[Measured], *, speed: bool = True, acce
     """Judge measurements that were never made against a baseline."""
     every, terms = CaseVerdicts(), CheckTerms(speed, accept_better)
     for (case, before), after in zip(baseline.cases, now, strict=True):
-        one = judge_case(case, before, after, baseline.bounds, terms)
+        one = check_case(case, before, after, baseline.bounds, terms)
         every.verdicts += one.verdicts
         every.tests += one.tests
         every.notes += one.notes
-    return judge_all(every, baseline, "made-up.json", 1.0, terms)
+    return check_all(every, baseline, "made-up.json", 1.0, terms)
 
 
 def as_measured(baseline: Baseline) -> list[Measured]:
@@ -92,7 +92,7 @@ def as_another_trajectory(measured: Measured) -> Measured:
 
 @pytest.fixture
 def gate() -> SimpleNamespace:
-    """Return the ways to change what is measured, and to judge it."""
+    """Return the ways to change what is measured, and to check it."""
     return SimpleNamespace(
         as_measured=as_measured,
         another=as_another_trajectory,

@@ -1,4 +1,4 @@
-"""The two commands together, on short simulations: what ``vislam baseline`` writes, ``vislam check`` judges."""
+"""The two commands together, on short simulations: what ``vislam baseline`` writes, ``vislam check`` compares with."""
 
 import json
 import shlex

@@ -16,8 +16,8 @@ from toolkit.gate.interleaved import (
     MARGIN,
     MOST_PAIRS,
     TimedPairs,
+    check_speeds,
     compare_speed,
-    judge_speeds,
     pairs_needed,
     timers,
     unpacked,
@@ -45,7 +45,7 @@ def findings(ratio: float, checks: int, seed: int) -> list[list[str]]:
     """Return what is found of eight estimators in each of some checks, the first of them slower."""
     rng = np.random.default_rng(seed)
     return [
-        [v.finding for v in judge_speeds([timed(ratio if i == 0 else 1.0, rng) for i in range(8)], "v1", 0.05)]
+        [v.finding for v in check_speeds([timed(ratio if i == 0 else 1.0, rng) for i in range(8)], "v1", 0.05)]
         for _ in range(checks)
     ]
 
@@ -65,7 +65,7 @@ def test_a_run_that_was_interrupted_spoils_nothing():
     rng = np.random.default_rng(5)
     one = timed(1.0, rng, 20)
     one.cpu_s[3, 1] *= 50.0
-    (verdict,) = judge_speeds([one], "v1", 0.05)
+    (verdict,) = check_speeds([one], "v1", 0.05)
     assert verdict.finding == "same"
     assert abs(verdict.change_percent) < 5.0
 
@@ -153,7 +153,7 @@ def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
         ("--help", "'--help' is no revision of this checkout"),
         ("", "'' is no revision of this checkout"),
         ("no.whl", "no.whl: it is no wheel that can be read (No such file or directory); build one"),
-        ("empty.whl", "empty.whl brings no code of what runs here"),
+        ("empty.whl", "empty.whl does not contain the code that runs here"),
     ],
 )
 def test_a_version_that_cannot_be_had_is_reported(tmp_path, monkeypatch, capsys, version, expected):
@@ -180,7 +180,10 @@ def test_a_revision_that_a_shallow_clone_lacks_is_to_be_fetched(tmp_path, monkey
 def test_outside_of_a_checkout_and_without_git_a_wheel_is_requested(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    with pytest.raises(BaselineError, match=r"HEAD: no checkout; stand in one, or name a wheel \(fatal: not a git"):
+    with pytest.raises(
+        BaselineError,
+        match=r"HEAD: the current directory is not in a checkout; change to one, or name a wheel \(fatal: not a git",
+    ):
         unpacked("HEAD").__enter__()
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BaselineError, match=r"git cannot be run \(No such file or directory\); name a wheel"):

@@ -120,7 +120,7 @@ def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_checked(vislam, caps
     messages = " ".join(capsys.readouterr().out.split())
     assert "lap: sequence is missing: results/lap.tum: 3 columns" in messages
     assert "maze: sequence is missing: no trajectory of it is in results; the baseline has maze/0.txt" in messages
-    assert "not in the baseline, and not judged: new" in messages
+    assert "not in the baseline, and not checked: new" in messages
 
 
 def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
@@ -133,7 +133,7 @@ def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
 def test_another_clock_is_reported_with_both_ranges(vislam, capsys):
     write(Path("results/lap.tum"), stamps(10.0, 3600.0, 3660.0))
     assert failures(vislam) == [("lap", "sequence", "missing")]
-    assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
+    assert "0 of its poses match the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
 
 
 def test_one_pose_is_reported_as_that_and_no_clock_is_blamed(vislam, capsys):
@@ -157,7 +157,7 @@ def test_exchanged_axes_are_named_where_a_baseline_is_made_and_held(vislam, caps
 def test_another_truth_is_not_compared_with(vislam, capsys):
     write(Path("other/lap.tum"), stamps(20.0), 0.01)
     assert failures(vislam, "--truth", "lap=other/lap.tum") == [("lap", "sequence", "missing")]
-    assert "another truth than the baseline's" in " ".join(capsys.readouterr().out.split())
+    assert "differs from the baseline's truth" in " ".join(capsys.readouterr().out.split())
     Path("truth").rename("moved")
     assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
     messages = " ".join(capsys.readouterr().out.split())

@@ -88,7 +88,7 @@ def test_keyframes_do_not_count_as_frames(make_sequence, make_run, drive):
     assert values["pairs"] == 30
 
 
-def test_coverage_counts_the_frames_the_truth_can_judge(make_sequence, make_run, drive):
+def test_coverage_counts_the_frames_within_the_truths_time(make_sequence, make_run, drive):
     sequence = make_sequence(drive(100), track_count=3)
     truth = Truth(sequence.frames_t_ns[:80] + 128, sequence.truth.T_world_imu[:80])  # ucsd 0027: off by 128 ns, short
     run = make_run(sequence.frames_t_ns[:80], sequence.truth.T_world_imu[:80])

@@ -110,7 +110,7 @@ def test_what_corrects_nothing_and_what_holds_its_biases_has_no_trend(recording)
         scored(replace(run, causal=Trajectory.of(reported)), recording)
     held = run.causal.cov.copy()
     held[:, model.layout.biases] = held[:, :, model.layout.biases] = 0.0
-    with pytest.raises(Unavailable, match="holds its biases"):
+    with pytest.raises(Unavailable, match="does not estimate biases"):
         scored(replace(run, causal=replace(run.causal, cov=held)), recording)
     with pytest.raises(Unavailable, match="no covariance of its whole state"):
         scored(replace(run, causal=replace(run.causal, cov=None)), recording)

@@ -1,4 +1,4 @@
-"""NEES: exact draws are consistent, wrong covariances are not, and the world it is judged in is the right one."""
+"""NEES: exact draws are consistent, wrong covariances are not, and the world it is evaluated in is the right one."""
 
 from dataclasses import replace
 

@@ -51,7 +51,7 @@ def test_a_sum_of_independent_corrections_is_no_longer_than_chance_has_it(belief
     assert abs(np.mean([test.nis for test in ten]) - ROWS) < 4.0 * np.sqrt(2.0 * ROWS / len(ten))
 
 
-def test_a_sum_tells_what_leans_one_way_and_no_single_correction_shows(belief, corrected):
+def test_a_sum_shows_what_leans_one_way_and_no_single_correction_shows(belief, corrected):
     """Ten corrections, each moved by half a standard deviation the same way: 2.5 = 10 (0.5)^2 a degree of freedom."""
     first = Correction.of(belief, corrected[0])
     shares, axes = np.linalg.eigh(first.taken / np.outer(*2 * [np.sqrt(np.diag(first.taken))]))

@@ -68,7 +68,7 @@ def test_without_right_images_decorrelated_residuals_have_the_identity_for_covar
     np.testing.assert_allclose(there @ cov_uv @ there.T, expected, atol=1e-9)
 
 
-def test_without_right_images_the_error_of_the_last_is_known_as_well_as_the_rest_tells():
+def test_without_right_images_the_error_of_the_last_is_determined_by_the_rest():
     """By regression on what was measured of (uL, uR, v), written out."""
     last = correlated_noise.error_of_the_last(NOISE, AGES, SEEN, LEFT_ONLY)
     for track in (0, 1):

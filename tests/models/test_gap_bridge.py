@@ -135,7 +135,7 @@ def test_a_bridge_is_as_sure_as_the_twist_was_seen_to_stay():
     np.testing.assert_allclose(reported[600].sigmas, expected, rtol=0.09)
 
 
-def test_at_first_a_bridge_tells_no_more_than_the_twists_that_are_measured():
+def test_at_first_a_bridge_adds_no_more_than_the_twists_that_are_measured():
     """Two of them, of intervals of a tenth of a second, differ by their white noise."""
     change = TwistChange(MEASURED)
     assert change.noise is None

@@ -120,7 +120,7 @@ def test_a_track_refused_in_three_frames_running_stays_out():
         assert out[later].mean() == 1.0 if stays_out else out[later].mean() < 0.05
 
 
-def test_what_creeps_shows_over_some_frames(monkeypatch):
+def test_what_moves_slowly_shows_over_some_frames(monkeypatch):
     """Two pixels are within the noise of two sightings, which is one in each coordinate; ten are not."""
     sequence = simulated("flight")
     tracks = [rows[:12] for rows in long_tracks(sequence, 12)[:10]]

@@ -124,7 +124,7 @@ def test_other_recordings_are_independent_draws_and_may_be_chance(messages) -> N
     assert not any(one["beyond_chance"] for one in tested)
 
 
-def test_one_run_tells_nothing_of_chance(messages) -> None:
+def test_chance_is_unknown_from_one_run(messages) -> None:
     found = messages("one", "seeds")
     assert all(one["p"] is None for one in found["metrics"])
     assert {"name": "dead-reckoning causal", "before": "ok", "after": "3 of 3 ok"} in found["ends"]

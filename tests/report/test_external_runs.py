@@ -71,7 +71,7 @@ def test_the_truth_in_any_format_is_without_error_and_says_what_it_cannot_tell(
     assert scores.notes["nees_pose_mean"] == "the estimator states no covariance"
     assert scores.notes["total_s"] == "not run here"
     assert "not run here" in run.log[0]
-    assert "stands as final" in run.log[1]
+    assert "listed as final" in run.log[1]
 
 
 def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording: Sequence) -> None:
@@ -135,7 +135,7 @@ def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence, s
     assert len(run.final) == recording.frame_count
 
 
-def test_a_straight_drive_w_first_is_named_though_no_gyro_tells(tmp_path: Path) -> None:
+def test_a_straight_drive_w_first_is_named_though_no_gyro_decides(tmp_path: Path) -> None:
     recording = simulate(replace(DRIVE, duration_s=10.0), seed=2)
     assert isinstance(recording.motion, TwistSamples)
     still = replace(recording.motion, w_radps=np.zeros_like(recording.motion.w_radps))

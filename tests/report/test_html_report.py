@@ -91,7 +91,7 @@ def test_every_axis_unit_is_known(page: str) -> None:
         assert column["meaning"]
 
 
-def test_what_the_audit_could_not_judge_is_shown(case: Json, comparison: Comparison) -> None:
+def test_what_the_audit_could_not_decide_is_shown(case: Json, comparison: Comparison) -> None:
     assert case["words"]["undecided"] == comparison.undecided
 
 

@@ -51,7 +51,7 @@ def test_key_order_is_stable(document: dict[str, Any]) -> None:
         assert list(run["metrics"]) == list(describe())
 
 
-def test_what_the_audit_could_not_judge_is_reported(comparison: Comparison, document: dict[str, Any]) -> None:
+def test_what_the_audit_could_not_decide_is_reported(comparison: Comparison, document: dict[str, Any]) -> None:
     assert comparison.undecided
     assert document["undecided"] == comparison.undecided
 
@@ -80,7 +80,7 @@ def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
     assert "consistency" not in built["runs"][-1]  # it failed without an answer
     words = [line for line in note_lines(timid) if "timid" in line]
     assert words[0] == (
-        "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 holds 95 % of consistent estimators however "
+        "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 contains 95 % of consistent estimators however "
         "correlated their errors"
     )
 
@@ -111,14 +111,14 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
         "band": [0.0, 4.0],
     }
     words = [line for line in note_lines(leaning) if "contradicted" in line]
-    assert words[0].startswith("steady is contradicted: its tracks turn its state one way, 5.2")
+    assert words[0].startswith("steady is contradicted: the corrections by its tracks have one direction, 5.2")
     assert "by chance at most 4.00" in words[0]
 
 
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
     comparison: Comparison, rescored: Rescored
 ) -> None:
-    harm = "explains withheld tracks worse than dead reckoning: it misses them 3.00 +- 0.10 times as far"
+    harm = "explains withheld tracks worse than dead reckoning: its reprojection error is 3.00 +- 0.10 times"
 
     def given(row: Row) -> Scores:
         is_first = row.estimator == comparison.lines[0].estimator

@@ -208,9 +208,9 @@ def test_a_warning_of_the_audit_stands_above_the_table_whatever_the_status(compa
         report_text(replace(comparison, findings=(warning,)), {}),
     ):
         above, below = text.split("estimator", 1)
-        assert "what the audit says of: conflict" in " ".join(above.split())
+        assert "with the findings of the audit: conflict" in " ".join(above.split())
         assert "disagree at 41-50 s" in below
-    assert "what the audit says of" not in comparison_text(comparison)
+    assert "findings of the audit:" not in comparison_text(comparison)
 
 
 def test_a_recording_without_image_features_says_so(comparison: Comparison) -> None:

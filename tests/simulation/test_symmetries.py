@@ -51,7 +51,7 @@ def test_its_images_are_those_of_points_that_stand_still(scenario: str, how: str
 
 
 @pytest.mark.parametrize("how", [mirrored, reversed_in_time])
-def test_told_twice_it_is_the_recording_again(how) -> None:
+def test_transformed_twice_it_is_the_recording_again(how) -> None:
     sequence = replace(exact("flight"), prior=None)
     again = how(how(sequence))
     np.testing.assert_array_equal(again.frames_t_ns, sequence.frames_t_ns)

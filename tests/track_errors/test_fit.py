@@ -45,7 +45,7 @@ def test_white_noise_comes_out_white(white_fit: Fit) -> None:
     # c is the mean of two columns of 1 px, d their difference, v the mean of two rows; 600 tracks are good for 3 %.
     np.testing.assert_allclose(white_fit.noise.white_px, [np.sqrt(0.5), np.sqrt(2.0), np.sqrt(0.5)], rtol=0.1)
     stated_px2 = 2.0**2 * np.diag([1.0, 1.0, 0.5])
-    assert "each sighting by itself" in summary_of(white_fit, stated_px2)
+    assert "independent between sightings" in summary_of(white_fit, stated_px2)
     times = re.search(
         r"recording's own 1.41/2.83/1.41 px in c/d/v, ([\d.]+) times that", summary_of(white_fit, stated_px2)
     )
@@ -77,7 +77,7 @@ def test_too_few_tracks_are_refused_with_what_to_do(exact: Sequence) -> None:
 
 
 def test_a_calibration_that_suits_no_motion_is_refused_in_one_line(walking: Sequence) -> None:
-    with pytest.raises(DataError, match="no motion of the camera suits the tracks"):
+    with pytest.raises(DataError, match="no motion of the camera fits the tracks"):
         fit_track_noise(identity_intrinsics(walking.truncated(50)))
 
 

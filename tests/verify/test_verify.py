@@ -74,9 +74,9 @@ PLANTS = {
 REPORTED = {
     "look-ahead through the base of an array": (
         CAUSAL,
-        "its answer to frame 0 is another one where the packets from frame 2 on are withheld",
+        "its answer to frame 0 differs where the packets from frame 2 on are withheld",
     ),
-    "look-ahead through what another run left": (CAUSAL, "another one where the packets"),
+    "look-ahead through what another run left": (CAUSAL, "differs where the packets"),
     "covariance not positive definite": (
         COVARIANCES,
         "the covariance of its answer to frame 7 is not positive definite",
@@ -86,7 +86,7 @@ REPORTED = {
     "covariance of another size": (COVARIANCES, "has the shape (5, 5); expected 6 x 6 or 9 x 9"),
     "NaN in a pose": (FINITE, "T_world_imu of its answer to frame 12"),
     "NaN in a covariance": (COVARIANCES, "frame 12 is not finite"),
-    "another random number each run": (SAME, "a second run answers otherwise to frame 0: T_world_imu differs by"),
+    "another random number each run": (SAME, "a second run differs at frame 0: T_world_imu differs by"),
     "the same array every time": (LATER, "its answer to frame 0 changed after it was given"),
     "a scaled rotation": (ROTATIONS, "rotations are none"),
     "no answer now and then": (STAMPS, "answers at"),
@@ -139,7 +139,7 @@ def test_nothing_else_is_called_broken(newcomer, capsys, kind: str) -> None:
 
 
 def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
-    some = ("2 s without sight", "0.25 s that is not a number")
+    some = ("2 s without sightings", "0.25 s that is not a number")
     monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
     assert main(["verify", str(newcomer("pass"))]) == 0
@@ -169,14 +169,14 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
 
 
 def test_who_dies_of_a_fault_is_reported_with_that_fault(newcomer, monkeypatch) -> None:
-    some = ("2 s without sight", "a camera 20 ms late")
+    some = ("2 s without sightings", "a camera 20 ms late")
     monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
     from toolkit.verify.subject import subject_of
 
     found = verification.ends_by_fault("my-filter", subject_of(str(path)).load())
-    assert set(found) == {"2 s without sight (drive)", "2 s without sight (flight)"}
-    assert "AssertionError: no sightings" in found["2 s without sight (drive)"]
+    assert set(found) == {"2 s without sightings (drive)", "2 s without sightings (flight)"}
+    assert "AssertionError: no sightings" in found["2 s without sightings (drive)"]
 
 
 def test_too_sure_and_too_timid_are_distinguished_from_honest() -> None:
@@ -184,8 +184,8 @@ def test_too_sure_and_too_timid_are_distinguished_from_honest() -> None:
     # Poses of a run share one error in the worst case: a chi-square of 6 over 6 each, over eight runs.
     alarms = sum(bool(inconsistency((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
     assert alarms <= 8  # of 2000 at 0.1 % two are expected; a Poisson of 2 exceeds 8 once in four thousand
-    assert "too sure of itself" in inconsistency([2.5] * 8)
-    assert "less sure" in inconsistency([0.3] * 8)
+    assert "overconfident" in inconsistency([2.5] * 8)
+    assert "less certain" in inconsistency([0.3] * 8)
 
 
 def test_a_covariance_with_units_far_apart_is_sound() -> None:
@@ -231,5 +231,5 @@ def test_an_answer_of_another_kind_is_named() -> None:
     one = Estimate(0, np.eye(4), info={"nis": 1.0})
     assert difference(one, Estimate(0, np.eye(4), info={"nis": 1.0})) == ""
     assert difference(one, Estimate(0, np.eye(4), info={"nis": 2.0})) == "its diagnostics (info) differ"
-    assert difference(one, None) == "one run answers and the other does not"
+    assert difference(one, None) == "one run returns an estimate and the other does not"
     assert difference(one, Estimate(0, np.eye(4), np.eye(6))) == "other fields or shapes"

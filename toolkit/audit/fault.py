@@ -104,9 +104,12 @@ class Evidence:
     def blind(self) -> Undecided:
         """The reason why samples and camera cannot be compared, where ``intervals`` is None."""
         if self.spoilt_by:
-            return Undecided(f"{self.spoilt_by} must be mended before the tracks show anything")
+            return Undecided(f"{self.spoilt_by} must be corrected before the tracks can be evaluated")
         if not is_comparable(self.sequence):
-            return Undecided("time, or the motion samples' reach or values, do not allow a comparison with the camera")
+            return Undecided(
+                "the time stamps, or the time span or values of the motion samples, do not allow a comparison "
+                "with the camera"
+            )
         known, intervals = int(self.camera_motion.known.sum()), max(self.sequence.frame_count - 1, 0)
         if not len(self.sequence.observations):
             return Undecided("there are no sightings to compare with")

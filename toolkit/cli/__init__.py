@@ -121,8 +121,8 @@ def _check_memory() -> None:
         return
     if limit < _LEAST_MEMORY:
         raise SystemLimitError(
-            f"the memory is limited to {limit / 1e6:.0f} MB (ulimit -v), and NumPy, SciPy and GTSAM alone take "
-            f"{_LEAST_MEMORY / 1e6:.0f} MB of addresses; allow more"
+            f"the memory is limited to {limit / 1e6:.0f} MB (ulimit -v), and NumPy, SciPy and GTSAM alone need "
+            f"{_LEAST_MEMORY / 1e6:.0f} MB of address space; allow more"
         )
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -181,10 +181,10 @@ def _unexpected(error: Exception) -> int:
 def _refused(behind: BaseException) -> str:
     """Return what of the system's means is missing, and what to do."""
     if isinstance(behind, MemoryError):
-        return "the memory does not suffice; take a part of the recording, a shorter one, or fewer --workers"
+        return "out of memory; use a part of the recording, a shorter one, or fewer --workers"
     if isinstance(behind, ImportError):
         return f"a library cannot be loaded ({behind}); allow more memory, or install it again"
-    return f"the system refuses to go on: {behind}"
+    return f"an operating-system call failed: {behind}"
 
 
 def _means_behind(error: BaseException | None) -> BaseException | None:

@@ -37,7 +37,7 @@ exit status:
   5    an estimator is unknown or cannot be used here
   70   a defect of vislam itself, or of a package that adds to it, which the
        message names; VISLAM_TRACEBACK=1 shows where
-  71   the system's means do not suffice: memory, processes, a cluster, an
+  71   a resource of the system is lacking: memory, processes, a cluster, an
        encoding
   130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,
        and what has ended of a comparison over seeds is kept
@@ -212,7 +212,7 @@ class _Once(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         if getattr(namespace, self.dest) is not None:
-            parser.error(f"{option_string} is there twice; it takes one file, and --set changes single settings")
+            parser.error(f"{option_string} is given twice; it takes one file, and --set changes single settings")
         setattr(namespace, self.dest, values)
 
 
@@ -231,7 +231,7 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
         "--from", dest="from_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames before it, {after}"
     )
     parser.add_argument(
-        "--to", dest="to_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames behind it, {after}"
+        "--to", dest="to_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames after it, {after}"
     )
     parser.add_argument("--every", metavar="N", type=at_least(1), help="use one frame in N")
     parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N of these frames only")
@@ -256,18 +256,18 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--outliers",
         metavar="POLICY",
-        help="what every estimator does about measurements that disagree with it (see docs/settings.md)",
+        help="how every estimator treats inconsistent measurements (see docs/settings.md)",
     )
     parser.add_argument(
         "--window",
         metavar="SECONDS",
         type=positive_seconds,
-        help="how far back windowed filters and smoothers reach alike",
+        help="length of the window of windowed filters and smoothers",
     )
     parser.add_argument(
         "--no-fast",
         action="store_true",
-        help="NumPy throughout, where the extra 'fast' would have filters run compiled code",
+        help="use NumPy only, even where the extra 'fast' provides compiled code for filters",
     )
     parser.add_argument(
         "--set",
@@ -295,7 +295,7 @@ def requested_settings(options: argparse.Namespace) -> "Settings":
     return settings_of(with_assignments(values, requested_assignments(options)), place)
 
 
-def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "the exit status tells") -> None:
+def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "see the exit status") -> None:
     """Add --json, with what it prints, and --quiet, with where the answer is then; at most one can be given."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--json", action="store_true", help=f"print {as_json}")
@@ -344,7 +344,7 @@ def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
         "--tracks",
         choices=("auto", "images", "simulated"),
         help="of a recording with images and truth: made of the images, or simulated along the truth (default: auto, "
-        "of the images where nearly all are there)",
+        "of the images if nearly all of them exist)",
     )
     add_topics_argument(parser)
 

@@ -55,7 +55,7 @@ def _add_what_to_compare(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help=f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
     )
-    add_estimators_argument(parser, "what to compare, see 'vislam list'; 'ladder' is every rung")
+    add_estimators_argument(parser, "estimators to compare, see 'vislam list'; 'ladder' is every rung")
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
     parser.add_argument(
         "--trajectory",
@@ -94,12 +94,14 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
-    what = "which to draw; docs/figures.md shows all there are"
+    what = "figures to draw; docs/figures.md shows all of them"
     add_option(parser, "--figures", "few", what, choices=("few", "all", "none"))
-    what = "of the figures; pdf and svg stay sharp in a paper"
+    what = "format of the figures; pdf and svg are vector graphics, for a paper"
     add_option(parser, "--figure-format", "png", what, choices=("png", "pdf", "svg"))
     add_output_arguments(
-        parser, "what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"
+        parser,
+        "the content of metrics.json or seeds.json, a line a SEQUENCE, no table",
+        "the run directory has everything",
     )
 
 
@@ -110,7 +112,7 @@ def _compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start",
         choices=("measurements", "truth"),
-        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
+        help="source of the first state; a start from the truth is labelled (default: measurements)",
     )
     add_tracks_argument(parser)
     _add_seeds(parser)
@@ -302,7 +304,9 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     for name in trajectories:
         plain = plain_name(name)
         if len(plain) > LONGEST_NAME:
-            raise UsageError(f"--trajectory: a name of {len(plain)} characters is none of a file; choose a shorter one")
+            raise UsageError(
+                f"--trajectory: a name of {len(plain)} characters is too long for a file; choose a shorter one"
+            )
         if not plain or plain in taken:
             why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
             raise UsageError(f"--trajectory: the name {name} {why}; choose another")

@@ -37,7 +37,7 @@ def _completion_arguments(parser: argparse.ArgumentParser) -> None:
 
 @command(
     "completion",
-    "print what a shell needs to complete vislam's words",
+    "print the script with which a shell completes vislam's commands and options",
     "vislam completion bash",
     arguments=_completion_arguments,
 )

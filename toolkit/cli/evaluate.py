@@ -41,7 +41,7 @@ def _add_terms(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--imu",
         action="store_true",
-        help="the vertical is measured: where the first pose is placed, only heading and position are",
+        help="the vertical is measured: place the first pose by heading and position only",
     )
     what = "of the truth's time; a run that covers less counts as failed"
     add_option(parser, "--least-coverage", 50.0, what, metavar="PERCENT", type=_percent)
@@ -49,7 +49,7 @@ def _add_terms(parser: argparse.ArgumentParser) -> None:
         "--runs",
         metavar="N",
         type=at_least(1, MOST_RUNS),
-        help="runs that each system ought to have of a sequence; others failed",
+        help="expected runs of each system and sequence; missing ones count as failed",
     )
 
 
@@ -65,12 +65,12 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
         "with SEQUENCE.tum or SEQUENCE/RUN.tum, or a FOLDER that has such a folder for each system",
     )
     _add_terms(parser)
-    add_option(parser, "--metric", "ate_se3_m", "what ranks and is tested", metavar="KEY")
+    add_option(parser, "--metric", "ate_se3_m", "metric that ranks and is tested", metavar="KEY")
     parser.add_argument(
         "--columns", metavar="KEY,...", type=names, default=(), help="metrics of the table, or all (default: the usual)"
     )
     add_option(parser, "--format", "text", "of what is printed", choices=_FORMATS)
-    add_output_arguments(parser, "evaluation.json, and nothing else", "the exit status and --out tell")
+    add_output_arguments(parser, "evaluation.json, and nothing else", "see the exit status and --out")
     parser.add_argument(
         "--out",
         metavar="DIR",

@@ -61,7 +61,7 @@ def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
     )
-    add_estimators_argument(parser, "what to measure, see 'vislam list'")
+    add_estimators_argument(parser, "estimators to measure, see 'vislam list'")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
     what = "seeds of each simulated sequence, from 0"
     add_option(parser, "--seeds", SEEDS, what, metavar="N", type=at_least(FEWEST_SEEDS))
@@ -210,7 +210,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         type=Path,
         required=True,
-        help="what vislam baseline wrote; of a folder, the one for the releases installed here",
+        help="file that vislam baseline wrote; of a folder, the one for the releases installed here",
     )
     add_workers_argument(parser)
     for name, what in _FILES.items():
@@ -219,7 +219,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
         "--trajectories",
         metavar="DIR|FILE",
         type=Path,
-        help="run nothing; judge another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
+        help="run nothing; check another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
         "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
     )
     parser.add_argument(
@@ -227,19 +227,21 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR|SEQUENCE=FILE",
         action="append",
         default=[],
-        help="with --trajectories: where the truth is, if not where it was for the baseline",
+        help="with --trajectories: path of the truth, if it is not the baseline's",
     )
     parser.add_argument(
         "--accept-better",
         action="store_true",
-        help="let results that moved pass unless they are worse, as after a change that is meant to move them",
+        help="let results that moved pass unless they are worse, after a change that is meant to move them",
     )
-    parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")
+    parser.add_argument(
+        "--skip-speed", action="store_true", help=("do not check time, for example on a machine of another make")
+    )
     parser.add_argument(
         "--speed-against",
         metavar="REVISION|WHEEL",
-        help="judge time by runs in turn with another version of the code: a git revision of the checkout you stand "
-        "in, or a wheel; sees 15 %%, on any machine",
+        help="check time by alternating runs with another version of the code: a git revision of the current checkout, "
+        "or a wheel; detects 15 %%, on any machine",
     )
     parser.add_argument(
         "--allow-other-releases",
@@ -257,7 +259,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
 )
 def check(options: argparse.Namespace) -> int:
     """Run again what a baseline lists, on the same measurements, and fail where accuracy, consistency, held-out
-    reprojection or speed got worse, an answer moved, or anything is missing. With --trajectories, judge files of
+    reprojection or speed got worse, an answer moved, or anything is missing. With --trajectories, check files of
     another system in the same way. See docs/gate.md.
     """
     from toolkit.files.writing import check_writable
@@ -284,7 +286,7 @@ def _check_of_estimators(options: argparse.Namespace) -> Check:
     if options.speed_against and options.skip_speed:
         raise UsageError("--speed-against and --skip-speed exclude each other")
     if options.truth:
-        raise UsageError("--truth goes with --trajectories; a baseline of estimators names its own truth")
+        raise UsageError("--truth goes with --trajectories; a baseline of estimators states its own truth")
     baseline = load_baseline(options.baseline)
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
@@ -302,7 +304,7 @@ def _check_of_trajectories(options: argparse.Namespace) -> Check:
     from toolkit.gate.trajectory_check import check_trajectories
 
     if options.speed_against:
-        raise UsageError("--speed-against times estimators; with --trajectories nothing runs")
+        raise UsageError("--speed-against measures the time of estimators; with --trajectories nothing runs")
     baseline = load_trajectory_baseline(options.baseline)
     given = _runs_given(options.trajectories, options.truth, baseline.sequences)
     return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)

@@ -66,7 +66,7 @@ def _card_arguments(parser: argparse.ArgumentParser) -> None:
 
 @command(
     "card",
-    "say what the tracks of a recording are like",
+    "describe the tracks of a recording: length, errors, depths",
     "vislam card drive-realistic --max-frames 60",
     arguments=_card_arguments,
 )
@@ -159,19 +159,19 @@ def _exposure_ms(text: str) -> float:
 
 
 def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", choices=SCENARIOS, help="what moves, and where")
+    parser.add_argument("scenario", choices=SCENARIOS, help="scenario: the vehicle and its path")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
-    add_option(parser, "--seed", 0, "draws every error", metavar="N", type=at_least(0))
+    add_option(parser, "--seed", 0, "seed of every error", metavar="N", type=at_least(0))
     parser.add_argument("--duration", metavar="S", type=positive_seconds, help="seconds (default: the scenario's)")
     images = parser.add_argument_group("images")
     images.add_argument("--images", action="store_true", help="render the images of a stereo pair (flight)")
     images.add_argument(
-        "--lens", choices=_LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
+        "--lens",
+        choices=_LENSES,
+        help=("the distortion of both cameras, which are then not aligned (default: none, rectified)"),
     )
     images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
-    images.add_argument(
-        "--moving", metavar="N", type=at_least(0, _MOST_CRATES), help="crates that fly about (default: 0)"
-    )
+    images.add_argument("--moving", metavar="N", type=at_least(0, _MOST_CRATES), help="moving crates (default: 0)")
 
 
 @command(

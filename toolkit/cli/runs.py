@@ -56,7 +56,7 @@ def report(options: argparse.Namespace) -> int:
 
 def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN_DIR", type=Path, help="as vislam compare writes it")
-    parser.add_argument("--estimator", metavar="NAME", help="whose, or truth (default: the only one there is)")
+    parser.add_argument("--estimator", metavar="NAME", help="an estimator, or truth (default: the only one there is)")
     parser.add_argument("--output", choices=("causal", "final"), help="default: final, where there is one")
     parser.add_argument("--format", choices=FORMATS, help="of the file; KITTI has no stamps")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the file to write")
@@ -103,7 +103,7 @@ def _bundle(options: argparse.Namespace) -> int:
 
 def _diff_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("before", metavar="RUN_A", type=Path, help="as vislam compare writes it")
-    parser.add_argument("after", metavar="RUN_B", type=Path, help="the one that is held against it")
+    parser.add_argument("after", metavar="RUN_B", type=Path, help="the run directory to compare with it")
     parser.add_argument(
         "--columns", metavar="KEY,...", type=names, default=(), help="metrics to show, or all (default: the tables')"
     )
@@ -112,7 +112,7 @@ def _diff_arguments(parser: argparse.ArgumentParser) -> None:
 
 @command(
     "diff",
-    "tell what differs between two run directories",
+    "show what differs between two run directories",
     "vislam compare drive --estimators ekf --max-frames 40 --out runs/before",
     "vislam compare drive --estimators ekf --max-frames 40 --set noise.motion_scale=1.2 --out runs/after",
     "vislam diff runs/before runs/after",
@@ -139,7 +139,7 @@ def diff(options: argparse.Namespace) -> int:
 
 def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="as vislam export --bundle writes it")
-    parser.add_argument("--data", metavar="SEQUENCE", help="where the recording is here, if not where it was there")
+    parser.add_argument("--data", metavar="SEQUENCE", help="path of the recording here, if it is not the bundle's")
     parser.add_argument("--out", metavar="DIR", type=Path, help="keep the new run directory (default: it is not kept)")
     add_output_arguments(parser, "every difference as JSON, and nothing else")
     add_workers_argument(parser)
@@ -147,7 +147,7 @@ def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
 
 @command(
     "reproduce",
-    "run what is in a bundle again and tell what differs",
+    "repeat the run of a bundle and show what differs",
     "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
     "vislam export runs/drive --bundle drive.zip",
     "vislam reproduce drive.zip",

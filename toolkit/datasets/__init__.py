@@ -192,7 +192,7 @@ def load_sequence(
             sequence = reader.load(path)
         if not isinstance(sequence, Sequence):
             file, given = getattr(reader, "__file__", reader), type(sequence).__name__
-            raise ExtensionError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
+            raise ExtensionError(f"{source}: load in {file} returned a {given}; it must return a Sequence")
         _check_types(sequence)
         check_stated(sequence)
     return sequence

@@ -136,7 +136,7 @@ def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
     if not listed.pairs:
         return (
             f"no image of {chosen.left.name} has one of {chosen.right.name} within 1 ms ({listed.stamps} left ones); a "
-            "stereo pair is taken at one instant: synchronise the cameras, or mend the stamps"
+            "stereo pair is taken at one instant: synchronise the cameras, or correct the stamps"
         )
     moved = chosen.imu or chosen.twist
     ranges = ((listed.pairs[0].t_ns, listed.pairs[-1].t_ns), (int(motion.t_ns.min()), int(motion.t_ns.max())))
@@ -179,7 +179,10 @@ def _truth(source: Source) -> tuple[Truth | None, tuple[str, ...]]:
     T_child_body = source.tree.between(child, body)
     if T_child_body is not None:
         return Truth(t_ns[first], T_world_child @ T_child_body), ()
-    whose = f"the truth's poses are of {child!r}, which nothing joins to {body!r}: they are taken for the body's"
+    whose = (
+        f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
+        "body's"
+    )
     return Truth(t_ns[first], T_world_child), (whose,) if child and child != body else ()
 
 
@@ -201,7 +204,7 @@ def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progres
         else:
             spool.add_grey(name, ros_values.grey(message.value, what))
         progress.advance(done + 1, max(total, done + 1), "unpacking images")
-    return (f"{unstamped} images have no stamp, and when they were recorded is taken for it",) if unstamped else ()
+    return (f"{unstamped} images have no stamp, and the time of recording is used",) if unstamped else ()
 
 
 def _type_of(chosen: Chosen, name: str) -> str:
@@ -230,7 +233,7 @@ def _motion_of(path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree) ->
         return ImuSamples(t_ns, accel, gyro), ()
     if chosen.twist is None:
         others = ", ".join(chosen.other_twists)
-        remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one beside the images"
+        remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one with the images"
         raise DataError(
             f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; {remedy}"
         )
@@ -289,5 +292,5 @@ def _check_measured(path: Path, topic: Topic, values: Array, covariance: Any, wh
         return
     apart = "the accelerometer's topic with --topics accel=TOPIC, " if what == "acceleration" else ""
     raise DataError(
-        f"{path}: {topic.name} measures no {what} (its values are 0 or said to be none); name {apart}{_NAME_ANOTHER}"
+        f"{path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}{_NAME_ANOTHER}"
     )

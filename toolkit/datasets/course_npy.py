@@ -44,7 +44,7 @@ from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import (
-    EXTRINSIC_IN_DOUBT,
+    EXTRINSIC_UNCERTAIN,
     NO_FEATURES,
     Observations,
     Provenance,
@@ -155,7 +155,7 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
         frames_t_ns=t_ns,
         observations=seen,
         motion=TwistSamples(t_ns, v_mps, w_radps),
-        provenance=Provenance("course-npy", str(parts.path), (*facts, *_turned(fields), EXTRINSIC_IN_DOUBT)),
+        provenance=Provenance("course-npy", str(parts.path), (*facts, *_turned(fields), EXTRINSIC_UNCERTAIN)),
     )
 
 
@@ -177,7 +177,9 @@ def _baseline_m(fields: Fields) -> float:
         )
     baseline_m = float(np.linalg.norm(left[:3, 3] - right[:3, 3]))
     if not baseline_m > 0.0:
-        raise DataError(f"{fields.path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; mend one")
+        raise DataError(
+            f"{fields.path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; correct one"
+        )
     return baseline_m
 
 
@@ -190,7 +192,7 @@ def _turned(fields: Fields) -> Iterator[str]:
     """Yield that the cameras are not parallel, where they are not."""
     turned_deg = _turned_deg(fields)
     if turned_deg > np.rad2deg(_TURNED_RAD):
-        yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is taken to be rectified"
+        yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
 def _sightings(parts: _Parts, features: StoredArray) -> Observations:

@@ -37,7 +37,7 @@ from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend
 
 CITES = ("geiger2012kitti",)
-NO_MOTION = "no motion input: all estimators assume a motion that is smooth, and say so"
+NO_MOTION = "no motion input: all estimators assume smooth motion"
 # Grey or colour, and the rows of calib.txt that are theirs.
 _FOLDERS = (("image_0", "image_1", 0), ("image_2", "image_3", 2), ("image_l", "image_r", 0))
 _PERIOD_S = 0.1

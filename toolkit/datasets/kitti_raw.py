@@ -163,7 +163,7 @@ def _size_or_none(path: Path) -> tuple[int, int] | None:
 def _motion(packets: _Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSamples, MotionNoise, str]:
     """Return the motion samples, their noise, and which they are in words."""
     if packets is None:
-        how = "no oxts: no motion input, all estimators assume a motion that is smooth"
+        how = "no oxts: no motion input, all estimators assume smooth motion"
         return NoSamples(frames_t_ns), unmeasured_motion(), how
     rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(packets.t_ns))))
     if rate_hz >= _IMU_FROM_HZ:

@@ -236,7 +236,7 @@ def _one_of(pairing: Any, known: tuple[Any, ...]) -> Any:
 def _provenance(fields: Text) -> Provenance:
     texts = (fields["format"], fields["source"], *fields["facts"])
     if not all(isinstance(text, str) for text in texts):
-        raise DataError("provenance holds what is no text; save the recording again")
+        raise DataError("provenance contains a value that is not text; save the recording again")
     return Provenance(texts[0], texts[1], texts[2:])
 
 

@@ -84,10 +84,12 @@ _STANDS = (
 )
 # Remarks where an estimate repeats one pose, or leaps. It leaps where one of its steps is this much longer (m) than the
 # truth's, and this many times as long as its usual step.
-_STAYS = "the estimate stands still, all its positions are one: it has nothing but the truth's own motion for errors"
-_LOOKS_ONE_WAY = "the estimate's orientations are all one, as where none was written: these are the truth's own turns"
+_STAYS = "the estimate stands still, all its positions are one: its errors are the truth's own motion"
+_LOOKS_ONE_WAY = (
+    "the estimate's orientations are all one, as where none was written: these are the truth's own rotations"
+)
 _OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
-_LEAPS = "the estimate leaps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
+_LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
@@ -242,8 +244,9 @@ def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Match
         raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
-            f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
-            f"the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, or allow more with --max-dt"
+            f"{estimate.path}: {len(matched)} of its poses match the truth in time; it covers "
+            f"{range_s(estimate.t_ns)}, the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, "
+            "or allow more with --max-dt"
         )
     return matched
 

@@ -287,7 +287,7 @@ def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:
         return EvaluatedRun(item, "failed", {}, {}, (" ".join(str(error).split()),))
     covered = scores.values[COVERAGE.key]
     if covered is not None and covered < terms.least_coverage_percent:
-        why = f"it covers {covered:.1f} % of the truth's time, and {terms.least_coverage_percent:g} % is asked for"
+        why = f"it covers {covered:.1f} % of the truth's time, and {terms.least_coverage_percent:g} % is required"
         return EvaluatedRun(item, "failed", scores.values, scores.notes, (f"{item.path}: {why}",))
     return EvaluatedRun(item, "ok", scores.values, scores.notes)
 

@@ -1,13 +1,14 @@
 """Finds estimators of one comparison that contradict the measured motion, which no single run of them can show.
 
 An estimator that uses no vision has no innovations: nothing in its run shows wheel slip or a wrong start. Estimators
-that correct the same motion by vision dispute it in two ways. First, their trajectory may differ from it by more than
-the covariances of both allow. The covariance of the difference is taken to be the sum of both; it is at most that,
-because estimators of the same motion from the same start share errors, which are then not negatively correlated.
+that correct the same motion by vision can contradict it in two ways. First, their trajectory may differ from it by
+more than the covariances of both allow. The covariance of the difference is assumed to be the sum of both; it is at
+most that, because estimators of the same motion from the same start share errors, which are then not negatively
+correlated.
 Second, their corrections may have a trend (:mod:`toolkit.metrics.correction_trend`). A difference of two estimates
 shows that one of them is inconsistent, not which (Hausman 1978, "Specification tests in econometrics"). Estimators
-whose corrections can be tested are witnesses: where half of them dispute the motion, estimators that rest on it alone
-are in doubt. An estimator that keeps its biases fixed differs from a sound motion by these biases, and is no witness.
+whose corrections can be tested count: where half of them contradict the motion, the estimators that use it alone are
+reported. An estimator that keeps its biases fixed differs from a correct motion by these biases, and does not count.
 """
 
 from collections.abc import Iterable
@@ -45,15 +46,15 @@ class FarthestPose(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Dispute:
-    """Estimators that do not correct the measured motion, the ``witnesses``, and the evidence against the motion.
+class MotionTest:
+    """Estimators that do not correct the measured motion, those that test it, and the evidence against the motion.
 
-    ``uncorrected`` are the former, ``too_far`` the rows that are too far from the motion, ``with_trend`` the estimators
-    whose corrections have a trend.
+    ``uncorrected`` are the former, ``tested`` those whose corrections can be tested, ``too_far`` the rows
+    that are too far from the motion, ``with_trend`` the estimators whose corrections have a trend.
     """
 
     uncorrected: tuple[str, ...]
-    witnesses: tuple[str, ...]
+    tested: tuple[str, ...]
     too_far: tuple[FarthestPose, ...]
     with_trend: tuple[str, ...]
 
@@ -73,15 +74,15 @@ class Dispute:
         )
 
     @property
-    def disputing(self) -> tuple[str, ...]:
-        """Return the witnesses that dispute the measured motion."""
+    def contradicting(self) -> tuple[str, ...]:
+        """Return the tested estimators that contradict the measured motion."""
         too_far = {one.row.estimator for one in self.too_far}
-        return tuple(name for name in self.witnesses if name in too_far or name in self.with_trend)
+        return tuple(name for name in self.tested if name in too_far or name in self.with_trend)
 
     @property
-    def doubts_motion(self) -> bool:
-        """Say whether at least half of the witnesses dispute the motion, and others rest on it."""
-        return bool(self.uncorrected and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
+    def is_contradicted(self) -> bool:
+        """Say whether at least half of the tested estimators contradict the motion, and others use it alone."""
+        return bool(self.uncorrected and self.contradicting and 2 * len(self.contradicting) >= len(self.tested))
 
 
 def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:

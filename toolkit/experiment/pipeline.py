@@ -55,7 +55,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not (self.estimators or self.own or self.trajectories):
-            raise SettingsError("nothing is to be compared: name an estimator, or a trajectory of another system")
+            raise SettingsError("there is nothing to compare: name an estimator, or a trajectory of another system")
         if self.max_frames is not None and not self.max_frames >= 2:
             raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
         if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:
@@ -283,7 +283,7 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        white={} if sequence.rig.track_noise is None else _taken_for_white(entries),
+        white={} if sequence.rig.track_noise is None else _assuming_white(entries),
         lacking=lacking(entries, plan.settings.noise, case.prepared),
         settings=plan.settings,
         workers=workers,
@@ -292,7 +292,7 @@ def _comparison(
     )
 
 
-def _taken_for_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
+def _assuming_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     """Return which estimators treat the noise of tracks as white whatever the rig states, and why."""
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 

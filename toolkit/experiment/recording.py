@@ -114,7 +114,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         if recording.noise.tracks == "fitted":
             whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
         elif recording.noise.tracks == "correlated":
-            whole = _with_doubts(whole, _cut(whole, recording))
+            whole = _with_contradiction(whole, _cut(whole, recording))
         if recording.card and card is None:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
@@ -187,7 +187,7 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
     if isinstance(source, Sequence):
         sequence, wrong = source, why_not_sightings(source)
         if wrong:
-            raise DataError(f"{source.name}: {wrong}; mend the sequence (Observations.sorted sorts)")
+            raise DataError(f"{source.name}: {wrong}; correct the sequence (Observations.sorted sorts)")
     elif source in SCENARIOS:
         check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
@@ -268,11 +268,11 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
     at_rest, counts = without_moving_tracks(sequence, prior)
     share = counts.sightings / max(counts.of_sightings, 1)
     fact = (
-        f"not given to estimators, for it moves against the motion and most other tracks (tracks.leave_out_moving): "
+        f"not given to estimators, because they contradict the motion and most other tracks (tracks.leave_out_moving): "
         f"{share:.1%} of the sightings, of {counts.tracks} of {counts.of_tracks} tracks"
     )
     if counts.undecided_frames:
-        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to tell"
+        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to decide"
     provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
     return replace(at_rest, provenance=provenance), share
 
@@ -289,13 +289,13 @@ def _stated_track_noise(requested: Noise) -> TrackNoise:
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
 
 
-def _with_doubts(whole: Sequence, used: Sequence) -> Sequence:
+def _with_contradiction(whole: Sequence, used: Sequence) -> Sequence:
     """Return the whole recording, with a fact where the tracks that are used contradict the stated noise."""
     assert used.rig.track_noise is not None
-    doubt = contradicted(used.rig.track_noise, used)
-    if doubt is None:
+    contradiction = contradicted(used.rig.track_noise, used)
+    if contradiction is None:
         return whole
-    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, doubt)))
+    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, contradiction)))
 
 
 def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> tuple[Sequence, Card]:
@@ -305,9 +305,9 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     """
     used = used if fit_s is None else _first_seconds(used, fit_s)
     fitted = fit_track_noise(used)
-    basis = "all that is used of the recording, so that causal answers know it too early"
+    basis = "all that is used of the recording, so that causal answers use it too early"
     if fit_s is not None:
-        basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
+        basis = f"the first {fit_s:g} s, which causal answers of that time use too early"
     fact = f"noise of tracks, fitted to {basis}: {summary_of(fitted, whole.rig.cov_uv_px2)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig

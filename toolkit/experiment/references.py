@@ -23,9 +23,9 @@ from toolkit.metrics.parts.association import associate, median_period_ns, poses
 from toolkit.sequence import Sequence, Truth
 
 _OTHER_TERMS = (
-    "its start, its noise and its cost are its own, and it may have seen the tracks that are withheld from the others"
+    "its start, its noise and its cost are its own, and it may have used the tracks that are withheld from the others"
 )
-_AS_FINAL = "it stands as final, for a file does not tell whether its poses know of later measurements"
+_AS_FINAL = "it is listed as final, because a file does not show whether its poses use later measurements"
 
 
 def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> tuple[Run, ...]:
@@ -48,7 +48,7 @@ def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesF
     taken = {plain_name(name): name for name in references}
     for name in files:
         if plain_name(name) in taken:
-            raise DataError(f"the recording brings an estimate {taken[plain_name(name)]}; call {name} otherwise")
+            raise DataError(f"the recording contains an estimate {taken[plain_name(name)]}; give {name} another name")
 
 
 def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequence) -> Run:

@@ -121,19 +121,19 @@ def _check_pair(left: Camera, right: Camera, T_right_left: Array, where: str) ->
     turned = float(np.arccos(np.clip(0.5 * (np.trace(T_right_left[:3, :3]) - 1.0), -1.0, 1.0)))
     if turned > _MOST_TURNED_RAD:
         raise DataError(
-            f"{where}: the cameras look {np.rad2deg(turned):.0f} deg apart, and a stereo pair looks the same way; mend "
-            "the extrinsics, or name two cameras that are a pair"
+            f"{where}: the cameras look {np.rad2deg(turned):.0f} deg apart, and a stereo pair looks the same way; "
+            "correct the extrinsics, or name two cameras that are a pair"
         )
     x, y, z = T_right_left[:3, 3]
     if not np.any(T_right_left[:3, 3]):
         raise DataError(
-            f"{where}: both cameras stand in the same place, so there is no baseline; mend the extrinsics, or name two "
-            "cameras"
+            f"{where}: both cameras stand in the same place, so there is no baseline; correct the extrinsics, or "
+            "name two cameras"
         )
     if -x < max(abs(y), abs(z)):
         side = "left" if x > max(abs(y), abs(z)) else "above, below or behind"
         raise DataError(
-            f"{where}: the right camera stands {side} of the left one; exchange them, or mend the extrinsics"
+            f"{where}: the right camera stands {side} of the left one; exchange them, or correct the extrinsics"
         )
 
 

@@ -1,7 +1,7 @@
 """The accuracy gate: tests whether accuracy, consistency, held-out reprojection or speed differ from a baseline's.
 
 Reading order: baseline (its values), baseline_file (as JSON) -> measuring -> verdict, significance (the tests of a
-metric) -> judging (a case) -> checking (the whole). Besides: interleaved (speed against another version of the code,
+metric) -> case_check (a case) -> checking (the whole). Besides: interleaved (speed against another version of the code,
 each in a process of timing_child), and trajectory_files -> trajectory_baseline -> trajectory_check (files of another
 system, without a run). Use, and power of the tests: docs/gate.md.
 """

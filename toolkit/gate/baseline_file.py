@@ -40,7 +40,7 @@ class MarginRecord(Struct, frozen=True, kw_only=True):
     """When a metric of simulated sequences is worse."""
 
     worse: Worse
-    margin_percent: Annotated[Percent, Meta(description="the mean worsening that nobody minds")]
+    margin_percent: Annotated[Percent, Meta(description="the mean worsening that is tolerated")]
 
 
 class BoundRecord(Struct, frozen=True, kw_only=True):
@@ -106,7 +106,7 @@ class BaselineRecord(Struct, frozen=True, kw_only=True):
 
     schema: Literal["vislam.baseline/1"]
     made_by: Annotated[dict[str, str | int | float], Meta(description="how, when and where it was made")]
-    releases: Annotated[dict[str, str], Meta(description="what it was made with and holds for")]
+    releases: Annotated[dict[str, str], Meta(description="what it was made with and is valid for")]
     false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
     bounds: BoundsRecord
     sequences: Annotated[tuple[CaseRecord, ...], Meta(min_length=1)]

@@ -1,4 +1,4 @@
-"""The whole gate: measure a new baseline, or measure an old one again and judge the differences."""
+"""The whole gate: measure a new baseline, or measure an old one again and test the differences."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from toolkit.estimator import check_options, find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
+from toolkit.gate.case_check import USUAL_TERMS, CaseVerdicts, CheckTerms, check_case
 from toolkit.gate.interleaved import compare_speed
-from toolkit.gate.judging import USUAL_TERMS, CaseVerdicts, CheckTerms, judge_case
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
-from toolkit.gate.significance import judge_pairs
+from toolkit.gate.significance import check_pairs
 from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
 from toolkit.settings import DEFAULTS, Settings
@@ -18,7 +18,7 @@ from toolkit.settings import DEFAULTS, Settings
 
 @dataclass(frozen=True)
 class How:
-    """How to run a check: number of processes, whether time is judged, settings, and what passes.
+    """How to run a check: number of processes, whether time is checked, settings, and what passes.
 
     ``accept_better`` lets what moved pass unless it is worse; ``speed_against`` names another version of the code, a
     git revision or a wheel, to take turns with for speed.
@@ -32,7 +32,7 @@ class How:
 
     @property
     def terms(self) -> CheckTerms:
-        """The terms on which each case is judged; speed that is judged in turns with other code is not judged twice."""
+        """The terms on which each case is checked; speed checked in turns with other code is not checked twice."""
         return CheckTerms(self.speed and self.speed_against is None, self.accept_better)
 
 
@@ -59,7 +59,7 @@ def new_baseline(
 
 
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
-    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error.
+    """Measure again what a baseline lists, and compare. Whatever is missing is a verdict, not an error.
 
     Raises BaselineError where another version of the code is asked for and cannot be found or timed.
     """
@@ -71,18 +71,18 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
         collected.notes += speeds.notes
     for case, before in baseline.cases:
         now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
-        one = judge_case(case, before, now, baseline.bounds, how.terms)
+        one = check_case(case, before, now, baseline.bounds, how.terms)
         collected.verdicts += one.verdicts
         collected.tests += one.tests
         collected.notes += one.notes
-    return judge_all(collected, baseline, name, time.monotonic() - began, how.terms)
+    return check_all(collected, baseline, name, time.monotonic() - began, how.terms)
 
 
-def judge_all(
+def check_all(
     collected: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
 ) -> Check:
     """Test all metrics of the check together, and collect the verdicts."""
-    tested = judge_pairs(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
+    tested = check_pairs(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {
         (case.source, name): (i, k)
         for i, (case, before) in enumerate(baseline.cases)

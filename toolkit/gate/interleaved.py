@@ -80,7 +80,7 @@ def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: P
     Raises BaselineError where the version cannot be found or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
-    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes)
+    return Speeds(tuple(check_speeds(turns.timed, version, rate)), turns.notes)
 
 
 def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
@@ -102,7 +102,7 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
     return Turns(tuple(one for one in timed if isinstance(one, TimedPairs)), tuple(notes))
 
 
-def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
+def check_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
     """Yield the verdict on each estimator; the chance of any false alarm among them is at most ``rate``."""
     slower, faster = (
         holm(np.array([_beyond_p(sign * timed.differences) for timed in found], dtype=float)).tolist()
@@ -202,7 +202,7 @@ def _lacking(version: str, sides: Sequence[Process], names: Sequence[str]) -> li
     """Return the estimators that only one side has; raises BaselineError where both sides are the same code."""
     found = [side.request("where", estimators=names) for side in sides]
     if found[0] == found[1]:
-        raise BaselineError(f"{version} brings no code of what runs here ({found[0]['toolkit']}); name another")
+        raise BaselineError(f"{version} does not contain the code that runs here ({found[0]['toolkit']}); name another")
     return [name for name in names if any(side["files"][name] is None for side in found)]
 
 
@@ -271,9 +271,15 @@ def _unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def _unpack_revision(revision: str, folder: Path) -> None:
-    top = _git("rev-parse", "--show-toplevel", otherwise=f"{revision}: no checkout; stand in one, or name a wheel")
+    top = _git(
+        "rev-parse",
+        "--show-toplevel",
+        otherwise=f"{revision}: the current directory is not in a checkout; change to one, or name a wheel",
+    )
     shallow = _git("rev-parse", "--is-shallow-repository", otherwise=revision).strip() == b"true"
-    deepen = "fetch it, for this clone is shallow (git fetch --unshallow)" if shallow else "name one that git log shows"
+    deepen = (
+        "fetch it, because this clone is shallow (git fetch --unshallow)" if shallow else "name one that git log shows"
+    )
     unknown = f"{revision!r} is no revision of this checkout; {deepen}, or name a wheel"
     commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", otherwise=unknown)
     archive = _git("archive", commit.decode().strip(), otherwise=unknown, folder=top.decode().removesuffix("\n"))

@@ -133,7 +133,7 @@ def fingerprint(sequence: Sequence) -> str:
 
 
 def metrics_of(case: Case, bounds: Bounds) -> tuple[str, ...]:
-    """Return the metrics a case is judged by."""
+    """Return the metrics a case is checked by."""
     return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
 
 

@@ -9,11 +9,11 @@ the farther it is from 1. Whatever became worse has moved as well: both question
 
 Student's paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
 section 2.5; the correction is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
-Statistics 6 (1979). Arrays are tested along their last axis, so that a benchmark can judge thousands of checks at once.
+Statistics 6 (1979). Arrays are tested along their last axis, so that a benchmark can test thousands of checks at once.
 
 Runs that were made anew on both sides, of a system that answers differently each time, are tested by Welch's test,
 one-sided ("The generalization of 'Student's' problem when several different population variances are involved",
-Biometrika 34, 1947). Identical runs have no spread to judge by; then the answer is certain.
+Biometrika 34, 1947). Identical runs have no spread; then the answer is certain.
 """
 
 from dataclasses import dataclass
@@ -110,7 +110,7 @@ def _away_p(before: Array, after: Array, margin: float, band: tuple[float, float
     return np.where((low <= now) & (now <= high), 1.0, np.minimum(1.0, 2.0 * p))
 
 
-def judge_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False) -> list[Verdict]:
+def check_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False) -> list[Verdict]:
     """Judge all paired metrics of a check; the chance of any false alarm among them is at most ``rate``.
 
     A movement may go up or down and a worsening has one side, so that half of the rate belongs to each side. With

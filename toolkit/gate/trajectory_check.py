@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.errors import DataError, no_such, printable
 from toolkit.gate.baseline import Criterion, Values
-from toolkit.gate.judging import judge_recorded
+from toolkit.gate.case_check import check_recorded
 from toolkit.gate.measuring import place_of
 from toolkit.gate.significance import FEWEST_RUNS, Compared, MeanChange, Where, geometric_mean, holm, percent_text
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, ScoredSequence, TrajectoryBaseline
@@ -134,7 +134,7 @@ def check_trajectories(
     order = list(baseline.sequences)
     verdicts = sorted([*verdicts, *tested], key=lambda verdict: order.index(verdict.sequence))
     unknown = sorted(set(there) - set(order))
-    notes = (f"not in the baseline, and not judged: {', '.join(unknown)}",) if unknown else ()
+    notes = (f"not in the baseline, and not checked: {', '.join(unknown)}",) if unknown else ()
     tests = sum(_is_tested(one) for one in compared)
     seconds = time.monotonic() - began
     return Check(name, tuple(verdicts), notes, baseline.false_alarm_rate, tests, {}, seconds, accept_better)
@@ -149,7 +149,7 @@ def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scori
     """Return the scores of a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
     now = given.scored(sequence, scoring, before)
     if now.truth_hash != before.truth_hash:
-        raise DataError(f"{now.truth} is another truth than the baseline's; make a new baseline")
+        raise DataError(f"{now.truth} differs from the baseline's truth; make a new baseline")
     return now.scores
 
 
@@ -191,7 +191,7 @@ def _tested_together(compared: list[Compared], rate: float, *, accept_better: bo
     for one in compared:
         if not _is_tested(one):
             was, is_ = float(np.median(one.before)), float(np.median(one.after))
-            yield judge_recorded(one.where, one.criterion, was, is_, accept_better=accept_better)
+            yield check_recorded(one.where, one.criterion, was, is_, accept_better=accept_better)
 
 
 def _tested(

@@ -72,7 +72,7 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
         files = trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
         name = printable(path.name if path.is_dir() else path.stem)
         if files and name in found:
-            raise DataError(f"{folder}: {name} is there twice, as {found[name][0].name} and {path.name}; leave one")
+            raise DataError(f"{folder}: {name} is given twice, as {found[name][0].name} and {path.name}; keep one")
         if files:
             found[name] = files
     if not found:
@@ -103,7 +103,9 @@ def read_stamped(path: Path, truth: Poses | None = None) -> Poses:
     """
     file = read_poses(path)
     if file.t_ns is None:
-        raise DataError(f"{path}: a {file.format} file has no stamps, and its poses meet no truth; write TUM")
+        raise DataError(
+            f"{path}: a {file.format} file has no stamps, so its poses cannot be matched with the truth; write TUM"
+        )
     poses = Poses(path, file.t_ns, file.T_world_imu)
     if truth is not None and len(file):
         matched = matched_poses(poses, truth)
@@ -124,8 +126,9 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
         raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
-            f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
-            f"the truth {range_s(truth.t_ns)}: write the stamps of the truth's clock, in seconds"
+            f"{estimate.path}: {len(matched)} of its poses match the truth in time; it covers "
+            f"{range_s(estimate.t_ns)}, the truth {range_s(truth.t_ns)}: write the stamps of the truth's clock, in "
+            "seconds"
         )
     check_axes(str(estimate.path), matched.truth, matched.estimate)
     fit = _FITS[scoring.align]

@@ -20,8 +20,8 @@ class Verdict:
     is allowed; ``changed metric`` is another number of the same trajectory; they and ``missing`` fail the check.
     ``worse`` and ``better`` are changes that are shown and do not: within what is allowed, or for the good where that
     is accepted. ``before`` and ``after`` are the baseline's value and the one now, means over the seeds where there are
-    several; ``change_percent`` is how much it grew. ``p`` is adjusted for all tests of the check; ``seen_percent`` is
-    the change this test would have seen with 95 % power.
+    several; ``change_percent`` is the relative change. ``p`` is adjusted for all tests of the check; ``seen_percent``
+    is the change this test would have detected with 95 % power.
     """
 
     sequence: str
@@ -72,7 +72,7 @@ class Check:
 
 
 class VerdictRecord(Struct, frozen=True, kw_only=True):
-    """What became of one metric of one estimator on one sequence; what is not finite or not judged is null."""
+    """What became of one metric of one estimator on one sequence; what is not finite or not checked is null."""
 
     sequence: str
     estimator: str
@@ -82,10 +82,10 @@ class VerdictRecord(Struct, frozen=True, kw_only=True):
     words: str
     before: Annotated[float | None, Meta(description="the baseline's value, the mean over the seeds")]
     after: Annotated[float | None, Meta(description="the value now, the mean over the seeds")]
-    change_percent: Annotated[float | None, Meta(description="how much it grew")]
+    change_percent: Annotated[float | None, Meta(description="relative change of the value")]
     allowed_percent: float | None
     p: Annotated[float | None, Meta(description="adjusted for all tests of the check")]
-    seen_percent: Annotated[float | None, Meta(description="the change this test sees with 95 % power")]
+    seen_percent: Annotated[float | None, Meta(description="the change this test detects with 95 % power")]
     fails: Annotated[bool, Meta(description="whether the check fails for this")]
 
     def __post_init__(self) -> None:

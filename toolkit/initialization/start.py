@@ -97,7 +97,7 @@ def start_from_truth(sequence: Sequence) -> Prior:
         t_s, positions = truth.t_ns[neighbours] / NS_PER_S, truth.T_world_imu[neighbours, :3, 3]
         v_world = (positions[-1] - positions[0]) / (t_s[-1] - t_s[0])
     cov = np.diag(np.repeat([0.01, 0.01, 0.05, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
-    return Prior(truth.T_world_imu[row], v_world, np.zeros(6), cov, "the truth at the first frame, as asked for")
+    return Prior(truth.T_world_imu[row], v_world, np.zeros(6), cov, "the truth at the first frame, as requested")
 
 
 def _own_frame() -> Prior:
@@ -130,13 +130,13 @@ def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
     """Return the start from the specific force alone, if there is any, and in its source why vision was not used."""
     if isinstance(sequence.noise, TwistChangeNoise):
         sigmas = [GAUGE_SIGMA, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, TURN_SIGMA]
-        source = f"the first frame as the world; velocity and turn rate unknown and taken for zero, for {why}"
+        source = f"the first frame as the world; velocity and turn rate unknown and assumed to be zero, because {why}"
         return Prior(np.eye(4), np.zeros(3), np.zeros(6), np.diag(np.repeat(sigmas, 3) ** 2), source)
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
     cov = 0.5 * (cov + cov.T)
-    source = f"the specific force; velocity unknown and taken for zero, for {why}"
+    source = f"the specific force; velocity unknown and assumed to be zero, because {why}"
     return Prior(se3(attitude, np.zeros(3)), np.zeros(3), np.zeros(6), cov, source)
 
 

@@ -176,7 +176,7 @@ def score_run(
             if not isinstance(scores, Scores) or list(scores.values) != _keys(file):
                 given = list(scores.values) if isinstance(scores, Scores) else type(scores).__name__
                 where = getattr(file, "__file__", file)
-                raise ExtensionError(f"{where}: score answers with Scores of {_keys(file)}, here with {given}")
+                raise ExtensionError(f"{where}: score must return Scores of {_keys(file)}, and returned {given}")
             values |= scores.values
             notes |= scores.notes
     return Scores(values, notes)

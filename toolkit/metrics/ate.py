@@ -62,15 +62,15 @@ _DISAGREE = (
     "end_drift_percent too; if the truth's world is not level, compare ate_se3_m"
 )
 _UNMEASURED = (
-    "without a measured vertical the tilt of an estimator's world, its first frame, in the truth's depends on where it "
-    "begins, and is most of this error; compare ate_se3_m"
+    "without a measured vertical the tilt of the estimator's world, its first frame, against the truth's depends on "
+    "where it begins, and is most of this error; compare ate_se3_m"
 )
 # A remark is made where the scale is wrong by this share, and positions fit this many times as well with another one.
 _LEAST_SCALE, _TIMES_BETTER = 0.02, 3.0
 _LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "miles": 1609.344, "kilometres": 1000.0}
 _SCALED = (
     "its positions fit the truth's to {:.3g} m once they are multiplied by {:.4g}{}: another unit, a scale that "
-    "nothing measured, or a baseline, focal length or wheels that are off"
+    "was not observed, or a baseline, focal length or wheels that are off"
 )
 _ON_A_LINE = "the positions lie on a line or in a point, so the rotation about it is not determined"
 

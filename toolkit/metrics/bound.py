@@ -59,7 +59,7 @@ METRICS = (
         _metric(
             f"claimed_{key}",
             f"stated variance of the {what} over the bound: mean trace of P^-1 times it over its degrees of freedom",
-            ("claimed", key[:8]),
+            ("stated", key[:8]),
         )
         for key, what in _BLOCKS.items()
     ),

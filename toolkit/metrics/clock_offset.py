@@ -24,7 +24,7 @@ OFFSET, ERROR = "clock_offset_ms", "clock_offset_error_ms"
 METRICS = (
     Metric(
         OFFSET,
-        "what the stamps of the estimate must be shifted by for its positions to fit the truth's best (ms)",
+        "shift of the estimate's stamps with which its positions fit the truth's best (ms)",
         "ms",
         ("clock", "offset"),
         decimals=1,
@@ -57,7 +57,7 @@ _RATE_REMARK = (
 )
 _REMARK = (
     "with its stamps shifted by {:.1f} +- {:.1f} ms its positions fit the truth's to {:.3g} m in place of {:.3g} m: "
-    "two clocks, a truth whose positions are stamped early or late, or a drift that goes with the velocity"
+    "two clocks, a truth whose positions are stamped early or late, or a drift proportional to the velocity"
 )
 
 
@@ -122,7 +122,7 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
         if abs(step_s) < _SETTLED_S:
             before_m = rmse(lengths(_linearised(path, t_s[usable], estimated[usable]).error_m))
             return _Fit(offset_s, jackknife_error(_offset_s, *at), before_m, rmse(lengths(at.error_m)))
-    raise Unavailable("no offset was found from which the fit does not step on")
+    raise Unavailable("the fit of the offset did not converge")
 
 
 class _Rate(NamedTuple):
@@ -177,7 +177,7 @@ def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArra
             clock += step
             if share == 1.0 and abs(step[0]) < _SETTLED_S and abs(clock[0]) < _MOST_RATE * t_s[-1]:
                 return float(clock[1]), since_s[rows], at
-    raise Unavailable("no rate was found from which the fit does not step on")
+    raise Unavailable("the fit of the rate did not converge")
 
 
 def _clock(error_m: Array, jacobian: Array, since_s: Array) -> Array:

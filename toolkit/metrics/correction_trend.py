@@ -36,14 +36,14 @@ _BY_CHANCE, _BY_LINEARISATION = 1e-6, 2.0
 METRICS = (
     Metric(
         TREND,
-        "mean squared sum of the corrections over 1 s, by the covariance that they took away; 1 is consistent",
+        "mean squared sum of the corrections over 1 s, over the covariance that they removed; 1 is consistent",
         "1",
         ("correction", "trend"),
         best="one",
     ),
     Metric(
         LIMIT,
-        "what the correction trend of a run stays below by chance, where nothing turns its state one way",
+        "limit of the correction trend by chance, without errors that correct the state in one direction",
         "1",
         ("trend", "limit"),
         name="correction trend, limit",
@@ -94,7 +94,7 @@ def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:
         raise Unavailable("the estimator states no covariance of its whole state")
     walked = np.mean([np.diag(step.prediction.noise) for step in steps], axis=0)[layout.biases]
     if (np.median(np.diagonal(cov, axis1=1, axis2=2)[:, layout.biases], axis=0) < walked).any():
-        raise Unavailable("the estimator holds its biases, and what they do to its state does lean one way")
+        raise Unavailable("the estimator does not estimate biases, and their effect on its state has one direction")
     return cov
 
 

@@ -29,8 +29,8 @@ _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
 # with an IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at these runs.
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
-_OF_CAUSAL = ": it revises itself by so much, or follows tracks that are wrong"
-_OF_FINAL = ": what it made of vision did harm"
+_OF_CAUSAL = ": it corrects itself by as much later, or uses wrong tracks"
+_OF_FINAL = ": its corrections by vision increased the error"
 METRICS = (
     Metric(
         RATIO,
@@ -120,7 +120,7 @@ def _harm(paired: _Paired, kind: str) -> str:
     whole, notes = _mean(paired.log_ratio), list[str]()
     if _least(whole) > np.log(MOST_RATIO[kind]):
         ratio = float(np.exp(whole[0]))
-        notes.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times as far ({paired.t_s.size} tracks)")
+        notes.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times ({paired.t_s.size} tracks)")
     edges = np.linspace(paired.t_s.min(), paired.t_s.max(), _STRETCHES + 1)
     stretch = np.clip(np.searchsorted(edges, paired.t_s, side="right") - 1, 0, _STRETCHES - 1)
     many = [k for k in range(_STRETCHES) if np.count_nonzero(stretch == k) >= _FEWEST_IN_STRETCH]
@@ -131,8 +131,8 @@ def _harm(paired: _Paired, kind: str) -> str:
     if not notes:
         return ""
     return (
-        f"explains withheld tracks worse than dead reckoning: it misses them {', '.join(notes)} as the measured motion "
-        "alone does"
+        f"explains withheld tracks worse than dead reckoning: its reprojection error is {', '.join(notes)} that of "
+        "the measured motion alone"
     )
 
 

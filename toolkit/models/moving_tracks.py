@@ -229,7 +229,9 @@ class _Step(NamedTuple):
         carried = start.cov @ d_step.T
         cov = d_step @ carried + end.noise[POSE, POSE]
         if not (np.isfinite(cov).all() and np.isfinite(T_start_end).all()):
-            raise DataError("the measured motion is too large to tell moving tracks by; run without leave_out_moving")
+            raise DataError(
+                "the measured motion is too large to find moving tracks by it; run without leave_out_moving"
+            )
         return cls(T_start_end, 0.5 * (cov + cov.T), end.transition @ carried + end.noise[:, POSE])
 
     def conditioned(self, end: Belief, found: _FoundMotion) -> Belief:

@@ -19,7 +19,7 @@ _MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
 # A scale is wrong where it differs from one by this many standard errors and by this much: unbiased errors of
 # disparities make vision 0.15 to 0.25 % too long on average (eight seeds of drive and of drive-realistic).
 _SIGMAS, _SCALE_OFF = 3.0, 0.005
-_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
+_STRAYS = ": moving objects or lasting mismatches; the outlier policy matters more than the estimator"
 
 
 def card_lines(card: Card) -> Iterator[str]:
@@ -32,19 +32,19 @@ def card_lines(card: Card) -> Iterator[str]:
     yield _noise(card)
     if middle < _FEW_FRAMES:
         yield (
-            f"tracks are short: most poses share few points with any but the next, and a smoother can do little that "
-            f"a filter has not done; half of the tracks are gone after {middle:.0f} frames"
+            f"tracks are short: most poses share few points with any but the next, and a smoother gains "
+            f"little over a filter; half of the tracks are gone after {middle:.0f} frames"
         )
     yield (
         f"{card.tails:.1%} of the residuals lie beyond four robust standard deviations, and {card.at_odds:.1%} of the "
-        f"tracks are at odds with the motion" + (_STRAYS if card.at_odds > _MANY_AT_ODDS else "")
+        f"tracks are inconsistent with the motion" + (_STRAYS if card.at_odds > _MANY_AT_ODDS else "")
     )
     if card.left_out is not None:
-        yield f"{card.left_out:.1%} of the sightings move against most others and are given to no estimator"
+        yield f"{card.left_out:.1%} of the sightings contradict most others and are not given to estimators"
     if card.blind_intervals > _MANY_BLIND * card.intervals:
         yield (
-            f"{card.blind_intervals} of {card.intervals} intervals have no common track: there every estimator rests "
-            "on the measured motion alone, and no smoother repairs what that gets wrong"
+            f"{card.blind_intervals} of {card.intervals} intervals have no common track: there every estimator depends "
+            "on the measured motion alone, and no smoother corrects its errors"
         )
     yield from _scale(card)
 
@@ -54,19 +54,20 @@ def _noise(card: Card) -> str:
     if not card.correlated:
         return (
             f"errors of a track are white, {_channels(card.noise.white_px)} (correlation from frame to frame {lags}): "
-            "what every estimator assumes, so that a smoother, which sees more, should win"
+            "what every estimator assumes, so that a smoother, which uses more data, should be the most accurate"
         )
     parts = []
     if card.noise.walk_px.any():
-        parts.append(f"they walk by {_channels(card.noise.walk_px)} per root frame")
+        parts.append(f"a random walk of {_channels(card.noise.walk_px)} per root frame")
     if card.noise.offset_px.any():
-        parts.append(f"each disparity is off by {card.noise.offset_px[1]:.2f} px for the track's whole life")
+        parts.append(f"an offset of the disparity of {card.noise.offset_px[1]:.2f} px, constant along a track")
     return (
         f"errors of a track are correlated: {' and '.join(parts)}, beside white noise of "
         f"{_channels(card.noise.white_px)} (correlation from frame to frame {lags}; {card.gain:.1f} +- "
-        f"{card.gain_error:.1f} in log-likelihood a track better than white). An estimator that counts them as white "
-        "takes every further sighting of a track for new information, a smoother most of all: it is too sure of itself "
-        "and need not win; noise.match_tracks has tracks count for less, noise.tracks=fitted tells it"
+        f"{card.gain_error:.1f} in log-likelihood a track better than white). An estimator that assumes white noise "
+        "uses every further sighting of a track as new information, a smoother most of all: it is overconfident and "
+        "need not be the most accurate; noise.match_tracks gives tracks less weight, noise.tracks=fitted models the "
+        "correlation"
     )
 
 
@@ -76,8 +77,9 @@ def _scale(card: Card) -> Iterator[str]:
     off, error = card.scale.value - 1.0, card.scale.error
     if abs(off) > max(_SIGMAS * error, _SCALE_OFF):
         yield (
-            f"vision is {abs(off):.2%} +- {error:.2%} {'long' if off > 0.0 else 'short'} against the measured motion: "
-            "calibration or odometry is off by as much, and errors after an SE(3) alignment show that first"
+            f"vision's steps are {abs(off):.2%} +- {error:.2%} {'longer' if off > 0.0 else 'shorter'} than the "
+            "measured motion's: calibration or odometry is off by as much, and errors after an SE(3) alignment show "
+            "that first"
         )
     else:
         yield f"vision and the measured motion agree in scale, to {abs(off):.2%} +- {error:.2%}"
@@ -99,8 +101,8 @@ def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
     lines += ["", as_text(Table(headings, rows, labels=1)), ""]
     lines.append(
         filled(
-            "lag in frames; corr.: autocorrelation of the residuals along a track; spread: how far two sightings of a "
-            "track err apart, in px, divided by root two; fitted: the same as the fitted noise has it",
+            "lag in frames; corr.: autocorrelation of the residuals along a track; spread: difference of the errors "
+            "of two sightings of a track, in px, divided by root two; fitted: the same as the fitted noise has it",
             width,
         )
     )

@@ -24,8 +24,8 @@ _LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 Columns = None | Literal["all"] | tuple[str, ...]
 _MOTION = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}
 _WITHOUT_TRUTH = (
-    "without ground truth the table shows how well an estimate explains tracks that none was given (held-out) and what "
-    "it cost, the notes whether its innovations fit its covariance; not how far it is from the true path"
+    "without ground truth the table shows the reprojection error of tracks that no estimator was given (held-out) "
+    "and the cost, the notes whether innovations fit the covariance; the distance from the true path is unknown"
 )
 
 
@@ -175,7 +175,7 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
     yield rules_line(comparison)
     warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
     if warnings:
-        yield f"whatever its status, no result stands without what the audit says of: {', '.join(warnings)}"
+        yield f"read every result, whatever its status, with the findings of the audit: {', '.join(warnings)}"
     if comparison.sequence.truth is None and len(comparison.sequence.observations):
         yield _WITHOUT_TRUTH
 
@@ -200,7 +200,7 @@ def _track_noise(noise: Noise) -> str:
     if noise.tracks == "correlated":
         return "; noise of tracks: correlated, as stated"
     basis = "the whole recording" if noise.track_fit_s is None else f"the first {noise.track_fit_s:g} s"
-    return f"; noise of tracks: fitted to {basis}, which causal answers know too early"
+    return f"; noise of tracks: fitted to {basis}, which causal answers use too early"
 
 
 def _optional_parts(noise: Noise) -> str:

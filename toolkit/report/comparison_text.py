@@ -23,17 +23,18 @@ from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_sec
 from toolkit.report.table import Table, as_markdown, as_text
 
 _READ_BEFORE = """\
-Causal and held-out are said of what an estimator is given. Before its first packet, the same for all: with raw IMU
-samples the start, where the recording brings none, is found from about the first 1.5 s of sightings that are not
-withheld, so causal answers of that time rest on a little of their future; and the audit looks for faults in the whole
+Causal and held-out describe what an estimator is given. Before its first packet, the same for all: with raw IMU
+samples the start, where the recording has none, is found from about the first 1.5 s of sightings that are not
+withheld, so causal answers of that time use a little of their future; and the audit looks for faults in the whole
 recording, withheld tracks included. Its findings are above."""
 _MARKED = """\
 `overconfident` or `timid` beside how a run ended: its errors, or without a truth its innovations, are larger or smaller
-than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that refused many;
-`contradicted`: its tracks turn its state one way, farther than its covariance allows. The notes have the figures."""
+than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that rejected many;
+`contradicted`: the corrections by its tracks have one direction, by more than its covariance allows. The notes have the
+figures."""
 _HOW_TO_READ_ONE = f"""\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
-estimator knew at each frame, a **final** line on its answer after the last frame; compare like with like.
+estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like.
 A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
 read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
 the matched pairs and the coverage above the table, or in it where the rows differ.
@@ -48,11 +49,11 @@ the matched pairs and the coverage above the table, or in it where the rows diff
 
 _OUTSIDE_BY_DESIGN = """\
 Some estimators may stay outside their band, and are compared all the same. A decoupled filter, like the seed report's,
-takes its map for exact when it corrects the pose and forgets that both share their errors: it counts the same
-information again and again, and its covariance shrinks whatever the error does. A plain joint filter keeps the
-correlations, but linearises one landmark at many different estimates of the same pose, and so believes to have
-measured its heading and position, which nothing measured. The rungs after it exist to mend this: for them, being
-outside the band is a defect of the estimator or of its noise."""
+treats its map as exact when it corrects the pose and neglects that the errors of both are correlated: it counts the
+same information again and again, and its covariance shrinks whatever the error does. A plain joint filter keeps the
+correlations, but linearises one landmark at many different estimates of the same pose, and so reduces the variance of
+its heading and position, which nothing measured. The rungs after it correct this: for them, being outside the band is a
+defect of the estimator or of its noise."""
 _HOW_TO_READ_MANY = f"""\
 Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
 means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
@@ -99,14 +100,14 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
         *(f"{in_markdown(line)}." for line in header_lines(comparison)),
         as_markdown(comparison_table(comparison)),
-        *markdown_section("Who differs from the best?", paired_lines(comparison)),
-        *markdown_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
+        *markdown_section("Which estimators differ from the best?", paired_lines(comparison)),
+        *markdown_section("Is the stated uncertainty consistent?", consistency_lines(comparison)),
         *markdown_section("Notes", note_lines(comparison)),
         *markdown_section("Remarks on single numbers", remark_lines(comparison)),
         *markdown_section("Where every estimator started", [comparison.prior.source]),
         *markdown_section("What the audit found in the recording", finding_lines(comparison)),
-        *markdown_section("What to know about this recording", comparison.sequence.provenance.facts),
-        *markdown_section("What its tracks are like", () if comparison.card is None else card_lines(comparison.card)),
+        *markdown_section("About this recording", comparison.sequence.provenance.facts),
+        *markdown_section("Its tracks", () if comparison.card is None else card_lines(comparison.card)),
         "## Figures",
         *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
         "## How to read the table",
@@ -140,9 +141,12 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     if any(f.blocking for f in findings):
         lines += ["", *_spoiling(findings)]
     elif any(f.warning for f in findings):
-        lines += ["", f"results have to be read with this in mind: {', '.join(f.fault for f in findings if f.warning)}"]
+        lines += [
+            "",
+            f"read the results with these findings in mind: {', '.join(f.fault for f in findings if f.warning)}",
+        ]
     elif findings and not audited.undecided:
-        lines += ["", "nothing is left that spoils a result"]
+        lines += ["", "no fault is left that invalidates a result"]
     return "\n".join(lines)
 
 

@@ -257,8 +257,8 @@ class MetricChangeRecord(Struct, frozen=True, kw_only=True):
     after: float | None
     change_percent: float | None
     moved: Annotated[bool, Meta(description="by more than a millionth")]
-    p: Annotated[float | None, Meta(description="that it is the same on average, corrected for all tests")]
-    beyond_chance: Annotated[bool | None, Meta(description="null where too few runs tell")]
+    p: Annotated[float | None, Meta(description="p-value of equal means, corrected for all tests")]
+    beyond_chance: Annotated[bool | None, Meta(description="null where there are too few runs")]
 
 
 class DiffRecord(Struct, frozen=True, kw_only=True):
@@ -359,4 +359,4 @@ def _summary_lines(found: Differences, moved: int, shown: int) -> Iterator[str]:
         rate = f"{100.0 * FALSE_ALARM_RATE:g} %"
         yield f"chance: {found.tests} tests, {how}, which share a false-alarm rate of {rate} (Holm)"
     else:
-        yield "chance: one run on each side tells nothing of it; compare over --seeds"
+        yield "chance: unknown from one run on each side; compare over --seeds"

@@ -106,7 +106,7 @@ def leaderboard_page(evaluation: EvaluatedSystems) -> str:
     for heading, lines in (
         ("Is it more than chance?", paired_lines(evaluation)),
         ("Runs that failed", failure_lines(evaluation, None)),
-        ("What to know", note_lines(evaluation)),
+        ("Notes", note_lines(evaluation)),
     ):
         entries = "".join(f"<li>{_text(line)}</li>" for line in lines)
         cards += [_card(heading, f"<ul>{entries}</ul>")] if entries else []

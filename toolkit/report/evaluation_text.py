@@ -144,7 +144,7 @@ def paired_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
             yield _paired_line(test, len(tests), evaluation.ranked_by)
     count = len(evaluation.ranked_sequences)
     if tests and 2.0 ** (1 - count) * len(tests) > FALSE_ALARM_RATE:
-        yield f"{count} sequences cannot tell {len(evaluation.systems)} systems apart at 5 %, whatever the errors are"
+        yield f"{count} sequences cannot distinguish {len(evaluation.systems)} systems at 5 %, whatever the errors are"
 
 
 def _paired_line(test: PairedTest, pairs: int, metric: Metric) -> str:

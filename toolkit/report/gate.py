@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 from toolkit.errors import printable
 from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
-from toolkit.gate.judging import SHOWN
+from toolkit.gate.case_check import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict, check_document
 from toolkit.metrics import known_metrics
 from toolkit.report.prose import WIDTH, Width, section
@@ -21,7 +21,7 @@ from toolkit.report.table import MISSING, Table, as_markdown, as_text, number
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
     "moved": "moved",
-    "changed metric": "computed otherwise",
+    "changed metric": "computed differently",
     "missing": "missing",
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
@@ -33,7 +33,7 @@ _NUMBERS = (
     ("now", "", ""),
     ("change", "", "%"),
     ("allowed", "", "%"),
-    ("sees", "", "%"),
+    ("detects", "", "%"),
     ("p", "", ""),
 )
 
@@ -142,14 +142,14 @@ def note_lines(check: Check) -> Iterator[str]:
         blind = [v for v in check.verdicts if v.seen_percent is not None and v.seen_percent > 10.0 and not v.fails]
         yield (
             f"{check.tests} tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
-            "'sees' is the change each of them finds with 95 % power, from how much it scatters"
+            "'detects' is the change each of them finds with 95 % power, from how much it scatters"
         )
         if blind:
-            yield f"{len(blind)} of them would not have seen 10 %: the change scatters too much for so few seeds"
+            yield f"{len(blind)} of them would not have detected 10 %: the change scatters too much for so few seeds"
     if any(verdict.finding == "moved" for verdict in check.failures):
         yield (
-            "what moved is another answer than the baseline's, and no worse: --accept-better lets it pass, and a new "
-            "baseline makes it the answer to come"
+            "what moved differs from the baseline and is no worse: --accept-better lets it pass, "
+            "a new baseline adopts it"
         )
     releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
     yield "; ".join(filter(None, (releases, f"took {check.seconds:.0f} s")))
@@ -216,7 +216,7 @@ def _numbers(verdict: Verdict) -> str:
         "change in percent": verdict.change_percent,
         "allowed in percent": verdict.allowed_percent,
         "p, adjusted": verdict.p,
-        "sees, in percent": verdict.seen_percent,
+        "detects, in percent": verdict.seen_percent,
     }
     return "\n".join(f"{name}: {value:.7g}" for name, value in numbers.items() if value is not None)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.disagreement import FARTHEST, Dispute, FarthestPose
+from toolkit.experiment.disagreement import FARTHEST, FarthestPose, MotionTest
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
@@ -18,13 +18,13 @@ from toolkit.report.table import cell, number
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
 _MARK = {
-    "overconfident": "overconfident, too sure of itself",
-    "timid": "timid, less sure of itself than it could be",
-    "heavy-tailed": "heavy-tailed, of innovations that no one covariance describes",
-    "contradicted": "contradicted, by tracks that turn its state one way",
+    "overconfident": "overconfident, its errors are larger than its covariance states",
+    "timid": "timid, its errors are smaller than its covariance states",
+    "heavy-tailed": "heavy-tailed, its innovations have no single covariance",
+    "contradicted": "contradicted, the corrections by its tracks have one direction",
 }
 _TAILS = (
-    "; and yet its gate refused much: most innovations are smaller than stated and some far larger, which no one "
+    "; and yet its gate rejected many: most innovations are smaller than stated and some far larger, which no single "
     "noise of pixels describes"
 )
 # Log lines shown of an estimator: one that recovers in every frame must not hide the rest; metrics.json has its whole
@@ -39,10 +39,10 @@ _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
 _STATUS = {
     "diverged": (
-        "diverged: it ran to the end, but its answers left what is physically plausible. That is a result, not a "
+        "diverged: it ran to the end, but its estimates are physically implausible. That is a result, not a "
         "crash: its scores are those of the whole trajectory, and its figure shows where it went."
     ),
-    "failed": "failed: it could not go on. What it had said until then, if anything, is kept and scored.",
+    "failed": "failed: it could not go on. What it had estimated until then, if anything, is kept and scored.",
 }
 
 
@@ -56,7 +56,7 @@ def finding_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason why faults could not be judged, behind their names."""
+    """Yield a line for each reason why faults could not be decided, behind their names."""
     by_reason: dict[str, list[str]] = {}
     for fault, why in undecided.items():
         by_reason.setdefault(why, []).append(fault)
@@ -86,13 +86,13 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
     for name, why in comparison.white.items():
-        yield f"{name} takes the noise of tracks for white: {why}"
+        yield f"{name} assumes white noise of tracks: {why}"
     for part, names in comparison.lacking.items():
         yield f"{', '.join(names)}: without {_PARTS[part]} (noise.{part})"
     yield from _marks(comparison)
     yield from _refusals(comparison)
     yield from _harm_by_vision(comparison)
-    yield from dispute_lines(Dispute.of(comparison.lines))
+    yield from motion_test_lines(MotionTest.of(comparison.lines))
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -149,16 +149,16 @@ def _marks(comparison: Comparison) -> Iterator[str]:
                 continue
             yield (
                 f"{_name_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
-                f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
+                f"{_figure(found.high)} contains 95 % of consistent estimators however correlated their errors"
                 f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
             )
 
 
 def _trend_text(trend: float, limit: float) -> str:
     return (
-        f"its tracks turn its state one way, {_figure(trend)} times as far (squared) as its covariance and the "
-        f"measured motion allow, by chance at most {_figure(limit)}; look for what all tracks share, as a fault of "
-        "calibration, motion or time stamps"
+        f"the corrections by its tracks have one direction, {_figure(trend)} times as large (squared) as its "
+        f"covariance and the measured motion allow, by chance at most {_figure(limit)}; look for an error that all "
+        "tracks share, as of calibration, motion or time stamps"
     )
 
 
@@ -169,8 +169,8 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
     if refused:
         listed = ", ".join(f"{name} {share:.0f} %" for name, share in refused.items())
         yield (
-            f"the outlier gate refused much of what it tested ({listed}): many mismatches, or a model that does not "
-            "hold, as of calibration, time stamps or noise"
+            f"the outlier gate rejected many of the measurements it tested ({listed}): many mismatches, or a wrong "
+            "model of calibration, time stamps or noise"
         )
 
 
@@ -185,19 +185,19 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
             yield f"{_name_of(row)} {harmed[0][1]}"
 
 
-def dispute_lines(dispute: Dispute) -> Iterator[str]:
-    """Yield a line for estimators too far from the measured motion, and one for those that rest on a disputed one."""
-    if dispute.too_far:
-        listed = "; ".join(f"{_name_of(one.row)} by {_distance_text(one)}" for one in dispute.too_far)
+def motion_test_lines(test: MotionTest) -> Iterator[str]:
+    """Yield a line for estimators too far from the measured motion, and one for those that use it alone."""
+    if test.too_far:
+        listed = "; ".join(f"{_name_of(one.row)} by {_distance_text(one)}" for one in test.too_far)
         yield (
-            "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
-            f"which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
+            "vision and the measured motion alone disagree: their estimates differ by more than their covariances "
+            f"allow, which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
         )
-    if dispute.doubts_motion:
-        names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.witnesses)}"
+    if test.is_contradicted:
+        names, count = ", ".join(test.contradicting), f"{len(test.contradicting)} of {len(test.tested)}"
         yield (
-            f"{', '.join(dispute.uncorrected)}: nothing but the measured motion and the start, which {count} that "
-            f"correct it by vision dispute ({names})"
+            f"{', '.join(test.uncorrected)}: uses only the measured motion and the start, which {count} that "
+            f"correct it by vision contradict ({names})"
         )
 
 
@@ -282,10 +282,10 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
     if found.is_significant:
         return listed
     if found.seeds_needed > _MOST_SEEDS:
-        return f"{listed}: as good as equal, {_MOST_SEEDS} seeds would not tell them apart"
+        return f"{listed}: practically equal, {_MOST_SEEDS} seeds would not distinguish them"
     more = max(1, math.ceil(found.seeds_needed) - found.n)
     return (
-        f"{listed}: may be chance; {more} more seed{'s' if more > 1 else ''} would tell a difference as large as this"
+        f"{listed}: may be chance; {more} more seed{'s' if more > 1 else ''} would show a difference as large as this"
     )
 
 

@@ -71,7 +71,7 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     fitted_px2: Annotated[Lags, Meta(description="the same as the fitted noise has it")]
     left_right_correlation: float
     tails: Annotated[float, Meta(description="share of residuals beyond four robust sigmas", ge=0, le=1)]
-    at_odds: Annotated[float, Meta(description="share of tracks at odds with the motion", ge=0, le=1)]
+    at_odds: Annotated[float, Meta(description="share of tracks that are inconsistent with the motion", ge=0, le=1)]
     scale: Annotated[float | None, Meta(description="translation by vision over the measured one, or null")]
     scale_error: float | None
     left_out: (
@@ -248,7 +248,7 @@ class Report(Struct, frozen=True, kw_only=True):
     steps: tuple[StepTimes, ...]
     maps: tuple[DrawnMap, ...]
     words: Messages
-    card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where asked for")] = UNSET
+    card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where requested")] = UNSET
     frames: Annotated[
         tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
     ] = UNSET
@@ -276,7 +276,7 @@ class SeedsMessages(Struct, frozen=True, kw_only=True):
 
     sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
     notes: tuple[str, ...]
-    verdicts: Annotated[tuple[str, ...], Meta(description="who is too sure of itself")]
+    verdicts: Annotated[tuple[str, ...], Meta(description="which estimators are overconfident")]
     start: str
 
 

@@ -51,7 +51,7 @@ class AuditEntry(Struct, frozen=True, kw_only=True):
 
 
 Undecided = (
-    Annotated[dict[str, str], Meta(description="by fault, why it could not be judged; absent before it was added")]
+    Annotated[dict[str, str], Meta(description="by fault, why it could not be decided; absent before it was added")]
     | UnsetType
 )
 
@@ -62,7 +62,7 @@ class ConsistencyMark(Struct, frozen=True, kw_only=True):
     verdict: Annotated[
         Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"],
         Meta(
-            description="by the mean: in, above, below its band; below, behind a gate that refused much; corrections "
+            description="by the mean: in, above, below its band; below, behind a gate that rejected many; corrections "
             "that lean one way by more than their limit"
         ),
     ]
@@ -76,7 +76,7 @@ class ConsistencyMark(Struct, frozen=True, kw_only=True):
 Consistency = (
     Annotated[
         ConsistencyMark,
-        Meta(description="absent where neither NEES nor NIS nor a trend tells, and before it was added"),
+        Meta(description="absent where neither NEES nor NIS nor a trend decides, and before it was added"),
     ]
     | UnsetType
 )
@@ -86,9 +86,9 @@ class ScoredRun(Struct, frozen=True, kw_only=True):
     """One kind of output of one estimator."""
 
     estimator: Annotated[str, Meta(description="its name, as in vislam list, or what was read from a file")]
-    output: Annotated[Output, Meta(description="what it knew at each frame, or when it had seen everything")]
+    output: Annotated[Output, Meta(description="what it estimated at each frame, or from the whole recording")]
     status: Annotated[
-        Status, Meta(description="ran to a plausible end; ran to the end and left what is plausible; could not go on")
+        Status, Meta(description="ran to the end; ran to the end with implausible estimates; could not go on")
     ]
     metrics: Annotated[dict[str, Value], ALL_PROMISED]
     notes: Notes
@@ -116,7 +116,7 @@ class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
     """What the recordings of all seeds have in common."""
 
     name: Annotated[str, Meta(description="the sequence's name")]
-    source: Annotated[str, Meta(description="as it was asked for")]
+    source: Annotated[str, Meta(description="as it was requested")]
     frames: Annotated[Count, Meta(description="camera frames")]
     duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
     motion: Motion
@@ -174,7 +174,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
     """One kind of output of one estimator under all seeds."""
 
     estimator: Annotated[str, Meta(description="its name, as in vislam list")]
-    output: Annotated[Output, Meta(description="what it knew at each frame, or when it had seen everything")]
+    output: Annotated[Output, Meta(description="what it estimated at each frame, or from the whole recording")]
     change: (
         Annotated[str, Meta(description="on a ladder only: what it changes against the rung before")] | UnsetType
     ) = UNSET
@@ -214,12 +214,13 @@ class Seeds(Struct, frozen=True, kw_only=True):
     sequence: SequenceOfSeeds
     seeds: Annotated[tuple[int, ...], Meta(description="in order")]
     hashes: Annotated[
-        tuple[str | None, ...], Meta(description="of what was read under each seed; null where no run lived to tell")
+        tuple[str | None, ...],
+        Meta(description="of what was read under each seed; null where every run's process died"),
     ]
     start: Annotated[str, Meta(description="where every run started")]
     estimators: Annotated[tuple[str, ...], Meta(description="in order")]
     runs: Annotated[tuple[RunOverSeeds, ...], Meta(description="by estimator, causal before final")]
-    log: Annotated[tuple[LogEntry, ...], Meta(description="every run that had something to say")]
+    log: Annotated[tuple[LogEntry, ...], Meta(description="every run that has log lines")]
 
     def __post_init__(self) -> None:
         if len(self.hashes) != len(self.seeds):

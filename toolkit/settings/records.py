@@ -41,7 +41,7 @@ class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
     exceeded as often. None is no gate, no loss.
     """
 
-    policy: Annotated[PolicyName, _setting("the policy all of these are taken from, but for what is set by itself")] = (
+    policy: Annotated[PolicyName, _setting("policy that sets all keys below, except those that are set themselves")] = (
         "robust"
     )
     gate_probability: Annotated[
@@ -110,7 +110,7 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
         | None
     ) = None
     most_states: Annotated[
-        int, _setting("states in the window at most; of more frames they are thinned evenly", ge=2, le=10_000)
+        int, _setting("most states in the window; if there are more frames, states are thinned evenly", ge=2, le=10_000)
     ] = 50
     landmarks: Annotated[
         int, _setting("landmarks msckf-slam keeps in its state for as long as they are seen", ge=0, le=500)
@@ -146,7 +146,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         float, _setting("factor on the white-noise densities of the motion samples", ge=1e-6, le=1e3)
     ] = 1.0
     tracks: Annotated[
-        TrackModel, _setting("errors of a track's sightings: each by itself, a stated walk and offset, or fitted")
+        TrackModel, _setting("errors of a track's sightings: independent, a stated walk and offset, or fitted")
     ] = "white"
     track_white_px: Annotated[float, _setting("correlated: white part, in column and row", "px", ge=1e-6, le=100.0)] = (
         0.03
@@ -159,7 +159,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[
             float,
             _setting(
-                "fitted: how much of the beginning, so that later causal answers rest on the past",
+                "fitted: length of the beginning that is used, so that later causal answers use the past only",
                 "s",
                 none="all of it",
                 ge=1e-6,
@@ -181,13 +181,13 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         | None
     ) = None
     bridge_gaps: Annotated[
-        bool, _setting("where frames have no track in common, a measured twist is like those before and after, too")
+        bool, _setting("where frames have no track in common, measured twists before and after predict the twist, too")
     ] = True
     match_imu: Annotated[
-        bool, _setting("causal estimators take an IMU for noisier than stated where tracks contradict it")
+        bool, _setting("causal estimators assume more noise of an IMU than stated where tracks contradict it")
     ] = True
     match_tracks: Annotated[
-        bool, _setting("white noise: tracks count for less where residuals along them are correlated")
+        bool, _setting("white noise: tracks have less weight where residuals along them are correlated")
     ] = True
 
 
@@ -198,7 +198,7 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[
             int,
             _setting(
-                "tracks a frame for estimators at most, spread over image and depth, the oldest first",
+                "most tracks a frame that estimators get, spread over image and depth, the oldest first",
                 none="all",
                 ge=10,
                 le=10_000,
@@ -207,7 +207,7 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         | None
     ) = None
     leave_out_moving: Annotated[
-        bool, _setting("give no estimator what moves against the motion and most other tracks: vehicles, mismatches")
+        bool, _setting("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
     ] = False
 
 
@@ -227,27 +227,29 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
     """How stereo tracks are made of images; the same tracks for every estimator."""
 
     tracks: Annotated[
-        Tracks, _setting("where a recording with images has its tracks from; auto: images, where nearly all are there")
+        Tracks,
+        _setting("source of the tracks of a recording with images; auto: the images, if nearly all of them exist"),
     ] = "auto"
     topics: Annotated[
-        str | None, _setting("of a bag, as in left=/cam0/image_raw,imu=/imu0; what is not said is guessed from names")
+        str | None,
+        _setting("topics of a bag, as in left=/cam0/image_raw,imu=/imu0; others are guessed from their names"),
     ] = None
-    max_tracks: Annotated[int, _setting("stereo tracks a frame at most", ge=20, le=2000)] = 200
+    max_tracks: Annotated[int, _setting("most stereo tracks a frame", ge=20, le=2000)] = 200
     spacing_px: Annotated[float, _setting("least distance of two tracks in the left image", "px", ge=3.0, le=200.0)] = (
         12.0
     )
     window_px: Annotated[int, _setting("side of the window that KLT compares", "px", ge=7, le=63)] = 15
     levels: Annotated[int, _setting("halvings of the image in KLT's pyramid", ge=0, le=8)] = 3
-    nearest_m: Annotated[float, _setting("depth of the nearest point looked for", "m", gt=0.0, le=100.0)] = 0.25
-    forward_backward_px: Annotated[
-        float, _setting("how far KLT there and back may end from where it began", "px", gt=0.0, le=10.0)
-    ] = 0.3
-    epipolar_px: Annotated[float, _setting("how far the rows of left and right may differ", "px", gt=0.0, le=20.0)] = (
-        1.5
+    nearest_m: Annotated[float, _setting("smallest depth that is searched", "m", gt=0.0, le=100.0)] = 0.25
+    forward_backward_px: Annotated[float, _setting("largest forward-backward error of KLT", "px", gt=0.0, le=10.0)] = (
+        0.3
     )
-    ransac_px: Annotated[float, _setting("distance from the motion most tracks agree on", "px", gt=0.0, le=20.0)] = 2.0
+    epipolar_px: Annotated[float, _setting("largest difference of left and right rows", "px", gt=0.0, le=20.0)] = 1.5
+    ransac_px: Annotated[
+        float, _setting("largest distance from the common motion of tracks", "px", gt=0.0, le=20.0)
+    ] = 2.0
     patch_px: Annotated[
-        float, _setting("how far a track may be from where its first patch fits", "px", gt=0.0, le=20.0)
+        float, _setting("largest distance of a track from the best match of its first patch", "px", gt=0.0, le=20.0)
     ] = 1.5
     patch_correlation: Annotated[float, _setting("least correlation with the track's first patch", gt=0.0, lt=1.0)] = (
         0.8
@@ -264,11 +266,11 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     metrics: Metrics = Metrics()
     frontend: Frontend = Frontend()
     start: Annotated[
-        Literal["measurements", "truth"], _setting("where the first state comes from; the truth is labelled")
+        Literal["measurements", "truth"], _setting("source of the first state; a start from the truth is labelled")
     ] = "measurements"
-    card: Annotated[bool, _setting("in the report, what the recording's tracks are like; takes some seconds")] = False
+    card: Annotated[bool, _setting("describe the recording's tracks in the report; takes some seconds")] = False
     arithmetic: Annotated[
-        Arithmetic, _setting("of filters that have both: auto is compiled where the extra fast is installed")
+        Arithmetic, _setting("of filters that have both kinds: auto is compiled where the extra fast is installed")
     ] = "auto"
     first_seed: Annotated[int, _setting("seed of simulated sequences, the first of several", ge=0)] = 0
     seeds: Annotated[int, _setting("how many seeds a simulated sequence is repeated over", ge=1, le=100_000)] = 1

@@ -79,7 +79,9 @@ def check_filmable(scenario: Scenario, directory: Path) -> None:
     if not (scenario.has_surfaces and isinstance(scenario.motion, Imu)):
         raise SettingsError(f"{scenario.name} has landmarks and no surfaces to take images of; flight has")
     if scenario.varied:
-        raise SettingsError(f"{scenario.name}: a world that the seed draws cannot be filmed; leave it as it is")
+        raise SettingsError(
+            f"{scenario.name}: images of a world that the seed draws cannot be rendered; use the scenario's own"
+        )
     check_replaceable(directory, _written_by_us)
     there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.is_dir())
     needed_gb, free_gb = size_gb(scenario), shutil.disk_usage(there).free / 1e9

@@ -89,7 +89,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
     """
     if not 1.0 / scenario.camera.rate_hz <= scenario.duration_s <= LONGEST_S:
         raise SettingsError(
-            f"a simulation of {scenario.duration_s:g} s cannot be had; its duration is from "
+            f"a simulation of {scenario.duration_s:g} s is not possible; its duration is from "
             f"{1.0 / scenario.camera.rate_hz:g} to {LONGEST_S:g} s"
         )
     streams = np.random.SeedSequence((seed, _number(scenario.name))).spawn(7)
@@ -207,8 +207,8 @@ def _provenance(scenario: Scenario, seed: int) -> Provenance:
     )
     if scenario.track_noise is not None:
         facts += (
-            "errors of a track are correlated, which the stated noise does not say (docs/tracks.md), and "
-            f"{scenario.slip_share:.0%} of the tracks slip to another point",
+            "errors of a track are correlated, which the stated noise does not include (docs/tracks.md), and "
+            f"{scenario.slip_share:.0%} of the tracks jump to another point",
         )
     return Provenance("simulated", f"scenario {scenario.name}, {scenario.duration_s:g} s, seed {seed}", facts)
 

@@ -97,7 +97,7 @@ def fit_track_noise(sequence: Sequence) -> Fit:
         return _fitted(sequence, groups)
     except np.linalg.LinAlgError as error:
         raise DataError(
-            f"{sequence.name}: no motion of the camera suits the tracks, so that their noise cannot be fitted; "
+            f"{sequence.name}: no motion of the camera fits the tracks, so that their noise cannot be fitted; "
             "vislam check-data may say what is wrong with them or with the calibration"
         ) from error
 
@@ -114,7 +114,7 @@ def _fitted(sequence: Sequence, groups: tuple[Tracklets, ...]) -> Fit:
         if state.freedom < LEAST_FREEDOM:
             raise DataError(
                 f"{sequence.name}: {len(sequence.visible) / sequence.frame_count:.1f} visible tracks a frame are too "
-                "few: the camera's motion takes up what they say, and their noise cannot be fitted; state it with "
+                "few: the camera's motion absorbs their errors, and their noise cannot be fitted; state it with "
                 "noise.tracks=correlated, or leave it white"
             )
     assert model is not None
@@ -213,7 +213,7 @@ def summary_of(fit: Fit, stated_px2: Array) -> str:
         stated_px = np.sqrt(np.diag(CHANNELS @ stated_px2 @ CHANNELS.T))
         times = float(np.exp(np.mean(np.log(stated_px / noise.white_px))))
         return (
-            f"{parts[0]}, each sighting by itself; what estimators are told is left at the recording's own "
+            f"{parts[0]}, independent between sightings; estimators still assume the recording's own "
             f"{_of_channels(stated_px)}, {times:.2f} times that"
         )
     return (

@@ -48,7 +48,8 @@ def contradicted(noise: TrackNoise, sequence: Sequence) -> str | None:
         return None
     return (
         f"from frame to frame the tracks scatter {scatter:.1f} times as much as the noise of tracks that was stated: "
-        "estimators trust them far too much, and the filters' gate rejects most; noise.tracks=fitted finds their own"
+        "estimators give them far too much weight, and the filters' gate rejects most; noise.tracks=fitted finds "
+        "their own"
     )
 
 

@@ -96,7 +96,7 @@ def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> 
         for k, (answer, full) in enumerate(zip(early, watched.online, strict=False)):
             if difference(answer, full):
                 return (
-                    f"its answer to frame {k} is another one where the packets from frame {count} on are withheld: "
+                    f"its answer to frame {k} differs where the packets from frame {count} on are withheld: "
                     f"{difference(answer, full)}"
                 )
     return ""
@@ -123,15 +123,15 @@ def _other_in_second_run(estimator: Estimator, packets: tuple[Packet, ...], firs
     """Say at which frame an estimator answers differently than before; empty where answers are the same."""
     for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
-            return f"a second run answers otherwise to frame {k}: {found}"
+            return f"a second run differs at frame {k}: {found}"
     found = difference(estimator.finish(), first.finished)
-    return f"a second run ends otherwise: {found}" if found else ""
+    return f"a second run has another final result: {found}" if found else ""
 
 
 def difference(one: Estimate | Finished | None, other: Estimate | Finished | None) -> str:
     """Say how two answers differ; empty where all bits are the same."""
     if (one is None) != (other is None):
-        return "one run answers and the other does not"
+        return "one run returns an estimate and the other does not"
     pairs = list(zip_longest(_named_arrays(one, ""), _named_arrays(other, "")))
     if any(left is None or right is None or left[1].shape != right[1].shape for left, right in pairs):
         return "other fields or shapes"
@@ -180,7 +180,7 @@ def touched(watched: Watched) -> str:
     given = (watched.setup, watched.packets)
     for array, copy in zip(arrays_of(given), watched.given_copies, strict=True):
         if not np.array_equal(array, copy, equal_nan=True):
-            return f"it wrote into what it was given: an array of shape {array.shape} is another one now"
+            return f"it wrote into what it was given: an array of shape {array.shape} has changed"
     return ""
 
 
@@ -306,5 +306,7 @@ def inconsistency(nees_means: list[float]) -> str:
     mean = float(np.mean(nees_means))
     if low <= mean <= high:
         return ""
-    how = "too sure of itself" if mean > high else "less sure of itself than it could be"
-    return f"it is {how}: mean pose NEES {mean:.3g}, and {low:.2f} to {high:.2f} holds 99.9 % of consistent estimators"
+    how = "overconfident" if mean > high else "less certain than it could be"
+    return (
+        f"it is {how}: mean pose NEES {mean:.3g}, and {low:.2f} to {high:.2f} contains 99.9 % of consistent estimators"
+    )

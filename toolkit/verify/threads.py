@@ -50,7 +50,9 @@ def differing_answers(estimator: str) -> str:
     """Say on which scenario an estimator's answers differ between one thread and two; empty where they do not."""
     one, two = (digests_at(threads, (estimator,)) for threads in (1, 2))
     differing = [key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest]
-    return f"with two threads it says other bits than with one, on {', '.join(differing)}" if differing else ""
+    if not differing:
+        return ""
+    return f"with two threads its answers differ in bits from those with one, on {', '.join(differing)}"
 
 
 def _digests(estimators: list[str]) -> dict[str, str]:

@@ -31,11 +31,11 @@ DURATION_S, MAX_TRACKS = 6.0, 40
 # Planted faults by a description for the user. Recordings are audited first, as before every comparison.
 PLANTED_FAULTS: Mapping[str, Callable[[Sequence], Sequence]] = {
     "a fifth of the sightings lost": partial(faults.dropped_sightings, dose=0.2),
-    "2 s without sight": partial(faults.blackout, dose=2.0),
-    "nothing ever seen": partial(faults.dropped_sightings, dose=1.0),
+    "2 s without sightings": partial(faults.blackout, dose=2.0),
+    "no sightings at all": partial(faults.dropped_sightings, dose=1.0),
     "one track a frame": partial(faults.few_tracks, dose=1.0),
     "30 % outlier tracks": faults.outlier_tracks,
-    "all seen to one side": faults.one_sided_view,
+    "sightings to one side only": faults.one_sided_view,
     "left and right swapped in a fifth of the tracks": partial(faults.swapped_images, dose=0.2),
     "0.5 s without motion samples": faults.motion_gap,
     "0.25 s that is not a number": faults.nan_span,
@@ -121,7 +121,7 @@ _OF_A_RUN: tuple[tuple[str, _Of, str], ...] = (
         "into later frames",
     ),
     (
-        "deterministic: a second run says the same bits",
+        "deterministic: a second run gives the same bits",
         promises.other_answers,
         "seed every random number in build(); keep nothing in the module or the class between runs",
     ),
@@ -142,17 +142,17 @@ _COVARIANCE_REMEDY = (
     "before position, in the body frame"
 )
 _NO_COVARIANCE = "it states no covariance"
-_NEES = f"honest: pose NEES over {SEEDS} seeds"
+_NEES = f"consistent: pose NEES over {SEEDS} seeds"
 _NEES_REMEDY = (
-    "above the band it is too sure: more process noise, landmarks whose errors are correlated with the pose, or "
-    "Jacobians at first estimates; below it, less noise than stated; see docs/metrics.md"
+    "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "
+    "Jacobians at first estimates; below it, assume less noise; see docs/metrics.md"
 )
 _RUNS_REMEDY = "see the line named; raise EstimatorError, with the reason, where it cannot go on"
-_THREADS = "one thread and two say the same bits"
+_THREADS = "one thread and two give the same bits"
 _THREADS_REMEDY = "sum in a fixed order; leave no result to which thread is first"
 _TROUBLE = "it goes on through every planted fault"
 _TROUBLE_REMEDY = (
-    "expect frames without sightings, negative disparities, gross outliers; recover and say so in Finished(log=...)"
+    "expect frames without sightings, negative disparities, gross outliers; recover and report it in Finished(log=...)"
 )
 
 

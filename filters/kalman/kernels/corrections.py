@@ -210,4 +210,4 @@ def test_correction(before: Arrays, after: Arrays, places: IntArray, least: floa
     return nis, dof
 
 
-COMPILED = what_was_compiled(test_correction, "what corrections are made of was")
+COMPILED = what_was_compiled(test_correction, "the parts of a correction were")

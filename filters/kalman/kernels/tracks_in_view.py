@@ -316,4 +316,4 @@ def information_with_newest(normals: Arrays, by_root: Arrays, rules: Array) -> A
     return stepped, newest, in_front, e, blocks_times_root(D, R)
 
 
-COMPILED = what_was_compiled(follow, "what tracks in view tell was")
+COMPILED = what_was_compiled(follow, "the information of tracks in view was")

@@ -84,7 +84,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom.warning(
         count=len(found),
         detail=f"vision and {samples} disagree at {', '.join(_detail(*one) for one in sorted(found, key=_begin))}",
-        treatment="moving objects or wrong samples: distrust every estimate from there on",
+        treatment="moving objects or wrong samples: do not rely on any estimate from there on",
         spans_ns=tuple(_in_ns(span, int(sequence.frames_t_ns[0])) for _, span in found),
     )
 

@@ -41,8 +41,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     findings = _ratios(evidence)
     if found.residual_px > found.limit_px or found.own_px > found.limit_px or findings:
         findings.append(
-            f"the tracks miss the measured motion by {found.residual_px:.2f} px from frame to frame (median; noise "
-            f"explains {found.limit_px:.2f} px at most) and the camera's own best motion by {found.own_px:.2f} px"
+            f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion "
+            f"(median; noise explains {found.limit_px:.2f} px at most) and {found.own_px:.2f} px against the camera "
+            "motion that fits them best"
         )
     if not findings:
         return None
@@ -105,7 +106,7 @@ def _is_off(ratio: Scalar, least: float, most: float) -> bool:
 
 FAULT = Fault(
     "disagreement",
-    "tracks that do not follow the measured motion, for a reason no other fault explains",
+    "tracks that are inconsistent with the measured motion, for a reason that no other fault explains",
     check,
     after=("units", "intrinsics", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset"),
 )

@@ -49,10 +49,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom.warning(
         count=1,
         detail=(
-            f"from about {at_s:.0f} s on the odometry is {100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} % "
-            f"{'faster' if step.value > 0.0 else 'slower'} beside the camera than before"
+            f"from about {at_s:.0f} s on the odometry's speed relative to the camera's is "
+            f"{100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} % "
+            f"{'higher' if step.value > 0.0 else 'lower'} than before"
         ),
-        treatment="wheels, their scale or depths have changed: no one scale mends the recording",
+        treatment="wheels, their scale or depths have changed: no constant scale corrects the recording",
     )
 
 
@@ -60,7 +61,7 @@ def _hidden(step: Scalar, hidden: float) -> Undecided | None:
     """Return the size of a step that variations of the scale may hide, where it is larger than LARGEST_HIDDEN."""
     if hidden < LARGEST_HIDDEN:
         return None
-    wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as those of sound drives do"
+    wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as in drives without faults"
     return Undecided(
         f"the odometry's scale changes {wanders}: a step by less than {100.0 * hidden:.0f} % would not show"
     )
@@ -83,7 +84,7 @@ def _largest_step(ratio: Array) -> tuple[int, Scalar]:
 
 FAULT = Fault(
     "scale-change",
-    "odometry whose scale beside the camera changes during the recording",
+    "odometry whose scale relative to the camera changes during the recording",
     check,
     after=("disagreement",),
 )

@@ -13,7 +13,7 @@ from toolkit.audit.parts.extrinsic import SYSTEMATIC_RAD, angle_of, turn_by_velo
 from toolkit.audit.parts.one_step import errors_are_independent
 
 # Excess beyond chance (a share, rad) that tracks which drift from image to image cause in simulations without slip.
-SCALE_BY_CREEP, TURN_BY_CREEP_RAD = 0.005, 0.003
+SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD = 0.005, 0.003
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -25,10 +25,10 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     return Symptom.information(
         count=len(differences),
-        detail=f"vision and odometry part all along: {'; '.join(differences)}",
+        detail=f"vision and odometry differ during the whole recording: {'; '.join(differences)}",
         treatment=(
-            "a focal length, a baseline, a principal point or wheels that are off, or slip and pitch, which make as "
-            "much in sound recordings of cars; estimators count on none of it"
+            "a wrong focal length, baseline, principal point or wheel scale, or slip and pitch, which cause as much in "
+            "recordings of cars without faults; by default estimators model none of these"
         ),
     )
 
@@ -39,7 +39,7 @@ def _scale(evidence: Evidence) -> str | None:
         return None
     scale, error = found.scale
     beyond = abs(scale) - found.scale_by_chance
-    if not 0.0 < beyond < SYSTEMATIC_SCALE["twist"] or not _is_no_creep(evidence, beyond, SCALE_BY_CREEP):
+    if not 0.0 < beyond < SYSTEMATIC_SCALE["twist"] or not _exceeds_track_drift(evidence, beyond, SCALE_BY_TRACK_DRIFT):
         return None
     return (
         f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
@@ -53,23 +53,25 @@ def _direction(evidence: Evidence) -> str | None:
         return None
     turn = turn_by_velocities(found.by_velocities)
     beyond_rad = float((np.abs(turn.rad) - turn.by_chance_rad).max())
-    if not 0.0 < beyond_rad < SYSTEMATIC_RAD["twist"] or not _is_no_creep(evidence, beyond_rad, TURN_BY_CREEP_RAD):
+    if not 0.0 < beyond_rad < SYSTEMATIC_RAD["twist"]:
+        return None
+    if not _exceeds_track_drift(evidence, beyond_rad, TURN_BY_TRACK_DRIFT_RAD):
         return None
     angle, error = angle_of(turn)
     return (
-        f"the camera goes {angle:.3f} +- {error:.3f} rad off the direction of the velocities, which is "
+        f"the camera moves at an angle of {angle:.3f} +- {error:.3f} rad to the velocities, equivalent to "
         f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"
     )
 
 
-def _is_no_creep(evidence: Evidence, beyond: float, by_creep: float) -> bool:
+def _exceeds_track_drift(evidence: Evidence, beyond: float, by_track_drift: float) -> bool:
     """Say whether tracks that drift cannot cause the excess: it is larger, or the errors are independent."""
-    return beyond > by_creep or errors_are_independent(evidence.step_correlation)
+    return beyond > by_track_drift or errors_are_independent(evidence.step_correlation)
 
 
 FAULT = Fault(
     "steady-difference",
-    "vision and odometry that part all along, by no more than slip makes of sound recordings",
+    "vision and odometry that differ during the whole recording, by no more than slip causes without a fault",
     check,
     after=("accelerometer-axes", "disagreement", "correlated-tracks"),
 )

@@ -43,7 +43,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
             f"{'longer' if scale > 0.0 else 'shorter'} than the {measured}"
         ),
-        treatment=f"disparities, baseline or focal length are off{causes}",
+        treatment=f"disparities, baseline or focal length are wrong{causes}",
     )
 
 
@@ -68,20 +68,22 @@ def _unseen(evidence: Evidence, least: float) -> Undecided | None:
     scale, error = found.scale
     if not np.isfinite(least):
         share = 100.0 * (SYSTEMATIC_SCALE[evidence.sequence.motion_kind] + found.scale_by_chance)
-        known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would hide"
+        known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would not show"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     if least + abs(scale) < LARGEST_HIDDEN:
         return _unseen_at_all(scale, error, found.scale_by_chance + abs(scale))
     known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
     hidden = least + abs(scale)
-    return Undecided(f"{known}, as in sound recordings: a fault of less than {100.0 * hidden:.0f} % would not show")
+    return Undecided(
+        f"{known}, as in recordings without faults: a fault of less than {100.0 * hidden:.0f} % would not show"
+    )
 
 
 def _unseen_at_all(scale: float, error: float, hidden: float) -> Undecided | None:
     """Return, with odometry, the scale below which not even `steady_difference` reports it, where it is large."""
     if hidden < LARGEST_CHANCE:
         return None
-    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, as by chance"
+    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, within chance"
     return Undecided(f"{known}: a scale that is off by less than {100.0 * hidden:.1f} % would not show")
 
 

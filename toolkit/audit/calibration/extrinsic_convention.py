@@ -17,7 +17,7 @@ from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.parts.robust import Scalar, mean_in_sigmas, slope
 from toolkit.geometry import Array, se3, se3_inverse, so3_log
-from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence
+from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
 
 # Least mean difference of the logarithms of two readings' residuals, in its own standard errors. The file allows all
 # readings, so the difference only has to be beyond chance (intervals are correlated over about a second).
@@ -34,7 +34,7 @@ _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0
 def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Find which of the four readings of the extrinsic the tracks follow, and take it."""
     sequence = evidence.sequence
-    if EXTRINSIC_IN_DOUBT not in sequence.provenance.facts:
+    if EXTRINSIC_UNCERTAIN not in sequence.provenance.facts:
         return None
     if evidence.intervals is None:
         return evidence.blind
@@ -45,8 +45,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     certainty = {name: mean_in_sigmas(logs[name] - logs[first]) for name in others}
     as_good = [name for name in others if not certainty[name] > AGAINST_SECOND]
     if len(as_good) == len(others):
-        return Undecided(f"the tracks follow every reading of the extrinsic alike, {first} and {as_good[0]} the best")
-    doubt = "".join(f"; it explains the motion as well {name} ({certainty[name]:.1f} sigma)" for name in as_good)
+        return Undecided(f"the tracks fit every reading of the extrinsic equally, best {first} and {as_good[0]}")
+    doubt = "".join(f"; {name} explains the motion equally well ({certainty[name]:.1f} sigma)" for name in as_good)
     for name in others:
         same_way = _turned_rad(readings[first], readings[name]) < SAME_WAY_RAD
         if not (same_way or name in as_good):
@@ -54,15 +54,18 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         share = _share(evidence.intervals, readings[first], readings[name])
         if share is not None:
             way = f"{share.value:.2f} +- {share.error:.2f} of the way from {first} to {name}"
-            doubt += f"; in turns the camera's velocity is {way}"
+            doubt += f"; during rotation the camera's velocity is {way}"
             first = name if share.value > 0.5 else first
         elif same_way:
-            doubt += f"; the camera looks the same way {name}, and there is too little rotation to tell where it is"
+            doubt += (
+                f"; {name} has the same orientation, and there is too little rotation to determine the camera's "
+                "position"
+            )
     each_px = ", ".join(f"{median_one_step_px(sequence, camera, T):.2f} px {name}" for name, T in readings.items())
     return Symptom(
         count=1,
         detail=f"one-step reprojection is {each_px}{doubt}",
-        treatment=f"the extrinsic is taken {first}",
+        treatment=f"the extrinsic is read {first}",
         remedy=_settled(sequence, readings[first], first),
         harmful=first != next(iter(readings)),
     )
@@ -110,8 +113,8 @@ def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
 
 def _settled(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
     """Return the sequence with this extrinsic, and without the fact that its convention is in doubt."""
-    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_IN_DOUBT)
-    provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is taken {reading}"))
+    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_UNCERTAIN)
+    provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is read {reading}"))
     return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
 
 

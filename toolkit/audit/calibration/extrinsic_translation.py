@@ -30,19 +30,21 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     share = way_gone(evidence.sequence, evidence.intervals, evidence.alignment, candidate - given)
     if is_excluded(share):
         return None
-    where = f"in turns the tracks put it {share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m) to"
+    where = (
+        f"by the tracks during rotation it is {share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m) to"
+    )
     if not is_there(share):
         summary = (
             f"the camera is at {metres(given)}, or at {metres(candidate)} if that is the translation of the inverse"
         )
-        return Undecided(f"{summary}: {where} there, and turns so few or wide tell no better")
+        return Undecided(f"{summary}: {where} there, and there is too little rotation to decide")
     return Symptom(
         count=1,
         detail=(
             f"the camera at {metres(given)} in the IMU frame is the translation of the inverse: {where} "
             f"{metres(candidate)}"
         ),
-        treatment="it is put there",
+        treatment="the camera's position is set to it",
         remedy=replace(evidence.sequence, rig=replace(rig, T_imu_cam=se3(rotation, candidate))),
     )
 

@@ -59,10 +59,10 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=len(faults),
         detail=(
-            f"{'; '.join(summary for _, summary in faults)}: the tracks miss the camera's own best motion by "
-            f"{given_px:.2f} px, and by {other_px:.2f} px with ordinary values"
+            f"{'; '.join(summary for _, summary in faults)}: the tracks' residuals against the best-fitting camera "
+            f"motion are {given_px:.2f} px, and {other_px:.2f} px with typical values"
         ),
-        treatment="the true ones are not in the data: mend K, or the pixels",
+        treatment="the true values are not in the data: correct K, or the pixels",
         remedy=None,
         spoils_vision=True,
     )
@@ -73,7 +73,7 @@ def _normalised(rig: StereoRig, low: Array, high: Array) -> Symptom:
     u, v = (f"{a:.2g} to {b:.2g}" for a, b in zip(low, high, strict=True))
     return Symptom(
         count=1,
-        detail=f"the sightings, u {u} and v {v}, are no pixels of fx_px = {rig.fx_px:g}: normalised image coordinates",
+        detail=f"the sightings, u {u} and v {v}, are not pixels of fx_px = {rig.fx_px:g}: normalised image coordinates",
         treatment="write fx_px u + cx_px and fy_px v + cy_px for them",
         remedy=None,
         spoils_vision=True,
@@ -98,7 +98,7 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
         summary = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
         found.append(({"fx_px": usual_px, "fy_px": usual_px}, summary))
     elif not 1.0 / MOST_STRETCHED < rig.fy_px / rig.fx_px < MOST_STRETCHED:
-        summary = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are not square by far"
+        summary = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are far from square"
         found.append(({"fy_px": rig.fx_px}, summary))
     return found
 
@@ -126,7 +126,7 @@ def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
 
 FAULT = Fault(
     "intrinsics",
-    "a principal point or a focal length that the sightings cannot have",
+    "a principal point or a focal length that is inconsistent with the sightings",
     check,
     after=("swapped-coordinates", "no-disparity", "time-order", "stale-frames", "doubled-disparity"),
 )

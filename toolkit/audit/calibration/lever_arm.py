@@ -52,7 +52,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     found, kind = _place(evidence), evidence.sequence.motion_kind
     if found is None or not (decidable := found.error_m < LARGEST_ERROR_M).any():
         errors = "" if found is None else f" to {', '.join(f'{error:.1f}' for error in found.error_m)} m"
-        return Undecided(f"too little rotation: where the camera is along x, y and z is not known{errors}")
+        return Undecided(f"too little rotation: the camera's position along x, y and z is not known{errors}")
     off = decidable & (np.abs(found.lacking_m) > found.least_m)
     if not off.any() and not found.slip:
         return _hidden(found, decidable, HIDDEN_M[kind])
@@ -63,8 +63,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom.warning(
         count=len(axes),
         detail=(
-            f"residuals turn with the vehicle: the camera is off by {', '.join(axes_m)} from {given}, where T_imu_cam "
-            f"has it{found.slip}"
+            f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} from {given}, its "
+            f"position in T_imu_cam{found.slip}"
         ),
         treatment=f"check the translation of T_imu_cam{other_point}",
     )
@@ -118,7 +118,7 @@ def _explains(way_m: Array, lacking_m: Array, cov_m2: Array) -> bool:
 
 FAULT = Fault(
     "lever-arm",
-    "a camera that stands elsewhere than the extrinsic says, as its turns show",
+    "a position of the camera that differs from the extrinsic's, as residuals during rotation show",
     check,
     after=("accelerometer-axes", "disagreement"),
 )

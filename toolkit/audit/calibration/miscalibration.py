@@ -82,7 +82,7 @@ def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> 
     if found is not None:
         doubt = doubtful(found, rig, kind) if kind == "imu" else None  # with odometry `steady_difference` reports it
         return _Calibration(wrong(found, rig, kind), "; ".join(filter(None, (doubt, hidden(found, kind)))) or None)
-    unseen = f"no tracks are seen for long enough beside the {BESIDE[kind]}"
+    unseen = f"no tracks are long enough to be compared with the {BESIDE[kind]}"
     return _Calibration([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
 
 
@@ -105,9 +105,11 @@ def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
 def _undecided(least_rad: float, by_velocity: bool) -> str | None:
     if least_rad < LARGEST_RAD:
         return None
-    cause = "what odometry slips by for seconds is no less" if by_velocity else "too little change of rotation"
-    hidden = "any turn of it" if not np.isfinite(least_rad) else f"a turn of it by less than {least_rad:.2f} rad"
-    return f"where the camera looks: {hidden} would not show, for {cause}"
+    cause = "wheel slip that lasts for seconds is as large" if by_velocity else "too little change of rotation"
+    hidden = (
+        "any rotation of it" if not np.isfinite(least_rad) else f"a rotation of it by less than {least_rad:.2f} rad"
+    )
+    return f"the camera's orientation: {hidden} would not show, for {cause}"
 
 
 def _is_off(ratio: Scalar, systematic: float) -> bool:
@@ -116,7 +118,7 @@ def _is_off(ratio: Scalar, systematic: float) -> bool:
 
 FAULT = Fault(
     "miscalibration",
-    "a camera turned a little against its extrinsic, or a scale that is a little off",
+    "a camera rotated slightly against its extrinsic, or a slight error of scale",
     check,
     after=("accelerometer-axes", "disagreement"),
 )

@@ -88,14 +88,14 @@ def _exchanged(alone: str) -> Symptom:
     if alone == _OWN:
         return Symptom(
             count=1,
-            detail="the gyro turns as the camera does, and the velocities go elsewhere, which no turn makes of both",
-            treatment=f"the velocities' channels are exchanged or have the wrong sign: set them right{MIRRORED}",
+            detail="the gyro agrees with the camera and the velocities do not, so no rotation of both corrects them",
+            treatment=f"the velocities' channels are exchanged or have the wrong sign: correct them{MIRRORED}",
             remedy=None,
         )
     return Symptom(
         count=1,
-        detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
-        treatment=f"channels of the samples are exchanged or have the wrong sign: set them right{MIRRORED}",
+        detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, so no rotation corrects all",
+        treatment=f"channels of the samples are exchanged or have the wrong sign: correct them{MIRRORED}",
         remedy=None,
         spoils_vision=True,
     )
@@ -111,13 +111,13 @@ def _readings(given: Array) -> tuple[Reading, ...]:
 def _of_body(given: Array, turn: Array) -> Reading:
     axes = axes_named(turn[:3, :3])
     cause = f"the motion samples' axes are the extrinsic's {axes}"
-    return Reading(turn @ given, axes, cause, "the extrinsic is turned to the samples' axes", given[:3, 3])
+    return Reading(turn @ given, axes, cause, "the extrinsic is rotated to the samples' axes", given[:3, 3])
 
 
 def _of_camera(given: Array, turn: Array) -> Reading:
     axes = axes_named(turn[:3, :3].T)
     cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
-    done = "the camera is turned in its place"
+    done = "the camera's rotation is corrected, its position is kept"
     return Reading(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
 
 
@@ -163,10 +163,12 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple
         return here, ""
     share = way_gone(turned, intervals, found, other - here)
     if is_there(share):
-        return other, f"; turns put the camera at {metres(other)} and not at {metres(here)}"
+        return other, f"; by rotations the camera is at {metres(other)} and not at {metres(here)}"
     if is_excluded(share):
         return here, ""
-    return here, f"; whether the camera is at {metres(here)}, as taken, or at {metres(other)}, turns do not tell"
+    return here, (
+        f"; too little rotation to decide whether the camera is at {metres(here)}, as assumed, or at {metres(other)}"
+    )
 
 
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from toolkit.geometry import Array
 
 # A mirror image of the scene reverses the turns about two axes and the motion along the third.
-MIRRORED = "; images that are mirrored look so too"
+MIRRORED = "; mirrored images have the same effect"
 
 
 def signed_axes() -> Array:

@@ -88,8 +88,8 @@ def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | 
     differences = [*of_rig, *_turn(found, by_chance), *of_right]
     if not differences:
         return None
-    said = "; ".join(one.summary for one in differences)
-    return f"{said}: that is more than chance and no more than in sound recordings"
+    summary = "; ".join(one.summary for one in differences)
+    return f"{summary}: that is more than chance and no more than in recordings without faults"
 
 
 def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
@@ -104,9 +104,9 @@ def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
     turn_rad = limits.turn_rad + limits.sigmas * float(found.error[TURN].max())
     parts += [f"a camera turned by {turn_rad:.2f} rad"] if turn_rad > limits.hidden_turn_rad else []
     right = _hidden_right(found, limits)
-    said = [f"too little rotation: {', '.join(parts)} would not show"] if parts else []
-    said += [f"too little motion across what is near: {' and '.join(right)} would not show"] if right else []
-    return "; ".join(said) or None
+    undetected = [f"too little rotation: {', '.join(parts)} would not show"] if parts else []
+    undetected += [f"too little motion sideways to near points: {' and '.join(right)} would not show"] if right else []
+    return "; ".join(undetected) or None
 
 
 def _hidden_right(found: SelfCalibration, limits: Limits) -> list[str]:
@@ -167,11 +167,11 @@ def _clock(found: SelfCalibration, limits: Limits) -> list[Wrong]:
 def _right_image(found: SelfCalibration, limits: Limits) -> list[Wrong]:
     value, least = found.value[RIGHT], np.array([limits.right_shift_px, limits.right_roll_rad])
     off, error = np.abs(value) > least + limits.sigmas * found.error[RIGHT], _with_systematic(found.error[RIGHT], least)
-    said = (
+    summaries = (
         f"the right image's columns are {value[0]:+.2f} +- {error[0]:.2f} px off",
         f"the right camera looks rolled about its optical axis by {value[1]:+.4f} +- {error[1]:.4f} rad",
     )
-    return [Wrong(said[k], "the rectification of the pair") for k in np.flatnonzero(off).tolist()]
+    return [Wrong(summaries[k], "the rectification of the pair") for k in np.flatnonzero(off).tolist()]
 
 
 def _with_systematic(error: Array, limit: Array | float) -> Array:

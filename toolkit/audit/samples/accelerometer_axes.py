@@ -65,10 +65,10 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=1,
         detail=(
-            f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: of the change of the camera's "
-            f"velocity the samples leave {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 then (median)"
+            f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: the residual against the camera's "
+            f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 then (median)"
         ),
-        treatment=f"its channels are exchanged or have the wrong sign: set them right{MIRRORED}",
+        treatment=f"its channels are exchanged or have the wrong sign: correct them{MIRRORED}",
         remedy=None,
         spoils_vision=True,
     )

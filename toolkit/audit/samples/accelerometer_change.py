@@ -17,7 +17,7 @@ from toolkit.resampling import NS_PER_S
 # standard errors and a share of gravity, a larger one unless the errors of the tracks are independent. Beyond five
 # standard errors, parts of sound recordings at hand have 0.3 % at most, and simulated flights whose tracks drift from
 # image to image 0.8 %. Chosen with them in view.
-CUTS, SIGMAS, SYSTEMATIC, BY_CREEP = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
+CUTS, SIGMAS, SYSTEMATIC, BY_TRACK_DRIFT = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
 # Length (s) of the windows in which gravity is read, short enough for the gyro's drift to be negligible, and the least
 # number of intervals of a window.
 WINDOW_S, LEAST_INTERVALS = 4.0, 12
@@ -38,11 +38,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     found = {share: step for share, step in steps.items() if step is not None}
     gravity = float(np.linalg.norm(sequence.gravity_world))
     if not found:
-        return Undecided("too few intervals whose camera motion is known, to read gravity before and after")
+        return Undecided("too few intervals whose camera motion is known, to estimate gravity before and after")
     share, step = max(found.items(), key=lambda one: abs(one[1].value) / one[1].error)
     least = SYSTEMATIC * gravity + SIGMAS * step.error
     if abs(step.value) > least and not errors_are_independent(evidence.step_correlation):
-        least = BY_CREEP * gravity + SIGMAS * step.error
+        least = BY_TRACK_DRIFT * gravity + SIGMAS * step.error
     if abs(step.value) < least:
         hidden = least / gravity
         return None if hidden < LARGEST_HIDDEN else Undecided(f"a change by less than {hidden:.0%} would not show")
@@ -52,7 +52,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
             f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before"
         ),
-        treatment="its range or its scale have changed, or it was knocked: no one bias holds for the recording",
+        treatment="its range or its scale have changed, or it was knocked: no constant bias describes the recording",
     )
 
 

@@ -51,14 +51,14 @@ def check(evidence: Evidence) -> Symptom | None:
         if worst.rounding > MOST_SHARE * worst.stated:
             found.append(
                 f"{name} come in steps of {worst.step:.3g} {unit}, which adds errors of {worst.rounding:.2g} to the "
-                f"{worst.stated:.2g} {unit} that are stated of a sample"
+                f"{worst.stated:.2g} {unit} stated for a sample"
             )
     if not found:
         return None
     return Symptom.warning(
         count=len(found),
         detail="; ".join(found),
-        treatment="write all the digits that the sensor has, or state noise that holds the rounding",
+        treatment="write all the digits that the sensor has, or state noise that includes the rounding",
     )
 
 
@@ -80,7 +80,7 @@ def _step(column: Array) -> float:
 
 FAULT = Fault(
     "coarse-samples",
-    "motion samples that come in steps, whose rounding is no little part of the stated noise",
+    "quantised motion samples, whose rounding is a considerable part of the stated noise",
     check,
     after=("units", "stuck-samples", "implausible", "saturated-samples"),
 )

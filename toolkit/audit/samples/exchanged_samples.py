@@ -33,8 +33,8 @@ def check(evidence: Evidence) -> Symptom | None:
         names = ("accelerations", "rates of rotation")
     return Symptom(
         count=len(sequence.motion.values),
-        detail=f"{names[0]} and {names[1]} are exchanged: {_sizes(sequence)}, and the other way round they fit",
-        treatment="exchanged again",
+        detail=f"{names[0]} and {names[1]} are exchanged: {_sizes(sequence)}, which are plausible the other way round",
+        treatment="exchanged back",
         remedy=exchanged,
     )
 
@@ -76,7 +76,7 @@ def _sizes(sequence: Sequence) -> str:
 
 FAULT = Fault(
     "exchanged-samples",
-    "velocities, or accelerations, and rates of rotation in each other's place",
+    "velocities, or accelerations, exchanged with rates of rotation",
     check,
     after=("intrinsics", "swapped-coordinates", "no-disparity", "outside-motion"),
 )

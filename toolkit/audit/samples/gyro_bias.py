@@ -60,15 +60,15 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if prior is None and _is_too_much(evidence.sequence, bias_radps, error_radps):
         return Symptom(
             count=int(biased.sum()),
-            detail=f"{detail}, more than estimators expect that begin with none",
-            treatment="it is taken off",
+            detail=f"{detail}, more than expected by estimators that start without a bias",
+            treatment="it is subtracted",
             remedy=_taken_off(evidence.sequence, bias_radps),
         )
     if prior is None or not denied.any():
         return Symptom.information(
             count=int(biased.sum()),
             detail=detail,
-            treatment="left to the estimators, which carry a gyro bias",
+            treatment="left to the estimators, which estimate a gyro bias",
         )
     stated = ", ".join(f"{b:z.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
     return Symptom(
@@ -130,7 +130,7 @@ def _fitted(evidence: Evidence) -> _Reading | None:
     if found is None:
         return None
     error_radps = np.hypot(found.error[GYRO_BIAS], SYSTEMATIC_FIT)
-    return _Reading(found.value[GYRO_BIAS], error_radps, "the bias by which tracks and IMU fit")
+    return _Reading(found.value[GYRO_BIAS], error_radps, "the bias for which tracks and IMU agree")
 
 
 def _against_camera(evidence: Evidence) -> _Reading | None:

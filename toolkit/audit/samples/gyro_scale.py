@@ -43,16 +43,16 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             continue
         beyond = abs(found.value - 1.0) - SIGMAS * found.error
         if beyond > 0.0:
-            said = f"{found.value:.3f} +- {found.error:.3f} times as fast as the camera about {axis}"
-            (off if beyond > SYSTEMATIC else doubtful).append(said)
+            excess = f"{found.value:.3f} +- {found.error:.3f} times as fast as the camera about {axis}"
+            (off if beyond > SYSTEMATIC else doubtful).append(excess)
     if off:
         return Symptom.warning(
             count=len(off),
             detail=f"the gyro turns {', '.join(off)}",
-            treatment="check the scale of each of its axes; no estimator carries one",
+            treatment="check the scale of each of its axes; no estimator estimates it",
         )
     if doubtful:
-        within = f"by less than {100.0 * SYSTEMATIC:g} % beyond chance, as tracks that creep make it seem"
+        within = f"by less than {100.0 * SYSTEMATIC:g} % beyond chance, which drifting tracks can cause"
         return Undecided(f"the gyro turns {', '.join(doubtful)}, {within}")
     return None
 
@@ -86,7 +86,7 @@ def _inverse_slope(measured: Array, seen: Array) -> float:
 
 FAULT = Fault(
     "gyro-scale",
-    "an axis of the gyro that turns faster or slower than the camera",
+    "an axis of the gyro that measures faster or slower rotation than the camera",
     check,
     after=("accelerometer-axes", "disagreement"),
 )

@@ -50,7 +50,7 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=int(sightings.sum() + samples.sum()),
         detail=(
-            f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) are beyond anything a sensor gives, "
+            f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) are beyond the range of any sensor, "
             f"up to {_largest(sequence, sightings, samples):.3g}"
         ),
         treatment="dropped; the neighbouring motion samples bridge the interval",
@@ -111,7 +111,7 @@ def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> fl
 
 FAULT = Fault(
     "implausible",
-    "single sightings or motion samples beyond anything a sensor gives",
+    "single sightings or motion samples beyond the range of any sensor",
     check,
     after=("not-finite", "time-order"),
 )

@@ -29,7 +29,7 @@ def check(evidence: Evidence) -> Symptom | None:
     detail = f"{bad_sightings} sighting(s) and {bad_samples} motion sample(s) are not finite"
     detail += f" ({', '.join(empty)} in all of them)" if empty else ""
     if bad_samples and not samples.any():
-        why = "no motion sample is left: look at who wrote them"
+        why = "no motion sample is left: check the program that wrote them"
         return Symptom(bad_sightings + bad_samples, detail, why, remedy=None, spoils_vision=True)
     remedy = sequence
     if bad_sightings:

@@ -44,8 +44,8 @@ def check(evidence: Evidence) -> Symptom | None:
         count=len(findings),
         detail="; ".join(findings),
         treatment=(
-            "estimators told so hardly use the IMU: check its noise (imu0/sensor.yaml, imu.yaml), which is a density "
-            "for one sample a second"
+            "estimators given this noise hardly use the IMU: check it (imu0/sensor.yaml, imu.yaml); it is a "
+            "density, the standard deviation at one sample a second"
         ),
     )
 
@@ -60,13 +60,16 @@ def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
         error = found / np.sqrt(len(values))
         if stated > MOST_WHITE * found and found > 0.0:
             yield (
-                f"{name}_noise_density makes samples scatter by {stated:.3g} {unit}, and they do by {found:.2g} "
+                f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and measured are {found:.2g} "
                 f"+- {error:.1g}"
             )
         stated = getattr(noise, f"{name}_random_walk") * np.sqrt(lag_s)
         found = _moved(t_s, values[:, columns], lag_s)
         if stated > MOST_WALK * found > 0.0:
-            yield f"{name}_random_walk moves them by {stated:.3g} {unit} in {lag_s:.3g} s, and they move by {found:.3g}"
+            yield (
+                f"by {name}_random_walk they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are "
+                f"{found:.3g}"
+            )
 
 
 def _moved(t_s: Array, values: Array, lag_s: float) -> float:
@@ -78,7 +81,7 @@ def _moved(t_s: Array, values: Array, lag_s: float) -> float:
 
 FAULT = Fault(
     "overstated-noise",
-    "an IMU whose stated noise is far more than its samples have",
+    "an IMU whose stated noise is far larger than that of its samples",
     check,
     after=("units", "saturated-samples", "stuck-samples"),
 )

@@ -32,8 +32,8 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     return Symptom.warning(
         count=int(rows.sum()),
-        detail=f"samples pile up at the end of a range: {', '.join(findings)}",
-        treatment="what was beyond is lost: use a sensor of a larger range",
+        detail=f"samples accumulate at the end of a range: {', '.join(findings)}",
+        treatment="values beyond it are lost: use a sensor of a larger range",
     )
 
 
@@ -47,7 +47,7 @@ def _at_range_end(column: Array) -> BoolArray:
 
 FAULT = Fault(
     "saturated-samples",
-    "an accelerometer or a gyro at the end of its range",
+    "an accelerometer or a gyro that is saturated",
     check,
     after=("not-finite", "implausible", "stuck-samples"),
 )

@@ -55,7 +55,7 @@ def check(evidence: Evidence) -> Symptom | None:
         count=int(stuck.sum()),
         detail=", ".join(f"the {name} repeats one value for {time:.3g} s" for name, time in seconds.items() if time),
         treatment=(
-            "too much to be bridged: look at the driver and the cables"
+            "too long to be bridged: check the driver and the cables"
             if too_many
             else "repeated samples are dropped; the others bridge the gap"
         ),
@@ -88,7 +88,7 @@ def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Sy
     return Symptom(
         count=int(np.logical_or.reduce([rows for _, rows in found]).sum()),
         detail=", ".join(f"the {name} repeats one value for {rows.sum() * step_s:.3g} s" for name, rows in found),
-        treatment="what it should have read is not known: look at the driver and the cables (samples carry noise)",
+        treatment="the true values are unknown: check the driver and the cables (real samples have noise)",
         remedy=None,
     )
 
@@ -122,7 +122,7 @@ def _never_moves(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=len(values),
         detail=", and ".join(findings),
-        treatment="they were not recorded: look at the driver and the cables",
+        treatment="they were not recorded: check the driver and the cables",
         remedy=None,
         spoils_vision=True,
     )

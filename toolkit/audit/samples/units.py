@@ -73,7 +73,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom(
         count=len(found),
         detail="; ".join(wrong.summary for wrong in found),
-        treatment="converted to SI" if certain else "no one unit fits it all: mend the recording",
+        treatment="converted to SI" if certain else "no single unit fits all of it: correct the recording",
         remedy=now.sequence if certain else None,
         spoils_vision=True,
     )
@@ -92,8 +92,8 @@ def _stamps(evidence: Evidence) -> _Wrong | None:
         return None
     return _Wrong(
         f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and their rate of rotation {rotation.value:.3g} "
-        f"+- {rotation.error:.1g} times the camera's: in the stamps time passes {speed.value:.3g} times as fast as it "
-        "did, so that they are not in seconds",
+        f"+- {rotation.error:.1g} times the camera's: the stamps run {speed.value:.3g} times as fast as "
+        "time, so they are not in seconds",
         None,
     )
 
@@ -105,7 +105,9 @@ def _frame_rate(evidence: Evidence) -> _Wrong | None:
     step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
     if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
         return None
-    return _Wrong(f"by the stamps frames come every {step_s:.2g} s, as no camera's do: they are not in seconds", None)
+    return _Wrong(
+        f"by the stamps frames come every {step_s:.2g} s, which no camera does: they are not in seconds", None
+    )
 
 
 def _baseline(evidence: Evidence) -> _Wrong | None:

@@ -24,19 +24,19 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     found = _fitted(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
     if found is None:
-        return Undecided("too little change of rotation in half of the recording: whether clocks keep pace is unknown")
+        return Undecided("too little change of rotation in half of the recording: whether the clocks drift is unknown")
     change_s, error_s = found.value, found.error
     least_s = least_change_s(evidence.sequence, error_s)
     if least_s > LARGEST_S:
-        known = f"clocks that part by less than {least_s:.2g} s between the halves would not show"
+        known = f"a change of the offset by less than {least_s:.2g} s between the halves would not show"
         return Undecided(f"too little change of rotation: {known}")
     if abs(change_s) < least_s:
         return None
     return Symptom.warning(
         count=1,
         detail=(
-            f"frames and motion samples part by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from the first half of "
-            "the recording to the second"
+            f"the offset of frames and motion samples changes by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from "
+            "the first half of the recording to the second"
         ),
         treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
     )
@@ -57,7 +57,7 @@ def _fitted(evidence: Evidence, intervals: Intervals) -> Scalar | None:
 
 FAULT = Fault(
     "clock-change",
-    "clocks of frames and motion samples that part during the recording",
+    "clocks of frames and motion samples that drift apart during the recording",
     check,
     after=("time-offset",),
 )

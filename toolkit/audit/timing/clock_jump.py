@@ -66,8 +66,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     jumps = [step for step in steps if step.is_jump]
     if not jumps:
         open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
-        summary = f"the stamps of frames and samples leap together by {', '.join(open_s)}"
-        return Undecided(f"{summary}: the tracks do not tell whether time passed") if open_s else None
+        summary = f"the stamps of frames and samples jump together by {', '.join(open_s)}"
+        return Undecided(f"{summary}: the tracks do not determine whether time passed") if open_s else None
     usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     jumps_text = [
         f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
@@ -171,6 +171,6 @@ def _longest_stretch(sequence: Sequence, jumps: list[_Step]) -> Sequence:
 
 FAULT = Fault(
     "clock-jump",
-    "a clock that is set on the way, by more or less than a step, while the vehicle goes on",
+    "a clock that is set during the recording, by more or less than a step, while the vehicle moves on",
     check,
 )

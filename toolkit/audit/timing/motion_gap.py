@@ -20,7 +20,7 @@ from toolkit.sequence import Sequence
 
 # Least number of measured stretches that are interpolated. With fewer, the variance of the samples is taken as the
 # error of the interpolation.
-LEAST_TRIALS = 5
+LEAST_STRETCHES = 5
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -39,8 +39,8 @@ def check(evidence: Evidence) -> Symptom | None:
         count=rows.size,
         detail=f"{rows.size} gap(s) in the motion samples, the longest of {longest_s:.3g} s",
         treatment=(
-            f"bridged by straight lines, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times the noise "
-            "there, as bridges over measured stretches need"
+            f"bridged by linear interpolation, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times "
+            "the noise there, as measured stretches bridged likewise need"
         ),
         remedy=replace(
             sequence,
@@ -69,9 +69,9 @@ def _holes(sequence: Sequence) -> tuple[IntArray, float]:
 def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
     """Return the factors (2,) on the noise, linear and angular, of an interpolation over so many steps."""
     values, step_s = sequence.motion.values, usual_ns / NS_PER_S
-    trials = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
-    if trials.size >= LEAST_TRIALS:
-        stretch = values[trials[:, None] + np.arange(steps + 1)]  # (W, steps + 1, 6)
+    stretches = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
+    if stretches.size >= LEAST_STRETCHES:
+        stretch = values[stretches[:, None] + np.arange(steps + 1)]  # (W, steps + 1, 6)
         share = np.linspace(0.0, 1.0, steps + 1)[:, None]
         line = stretch[:, :1] * (1.0 - share) + stretch[:, -1:] * share
         summed = step_s * np.cumsum(stretch - line, axis=1)[:, 1:]
@@ -118,7 +118,7 @@ def _with(before: Bridges | None, new: Bridges) -> Bridges:
 
 FAULT = Fault(
     "motion-gap",
-    "short holes in the motion samples",
+    "short gaps in the motion samples",
     check,
     after=("time-gap", "units", "mixed-axes"),
 )

@@ -27,14 +27,16 @@ def check(evidence: Evidence) -> Symptom | None:
         return Symptom(
             count=int(sequence.motion.t_ns.size),
             detail=detail,
-            treatment="so few tell nothing, as of stamps in another unit than the frames': check both",
+            treatment="too few to be used, as where their stamps are in another unit than the frames': check both",
             remedy=None,
             spoils_vision=True,
         )
     return Symptom.warning(
         count=int(sequence.motion.t_ns.size),
         detail=detail,
-        treatment="between two samples the motion is a straight line, whose error no stated noise holds",
+        treatment=(
+            "between two samples the motion is interpolated linearly, with an error that no stated noise includes"
+        ),
     )
 
 

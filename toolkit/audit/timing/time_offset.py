@@ -76,7 +76,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
         return Symptom.warning(
             count=1,
-            detail=f"{seen}, but then the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is off",
+            detail=(
+                f"{seen}, but then the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
+            ),
             treatment="stamp rates of rotation and velocities by one clock, the camera's",
         )
     return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
@@ -137,7 +139,7 @@ def _doubtful(sequence: Sequence, found: Scalar) -> Undecided | None:
     late = "late" if found.value < 0.0 else "early"
     seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
     return Undecided(
-        f"frames look as if stamped {late} by {seen}, too little change of rotation to tell that from chance"
+        f"frames look as if stamped {late} by {seen}, too little change of rotation to distinguish that from chance"
     )
 
 
@@ -157,9 +159,9 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     return Symptom.warning(
         count=1,
         detail=(
-            f"twists come as often as frames, and each frame {1e3 * late_s:.0f} ms after one: a camera's clock that is "
-            f"to be shifted by {shifts} ms looks so; by the tracks it is {1e3 * offset.value:+.0f} +- "
-            f"{1e3 * offset.error:.0f} ms, which does not tell that from none"
+            f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the "
+            f"camera's clock were to be shifted by {shifts} ms; by the tracks the offset is "
+            f"{1e3 * offset.value:+.0f} +- {1e3 * offset.error:.0f} ms, which is consistent with zero as well"
         ),
         treatment="if frames and twists were taken together, give them the same stamps",
     )

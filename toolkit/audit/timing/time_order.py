@@ -31,7 +31,7 @@ def check(evidence: Evidence) -> Symptom | None:
         why = "most are equal to the one before them, as stamps are that were rounded: write them with all their digits"
         return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
     if max(map(_share_back, _streams(sequence))) > MOST_LATE:
-        why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
+        why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
         return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
     jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
     if jumps_s:
@@ -40,7 +40,7 @@ def check(evidence: Evidence) -> Symptom | None:
         treatment = f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames"
         return Symptom(count=frames + samples, detail=detail, treatment=treatment, remedy=remedy)
     if max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
-        why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
+        why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
         return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
     return Symptom(
         count=frames + samples,

@@ -44,10 +44,11 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom.warning(
         count=1,
         detail=(
-            f"the steps of the frames are off the usual one by {typical_ms:.2g} ms (median), and of that the camera's "
-            f"motion follows {found.value:.2f} +- {found.error:.2f}, where it should follow all"
+            f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the "
+            f"camera's motion shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should "
+            "show all"
         ),
-        treatment="images come more evenly than their stamps: stamp them when they are exposed",
+        treatment="images are taken at more even intervals than stamped: stamp them when they are exposed",
     )
 
 
@@ -85,7 +86,7 @@ def _share(regressor: Array, response: Array) -> float:
 
 FAULT = Fault(
     "uneven-stamps",
-    "frames whose stamps come unevenly while the images do not",
+    "frames whose stamps are uneven although the images were taken evenly",
     check,
     after=("stale-frames", "time-gap", "intrinsics", "swapped-coordinates", "no-disparity", "doubled-disparity"),
 )

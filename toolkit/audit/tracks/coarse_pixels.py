@@ -31,8 +31,8 @@ def check(evidence: Evidence) -> Symptom | None:
     rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
     return Symptom(
         count=len(seen_px),
-        detail=f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px that are stated of uL",
-        treatment="write them with all the digits that the tracker has; far points suffer most",
+        detail=f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL",
+        treatment="write them with all the digits that the tracker has; depths of far points suffer most",
         remedy=None,
         harmful=False,
         warns=bool(rounding_px > MOST_SHARE * stated_px),

@@ -27,16 +27,16 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom.information(
         count=1,
         detail=(
-            f"the errors of a track's sightings go together: from one step to the next their correlation is "
-            f"{value:+.2f} +- {error:.2f}, where it is -0.5 if each errs by itself; to count them as white is too sure"
+            f"the errors of a track's sightings are correlated: from one step to the next by {value:+.2f} "
+            f"+- {error:.2f}, where independent errors have -0.5; to assume white noise is overconfident"
         ),
-        treatment="'vislam card' shows how, noise.tracks=fitted tells them",
+        treatment="'vislam card' shows the correlation, noise.tracks=fitted models it",
     )
 
 
 FAULT = Fault(
     "correlated-tracks",
-    "tracks whose sightings do not err each by itself, as estimators are told unless a setting says otherwise",
+    "tracks whose sightings have correlated errors, where estimators assume independent ones unless set otherwise",
     check,
     after=("track-scatter",),
 )

@@ -44,7 +44,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     stay = [k for k in jumps.tolist() if _stays(intervals, sequence.rig.T_imu_cam, k, turn_rad[k])]
     places = [f"{frame_s[intervals.interval[k]]:.1f} s (by {angle_rad[k]:.3f} rad)" for k in stay or jumps.tolist()]
     if not stay:
-        return Undecided(f"the camera jumps at {', '.join(places)}, and its velocity does not show that it stays so")
+        return Undecided(
+            f"the camera jumps at {', '.join(places)}, and its velocity does not show whether the change is permanent"
+        )
     return Symptom.warning(
         count=len(stay),
         detail=f"the image jumps, and not the vehicle, at {', '.join(places)}",
@@ -77,7 +79,7 @@ def _share_that_stays(intervals: Intervals, v_mps: Array, T_imu_cam: Array, k: i
 
 FAULT = Fault(
     "image-jump",
-    "an image that jumps without the vehicle and stays so",
+    "an image that jumps, permanently, while the vehicle does not",
     check,
     after=("mixed-axes", "twist-lag", "time-offset"),
 )

@@ -14,7 +14,7 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=count,
         detail=f"{count} of {len(uv_px)} sightings ({count / len(uv_px):.0%}) lack the right image",
-        treatment="without any disparity, depths hang on the motion alone" if none_else else "used for uL and v",
+        treatment="without any disparity, depths depend on the motion alone" if none_else else "used for uL and v",
         remedy=None,
         harmful=False,
         warns=none_else,

@@ -12,9 +12,9 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=sequence.frame_count,
         detail=f"none of {sequence.frame_count} frames has a stereo sighting",
-        treatment="nothing can be compared but dead reckoning: look for the lost tracks",
+        treatment="only dead reckoning can be compared: check the tracker that made the recording",
         remedy=None,
     )
 
 
-FAULT = Fault("no-sightings", "frames without any sighting, where a camera should have seen something", check)
+FAULT = Fault("no-sightings", "frames none of which has a sighting, in a recording with a camera", check)

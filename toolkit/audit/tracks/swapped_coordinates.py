@@ -59,15 +59,15 @@ def check(evidence: Evidence) -> Symptom | None:
     apart_px, noise_px = float(np.nanmedian(np.abs(disparity))), float(np.sqrt(sequence.rig.cov_uv_px2[0, 0]))
     if apart_px < ROW_SIGMAS * noise_px and share < 1.0 - SUSPECT_SHARE:
         detail += f" and uL differs from uR by {apart_px:.1f} px only, as the rows of a pair do: u and v are exchanged"
-        why = "the depth is lost with the exchange: mend the file"
+        why = "the depth is lost with the exchange: correct the file"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
     explained = [remedy for remedy in _reordered(sequence) if _is_sound(remedy[1])]
     if len(explained) != 1:
-        why = "no order of the coordinates makes the tracks follow the measured motion: mend the file"
+        why = "no order of the coordinates makes the tracks agree with the measured motion: correct the file"
         detail += ": left and right, or u and v, are exchanged"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
     order_name, remedy = explained[0]
-    treatment = "exchanged again, and the tracks follow the measured motion"
+    treatment = "exchanged back, and the tracks agree with the measured motion"
     return Symptom(count, f"{detail}: {order_name}", treatment, remedy, spoils_vision=True)
 
 
@@ -88,9 +88,13 @@ def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
         count=count,
         detail=(
             f"{count} of {len(exchanged)} sightings ({count / len(exchanged):.0%}), whole tracks, have a uL that "
-            "differs from uR as the rows of a pair do, and follow the camera's own motion only if u and v are exchanged"
+            "differs from uR as the rows of a pair do, and agree with the camera's own motion only if u and v are "
+            "exchanged"
         ),
-        treatment=f"the depth is lost with the exchange: these and what else is like rows dropped ({candidates.sum()})",
+        treatment=(
+            "the depth is lost with the exchange: these and all others that look like rows dropped "
+            f"({candidates.sum()})"
+        ),
         remedy=replace(sequence, observations=sequence.observations.select(~candidates)),
     )
 
@@ -169,7 +173,7 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
         return Symptom(
             count=int(same.sum()),
             detail=f"{int(same.sum())} {of_all} have a uR that equals uL: one camera's columns stand for both",
-            treatment="without the right image there is no depth: mend the file, or leave uR empty",
+            treatment="without the right image there is no depth: correct the file, or leave uR empty",
             remedy=None,
             spoils_vision=True,
         )
@@ -225,7 +229,7 @@ def _is_sound(sequence: Sequence) -> bool:
 def _order_name(order: tuple[int, ...]) -> str:
     if order == (1, 0, 2):
         return "left and right are exchanged"
-    return f"they stand in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
+    return f"they are in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
 
 
 def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:

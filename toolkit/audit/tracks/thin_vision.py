@@ -28,7 +28,7 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom.warning(
         count=len(spans),
         detail=(
-            f"the tracks do not tell how the camera moves for {share:.0%} of the time, the longest at "
+            f"the tracks do not determine the camera's motion for {share:.0%} of the time, the longest at "
             f"{frame_s[longest[0]]:.1f}-{frame_s[longest[1]]:.1f} s ({seen:.1f} sightings a frame over all)"
         ),
         treatment="there every estimate rests on the motion samples, or on a few tracks that may be wrong",
@@ -44,7 +44,7 @@ def _runs(marked: BoolArray) -> list[tuple[int, int]]:
 
 FAULT = Fault(
     "thin-vision",
-    "too few tracks to tell how the camera moves, for half a second or more",
+    "too few tracks to determine the camera's motion, for half a second or more",
     check,
     after=("no-sightings", "stale-frames", "no-disparity", "time-gap", "intrinsics", "units"),
 )

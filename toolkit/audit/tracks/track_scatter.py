@@ -65,10 +65,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return _tail(chi2) or _overstated(evidence, scatter, error)
     cause = "mismatches, points that move, or noise stated too small"
     if SAME_RATIO[0] < _nearer_scatter(chi2) / scatter < SAME_RATIO[1]:
-        cause = f"near and far ones alike, so that the noise is stated {scatter:.3g} times too small"
+        cause = f"near and far ones equally, so the noise is stated {scatter:.3g} times too small"
     return _symptom(
         f"{_scatters(evidence, scatter, error)}; {np.mean(chi2 > FAR_CHI2):.0%} are beyond chance",
-        f"{cause}: estimators trust such tracks too much",
+        f"{cause}: estimators give such tracks too much weight",
     )
 
 
@@ -90,16 +90,14 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     if scatter + SIGMAS * error > least:
         return None
     times = f"{1.0 / scatter:.2g}" if scatter > 0.1 else f"{1.0 / scatter:.0f}"
-    cause = f"the noise is stated {times} times too large, or the errors last along whole tracks"
+    cause = f"the noise is stated {times} times too large, or the errors are constant along tracks"
     if not independent:
-        cause = f"the noise is stated too large, by less than {times} times as the errors go together between frames"
-    symptom = _symptom(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
+        cause = f"the noise is stated too large, by less than {times} times as the errors are correlated between frames"
+    symptom = _symptom(_scatters(evidence, scatter, error), f"{cause}: estimators give such tracks too little weight")
     if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
         return symptom
     # This noise was not stated: it is the one assumed where a recording states none.
-    assumed = (
-        f"{symptom.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px states it"
-    )
+    assumed = f"{symptom.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px sets it"
     return replace(symptom, treatment=assumed, warns=False)
 
 
@@ -130,8 +128,8 @@ def _tail(chi2: Array) -> Symptom | None:
 
 def _mismatched(share: str, than: str) -> Symptom:
     return _symptom(
-        f"from frame to frame {share} of the sightings miss by more than {than}",
-        "mismatches, exchanged ids, or points that move: estimators must refuse as many",
+        f"from frame to frame {share} of the sightings have residuals of more than {than}",
+        "mismatches, exchanged ids, or points that move: estimators must reject as many",
     )
 
 

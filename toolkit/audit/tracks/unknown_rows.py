@@ -14,7 +14,9 @@ def check(evidence: Evidence) -> Undecided | None:
     sequence = evidence.sequence
     if ONE_ROW_FOR_BOTH not in sequence.provenance.facts or is_left_only(sequence.observations.uv_px).all():
         return None
-    return Undecided(f"{ONE_ROW_FOR_BOTH}: that left and right agree in rows, as rectified pairs do, it does not show")
+    return Undecided(
+        f"{ONE_ROW_FOR_BOTH}: whether left and right agree in rows, as rectified pairs do, cannot be checked"
+    )
 
 
-FAULT = Fault("unknown-rows", "rows of left and right that may differ, of a file that has one for both", check)
+FAULT = Fault("unknown-rows", "rows of left and right image that may differ, in a file with one for both", check)

@@ -42,15 +42,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     largest = int(np.argmax(np.abs(measured)))
     axis[largest] = np.sign(measured[largest])
     measured_text, given_text = _rounded(measured), _rounded(given)
-    summary = f"the samples fall along {measured_text} m/s^2 of the truth's world, and gravity_world is {given_text}"
+    summary = f"by the samples gravity is {measured_text} m/s^2 in the truth's world, and gravity_world is {given_text}"
     certain = _angle_deg(axis, measured) < NEAR_AXIS_DEG
     gravity_world = (size_mps2 if size_mps2 > 0.0 else STANDARD_MPS2) * axis
     return Symptom(
         count=1,
         detail=summary,
-        treatment=f"it is set to {_rounded(gravity_world)}"
-        if certain
-        else "no axis of the world is near: set it right",
+        treatment=f"it is set to {_rounded(gravity_world)}" if certain else "no axis of the world is near: correct it",
         remedy=replace(sequence, gravity_world=gravity_world) if certain else None,
     )
 
@@ -88,7 +86,7 @@ def _rounded(vector: Array) -> str:
 
 FAULT = Fault(
     "gravity-direction",
-    "gravity that points elsewhere in the truth's world than an IMU shows",
+    "gravity whose direction in the truth's world differs from the IMU's",
     check,
     after=("accelerometer-axes", "time-offset"),
 )

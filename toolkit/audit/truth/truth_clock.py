@@ -27,7 +27,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             f"the camera turns as the truth does when time passes {1.0 + rate.value:.4f} +- {rate.error:.4f} times as "
             "fast by the truth's stamps as by the frames'"
         ),
-        treatment="stamp both by one clock: position errors hold the way that is gone in the time by which they part",
+        treatment=(
+            "stamp both by one clock: position errors include the distance moved in the time by which they differ"
+        ),
     )
 
 
@@ -37,7 +39,7 @@ def _unseen(apart_s: float) -> Undecided | None:
     hidden = f"one that is off by less than {apart_s:.2g} s would not show"
     if apart_s == float("inf"):
         hidden = "whether it is the frames' is unknown"
-    return Undecided(f"too little change of rotation to tell the truth's clock: {hidden}")
+    return Undecided(f"too little change of rotation to determine the truth's clock: {hidden}")
 
 
 FAULT = Fault(

@@ -50,7 +50,9 @@ LEAST_APART, TIMES_NEARER = 0.1, 3.0
 # (`units`).
 LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
-_OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
+_OTHER = (
+    "check that the truth is this recording's, in order and in the axes it is read in; do not rely on errors against it"
+)
 
 _AXES = "write the truth in the axes it is read in: the world's, z upwards, and the body's that the samples have"
 
@@ -81,8 +83,8 @@ def _broken(truth: Truth) -> Symptom | None:
     row = int(np.argmax(np.where(leaps, step_m, 0.0)))
     at_s = (truth.t_ns[row] - truth.t_ns[0]) / NS_PER_S
     return _symptom(
-        f"the truth leaps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
-        "cut it there, or leave the pose out: every position error holds the leap",
+        f"the truth jumps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
+        "cut it there, or leave the pose out: every position error includes the jump",
     )
 
 
@@ -102,7 +104,7 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     if turned.sum() >= max(LEAST_WINDOWS, LEAST_TURNING * moved.sum()):
         off["turns"] = off_by(both.turned_rad[:, turned])
     elsewhere = {
-        how: f"it {how} otherwise, by {100.0 * share.value:.0f} +- {100.0 * share.error:.0f} % of the larger of both"
+        how: f"it {how} differently, by {100.0 * share.value:.0f} +- {100.0 * share.error:.0f} % of the larger of both"
         for how, share in off.items()
         if share.value - share.by_chance > MOST_OFF
     }
@@ -122,7 +124,8 @@ def _doubtful(scale: Compared) -> Undecided | None:
         return None
     return Undecided(
         f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's, which is more than chance and "
-        "no more than in sound recordings: the truth's unit, the baseline or the focal length may be off by it"
+        "no more than in recordings without faults: the truth's unit, the baseline or the focal length may be off "
+        "by it"
     )
 
 
@@ -138,7 +141,7 @@ def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
     return _symptom(
         f"the truth stands still in {apart.sum()} of {moved.size} windows of {WINDOW_S:g} s in which the camera moves "
         f"at {speed_mps:.2g} m/s",
-        "it is no truth of this motion, or was frozen: leave it out, for errors and consistency against it say nothing",
+        "it is no truth of this motion, or was frozen: leave it out; errors and consistency against it are meaningless",
     )
 
 
@@ -152,9 +155,9 @@ def _looking_one_way(truth: Truth, both: Windows) -> Symptom | None:
     if np.ptp(truth.T_world_imu[:, :3, :3], axis=0).max() > 0.0 or turns.sum() < LEAST_WINDOWS:
         return None
     return _symptom(
-        f"all orientations of the truth are one, and in {turns.sum()} of {turns.size} windows of {WINDOW_S:g} s the "
+        f"all orientations of the truth are equal, and in {turns.sum()} of {turns.size} windows of {WINDOW_S:g} s the "
         f"camera turns by {float(np.median(turns_rad[turns])):.2g} rad (median)",
-        "write the orientations, or leave the truth out: errors of orientation and NEES against it say nothing",
+        "write the orientations, or leave the truth out: errors of orientation and NEES against it are meaningless",
     )
 
 
@@ -167,9 +170,10 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
         apart = _apart(windows(evidence.sequence, evidence.camera_motion, replace(truth, T_world_imu=T_world_imu)))
         if apart < given / TIMES_NEARER:
             summary = (
-                f"the truth's motion is not the camera's, but for one {reading}, by which they differ by {apart:.1%}"
+                f"the truth's motion agrees with the camera's only for a truth {reading}, with a difference of "
+                f"{apart:.1%}"
             )
-            return _symptom(f"{summary} and not by {given:.0%}", remedy)
+            return _symptom(f"{summary} in place of {given:.0%}", remedy)
     return None
 
 
@@ -200,7 +204,7 @@ def _by_another_clock(evidence: Evidence) -> Symptom | None:
     return _symptom(
         f"the camera turns as the truth does when the truth's stamps are shifted by {-1e3 * found.value:.0f} +- "
         f"{1e3 * found.error:.0f} ms",
-        "stamp both by one clock: every position error holds the way that is gone in that time",
+        "stamp both by one clock: every position error includes the distance moved in that time",
     )
 
 
@@ -210,7 +214,7 @@ def _symptom(detail: str, treatment: str) -> Symptom:
 
 FAULT = Fault(
     "truth-mismatch",
-    "a truth that moves otherwise than vision: of another motion or unit, or beside a wrong baseline or focal length",
+    "a truth that moves differently from vision: of another motion or unit, or a wrong baseline or focal length",
     check,
     after=("disagreement",),
 )

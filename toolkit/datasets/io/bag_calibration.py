@@ -21,7 +21,7 @@ from toolkit.geometry import Array, se3
 from toolkit.measured_motion import MotionNoise, MotionSamples, TwistSamples
 from toolkit.models.noise import mems_imu, twist_noise
 
-_NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is taken (noise.motion_scale scales it)"
+_NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
 _STATED = "the noise of the IMU is as its file states it"
 _PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
 
@@ -127,7 +127,7 @@ def _not_joined(source: Source) -> str:
     other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
     tf = "/tf_static and no fixed transform of /tf" if source.chosen.moving else "/tf_static"
     return (
-        f"{source.path}: nothing tells where the camera is on the body: no {tf} joins the frames "
+        f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
         f"{source.frames.body!r} and {source.frames.left!r}; {_PUT_BESIDE}{other}"
     )
 
@@ -164,7 +164,7 @@ def _pair(source: Source) -> tuple[RectifiedPair, RectifiedPair | None, str]:
         if not (baseline_m > 0.0 and left_rect.pinhole_px[0] > 0.0):
             raise DataError(
                 f"{what[1]}: the images are rectified, P has no baseline (Tx is 0), and no /tf_static joins the two "
-                f"cameras; mend P, or {_PUT_BESIDE} and name the raw images"
+                f"cameras; correct P, or {_PUT_BESIDE} and name the raw images"
             )
         given = already_rectified(left_rect.pinhole_px, baseline_m, _size(infos[0]))
         # The frame of an image is the camera's own; R turns it into the rectified one's.

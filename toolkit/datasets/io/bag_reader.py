@@ -36,7 +36,7 @@ _PART = re.compile(r"_(\d+)$")
 # The library's messages about a storage, a compression or a version of bags that it does not know.
 _NOT_SUPPORTED = "not supported"
 # What writes the missing index, by kind of bag.
-_MENDS = {
+_REMEDIES = {
     "ros1": "copy it again, or run rosbag reindex on it",
     "mcap": "copy it again, or run mcap recover on it",
     "sqlite": "copy it again, or run ros2 bag reindex on its folder",
@@ -242,7 +242,7 @@ def _check_order(parts: Sequence[Path], readers: Sequence[Any]) -> None:
         if later.message_count and later.start_time < earlier.end_time:
             overlap_s = (earlier.end_time - later.start_time) / NS_PER_S
             raise DataError(
-                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so both are no parts of one recording; "
+                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so they are not parts of one recording; "
                 "name one of them"
             )
 
@@ -296,5 +296,5 @@ def _guarded(path: Path, kind: Kind) -> Iterator[None]:
                 "with ros2 bag convert or rosbag decompress, or install a newer rosbags"
             ) from error
         of_folder = kind in ("mcap", "sqlite") and _of_rosbag2(path.parent / _METADATA)
-        mend = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _MENDS[kind]
-        raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {mend}") from error
+        remedy = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _REMEDIES[kind]
+        raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {remedy}") from error

@@ -146,7 +146,7 @@ def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> st
     elif len(images) == 1:
         why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
     else:
-        why = "no two topics of images are a stereo pair by their names; say which with --topics left=TOPIC,right=TOPIC"
+        why = "no two topics of images are a stereo pair by their names; name them with --topics left=TOPIC,right=TOPIC"
     return f"{path}: {why}; there are {there}"[:_LONGEST]
 
 

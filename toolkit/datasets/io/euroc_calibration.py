@@ -31,8 +31,8 @@ from toolkit.simulation.scenarios import stereo_cov_px2
 PIXEL_SIGMA_PX = 0.5
 ACCEL_FACTOR, GYRO_FACTOR = 8.0, 3.0
 _INFLATED = (
-    f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
-    "one, as measured in flight against the truth"
+    f"white noise of the accelerometer and the gyro assumed to be {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the "
+    "stated one, as measured in flight against the truth"
 )
 _AS_STATED = "the noise of the IMU is as its file states it"
 _DENSITIES = {
@@ -199,7 +199,7 @@ def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> Non
         raise DataError(f"{path}: cam0 and cam1 stand at one place, so there is no baseline; give each its own pose")
     if -x < max(abs(y), abs(z)):
         turned = inverted is not None and _is_right(inverted)
-        remedy = "each T_BS looks like the inverse of one: invert both" if turned else "mend the pose of one of them"
+        remedy = "each T_BS looks like the inverse of one: invert both" if turned else "correct the pose of one of them"
         raise DataError(f"{path}: cam1 is at {x:.3g} {y:.3g} {z:.3g} m of cam0, not to the right of it; {remedy}")
     raise DataError(f"{path}: cam1 is not to the right of cam0; exchange the two")
 

@@ -30,8 +30,8 @@ _MOST_STEPS = 5
 # Differences below the first number are the noise of a good motion capture at a standstill.
 _MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
 _STRANGER = (
-    ": it turns otherwise than the gyro, so it is of another recording, or its quaternions or the gyro are not in the "
-    "order, axes or units they are read in; distrust every figure that rests on it"
+    ": its rotation differs from the gyro's, so it is of another recording, or its quaternions or the gyro are not in "
+    "the order, axes or units they are read in; do not rely on figures against it"
 )
 _AXES = "xyz"
 # Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
@@ -80,9 +80,11 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
     ranked = sorted(scatter.items(), key=lambda item: item[1])
     best, least = ranked[0]
     if not np.isfinite(least):
-        raise DataError(f"{best}: the truth and the IMU share no 0.2 s; check that both are of one recording and clock")
+        raise DataError(
+            f"{best}: the truth and the IMU overlap by less than 0.2 s; check that both are of one recording and clock"
+        )
     scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
-    among = "" if len(ranked) == 1 else ", the better of what the folder holds"
+    among = "" if len(ranked) == 1 else ", the better of those in the folder"
     stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * _turning_radps(found[best], imu)) else ""
     reason = f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters}){stranger}"
     return Choice(found[best], reason)

@@ -142,11 +142,11 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
         raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]} ({bad.size} such stamps); remove these samples")
     bad = np.flatnonzero(np.abs(stamps_s) > _LATEST_NS_S)
     if 0 < bad.size < 0.5 * stamps_s.size:
-        raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]:g} s ({bad.size} such stamps); mend them")
+        raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]:g} s ({bad.size} such stamps); correct them")
     beyond = np.flatnonzero(np.abs(stamps_s) > NS_PER_S * _LATEST_NS_S)
     if beyond.size:
         raise DataError(
-            f"{path}: {key}[{beyond[0]}] is {stamps_s[beyond[0]]:g}, which no unit makes a time of; mend it"
+            f"{path}: {key}[{beyond[0]}] is {stamps_s[beyond[0]]:g}, which no unit makes a time of; correct it"
         )
     unit = _unit_of(stamps_s)
     coarse_s = (1.0 if unit is None else unit[0]) * float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
@@ -215,7 +215,7 @@ def check_rows(path: Path, corners_px: Array) -> None:
 def _rows_mended(columns_px: Array) -> str:
     """Return what to do about rows that differ in sightings whose uL - uR (N,) px is given."""
     exchanged = abs(np.median(columns_px)) <= _MOST_ROWS_APART_PX
-    return "u and v look exchanged: exchange them" if exchanged else "rectify the images, or mend the rows"
+    return "u and v look exchanged: exchange them" if exchanged else "rectify the images, or correct the rows"
 
 
 def camera_matrix(path: Path, key: str, K: Array) -> Array:
@@ -234,7 +234,7 @@ def camera_matrix(path: Path, key: str, K: Array) -> Array:
         )
     for axis, name in enumerate(("fx", "fy")):
         if not K[axis, axis] > 0.0:
-            raise DataError(f"{path}: {name} in {key} is {K[axis, axis]:g}, expected a positive number; mend {key}")
+            raise DataError(f"{path}: {name} in {key} is {K[axis, axis]:g}, expected a positive number; correct {key}")
     return K
 
 

@@ -271,7 +271,7 @@ def check_one_trigger(mav0: Path, listed: Listed) -> None:
     if listed.apart_ms is not None:
         raise DataError(
             f"{mav0}: no image of cam0 has one of cam1 within 1 ms, the nearest is {listed.apart_ms:.4g} ms away "
-            "(median): a stereo pair has one trigger; where only the cameras' clocks differ, mend the stamps of cam1"
+            "(median): a stereo pair has one trigger; where only the cameras' clocks differ, correct the stamps of cam1"
         )
 
 

@@ -170,7 +170,9 @@ class _Machine:
             elif name in _ACTIONS:
                 _ACTIONS[name](self, argument)
             else:
-                raise DataError(f"{self._path}: its pickle uses {name}, which plain data do not need; it is not run")
+                raise DataError(
+                    f"{self._path}: its pickle uses {name}, which plain data do not need; it is not executed"
+                )
         raise ValueError("the pickle does not end")
 
     def _opcodes(self) -> Iterator[tuple[pickletools.OpcodeInfo, Any, int | None]]:

@@ -271,7 +271,7 @@ def columns_of_file(path: Path) -> Columns:
     heading, lines = _heading(path, text)
     separator = max(_SEPARATORS, key=heading.count)
     if separator not in heading and len(heading.split()) > 1:
-        raise DataError(f"{path}: its columns stand between blanks; separate them by commas, semicolons or tabs")
+        raise DataError(f"{path}: its columns are separated by blanks; separate them by commas, semicolons or tabs")
     names = [name.strip().lstrip("#").partition("[")[0].strip() for name in _cells(heading, separator)]
     kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
     if len(set(kept)) < len(kept):

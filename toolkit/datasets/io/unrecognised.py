@@ -33,7 +33,10 @@ def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
         return guess
     whole = next((above for above in islice(path.absolute().parents, _ABOVE) if recognised(above)), None)
     if whole is not None:
-        return f"is a part of a recording: name the whole, {printable(str(whole))}; by itself it is of no known format"
+        return (
+            f"is a part of a recording: name the whole recording, {printable(str(whole))}; by itself it is of no "
+            "known format"
+        )
     return "its content is of no known format"
 
 
@@ -45,7 +48,7 @@ def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
             f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
         )
     inside = [printable(str(entry.relative_to(path))) for entry in _recordings_in(path, recognised)]
-    return f"is no recording, and holds some: name {' or '.join(inside)} in it" if inside else ""
+    return f"is not a recording, but contains some: name {' or '.join(inside)} in it" if inside else ""
 
 
 def _of_file(path: Path) -> str:

@@ -59,7 +59,7 @@ class Reference(NamedTuple):
         twists = isinstance(motion, TwistSamples)
         speeds = np.linalg.norm(motion.values[samples, :3], axis=1) if twists else np.full(samples.size, np.nan)
         return cls(
-            sequence.name, "the frames", "the gyro says", sequence.frames_t_ns,
+            sequence.name, "the frames", "the gyro does", sequence.frames_t_ns,
             motion.t_ns[samples], motion.values[samples, 3:].reshape(-1, 3),
             np.empty(0, np.int64) if truth is None else truth.t_ns,
             np.empty((0, 3)) if truth is None else truth.T_world_imu[:, :3, 3],
@@ -109,7 +109,7 @@ def of_the_camera(sequence: Sequence) -> Reading:
     """Return the reading of poses of the left camera."""
     R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T
     remedy = "the poses look like the left camera's: multiply each by the inverse of T_imu_cam from the right"
-    return Reading("taken as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
+    return Reading("read as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
 
 
 def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:

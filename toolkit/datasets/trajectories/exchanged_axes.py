@@ -62,9 +62,9 @@ class Exchange:
         if len(moved) == 2:
             changes.append(f"{_NAMES[moved[0]]} and {_NAMES[moved[1]]} exchanged")
         elif moved:
-            changes.append(f"x, y and z taken from what stands as {', '.join(_NAMES[axis] for axis in order)}")
+            changes.append(f"x, y and z read from the columns {', '.join(_NAMES[axis] for axis in order)}")
         if turned:
-            changes.append(f"the sign of {' and '.join(turned)} turned")
+            changes.append(f"the sign of {' and '.join(turned)} changed")
         return f"{' and '.join(changes)} ({self.struck})"
 
 

@@ -27,7 +27,10 @@ _USUAL_SHARE, _USUAL_SIGMAS, _FEWEST_FRAMES = 0.8, 1.2816, 20
 INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
 # A first pose this improbable under its own covariance is expressed in another world frame than the truth.
 OTHER_WORLD = 1e-6
-PLACED = "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
+PLACED = (
+    "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there is included "
+    "in full"
+)
 NOT_MET = "no pose has a true one at its time"
 NOT_PLACED = "the estimate has its own world frame, and the truth has no pose for its first one"
 

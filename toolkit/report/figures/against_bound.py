@@ -26,9 +26,9 @@ from toolkit.report.figures.style import (
 
 _CAPTION = (
     "How close to the limit. Black: the Cramér-Rao bound, one standard deviation (dashed: of what was known at the "
-    "time, solid: of the whole recording). In colour, thick: what an estimator errs beyond the efficient estimate on "
-    "the same measurements; well below the bound it loses nothing that matters. Thin: the standard deviation it "
-    "states; below the bound it is too sure."
+    "time, solid: of the whole recording). In colour, thick: the error of an estimator beyond the efficient estimate "
+    "on the same measurements; well below the bound the loss is negligible. Thin: the standard deviation it "
+    "states; below the bound it is overconfident."
 )
 _LEAST_SHARE, _STATED_WIDTH = 1e-3, 0.7
 

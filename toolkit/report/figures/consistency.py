@@ -16,15 +16,15 @@ from toolkit.report.figures.style import NamedFigure, shown_as
 _OF_NEES = (
     "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the estimator "
     "states. In the band (grey) are 95 % of the frames of a consistent estimator; how many are stands above each "
-    "panel. Above the band an estimator is too sure of itself, below it too timid. Errors of neighbouring frames "
-    "belong together: a long stay outside may be one draw of luck, and only seeds tell."
+    "panel. Above the band an estimator is overconfident, below it timid. Errors of neighbouring frames are "
+    "correlated: a long stay outside may be chance, and only several seeds can decide."
 )
 _OF_NIS = (
-    "Innovations of each frame, squared, over what the estimator's own covariances let expect of them behind its gate "
+    "Innovations of each frame, squared, over what the estimator's own covariances predict behind its gate "
     "(NIS). It needs no truth. In the band (grey) are 95 % of the frames of a consistent filter; how many are stands "
     "above each panel. Its width is that of the run's own scatter from frame to frame: a gate makes a frame's "
-    "innovations scatter less, the error of the pose that they share more. A long stay above it is of measurements "
-    "that surprise the estimator more than they should."
+    "innovations scatter less, the error of the pose that they share more. A long stay above it means innovations "
+    "larger than the estimator expects."
 )
 
 

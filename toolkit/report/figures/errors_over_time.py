@@ -170,12 +170,12 @@ def _caption(comparison: Comparison, name: str) -> str:
         of_whom = "" if reference is None else f" from {reference.name}"
         return (
             f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "
-            f"deviations that {name} states; a difference far outside it says that one of the two is too sure."
+            f"deviations that {name} states; a difference far outside it means that one of the two is overconfident."
         )
     placed = (
         "as the NEES takes it: where the start is not in the truth's world, its first pose is placed on the truth's"
     )
     return (
-        f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: an honest estimator "
-        "is inside nearly always, and fills it."
+        f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: a consistent "
+        "estimator is inside nearly always, and fills it."
     )

@@ -66,7 +66,7 @@ def _nees(over: Comparison) -> NamedFigure:
     caption = (
         f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
         f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band an "
-        f"estimator is too sure of itself. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
+        f"estimator is overconfident. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
     )
     title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
     figure = figure_with_bands(over.estimators, drawn, "pose NEES / 6", title)

@@ -41,8 +41,8 @@ def _held_out(_: str, value: float) -> str:
     return f"{_short(value)} px off the median withheld sighting"
 
 
-def _honesty(_: str, value: float) -> str:
-    return f"mean pose NEES {_short(value)}; 1 is honest, more is too sure"
+def _consistency(_: str, value: float) -> str:
+    return f"mean pose NEES {_short(value)}; 1 is consistent, more is overconfident"
 
 
 def _time(_: str, value: float) -> str:
@@ -57,10 +57,10 @@ def highlights(rows: list[Row], motion: str) -> list[dict[str, str]]:
     ate = ("ate_yaw_m",) if motion == "imu" else ("ate_se3_m",)
     everyone = ("causal", "both", "final")
     questions = (
-        _Question("Most accurate at the time (causal)", ("causal", "both"), ate, " m", _error),
+        _Question("Most accurate at each frame (causal)", ("causal", "both"), ate, " m", _error),
         _Question("Most accurate in the end (final)", ("final", "both"), ate, " m", _error),
         _Question("Best on withheld tracks", everyone, ("heldout_reproj_median_px",), " px", _held_out),
-        _Question("Most honest uncertainty", everyone, ("nees_pose_mean",), "", _honesty, _from_one, contest=True),
+        _Question("Best stated uncertainty", everyone, ("nees_pose_mean",), "", _consistency, _from_one, contest=True),
         _Question("Fastest", everyone, ("total_s",), " s", _time),
     )
     eligible = list(_eligible(rows))
@@ -86,10 +86,10 @@ def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
                 return None
             after = next(((row, v) for row, v in others if row["estimator"] != best["estimator"]), None)
             return {
-                "asks": question.question_text,
+                "question": question.question_text,
                 "answer": best["estimator"],
                 "row": best["id"],
-                "tells": question.answer_text(key, value),
+                "detail": question.answer_text(key, value),
                 "next": "" if after is None else f"next: {after[0]['estimator']}, {_short(after[1])}{question.unit}",
             }
     return None

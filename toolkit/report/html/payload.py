@@ -264,7 +264,7 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
 
 
 def mark_of(mark: ConsistencyMark | UnsetType) -> str:
-    """Return what a run is marked as, nothing where it is consistent or cannot be judged."""
+    """Return what a run is marked as, nothing where it is consistent or cannot be evaluated."""
     return "" if mark is UNSET or mark.verdict == "consistent" else mark.verdict
 
 

@@ -33,5 +33,5 @@ def unwritten_orientations(sequence: Sequence, dose: float = 1.0, seed: int = 0)
 
 def _truth_of(sequence: Sequence) -> Truth:
     if sequence.truth is None:
-        raise DataError(f"{sequence.name}: no truth, which could be wrong")
+        raise DataError(f"{sequence.name}: it has no truth that could be changed")
     return sequence.truth

@@ -23,8 +23,8 @@ function highlightTiles(one) {
   return el("div", { class: "tiles" }, one.highlights.map((tile) => {
     const row = one.rows.find((other) => other.id === tile.row);
     return el("div", { class: "tile", onpointerenter: () => pointAt(keyOf(row)), onpointerleave: () => pointAt(null) },
-      el("span", { class: "asks", text: tile.asks }), el("b", {}, swatch(row), tile.answer),
-      el("span", { text: tile.tells }), el("span", { class: "fine", text: tile.next }));
+      el("span", { class: "question", text: tile.question }), el("b", {}, swatch(row), tile.answer),
+      el("span", { text: tile.detail }), el("span", { class: "fine", text: tile.next }));
   }));
 }
 

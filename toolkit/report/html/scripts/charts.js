@@ -76,13 +76,13 @@ function componentsCard(one) {
     };
   };
   return chartCard(one, "By component, with ±3σ", describe, "Along and about the world's axes, not aligned; a start outside the " +
-    "truth's world is placed by its first pose. Shaded: three standard deviations as stated; an honest estimate is inside nearly always.", chooseRow, chooseName);
+    "truth's world is placed by its first pose. Shaded: three standard deviations as stated; a consistent estimate is inside nearly always.", chooseRow, chooseName);
 }
 
 const NEES_PARTS = [["pose", "pose"], ["orientation", "rotation"], ["position", "position"]];
 
 function neesCard(one) {
-  const title = "Is the stated uncertainty honest? NEES";
+  const title = "Is the stated uncertainty consistent? NEES";
   const rows = one.rows.filter((row) => row.nees && typeof row.nees === "object");
   if (!rows.length) return emptyCard(title, reasonsOf(one.rows, "nees"));
   let part = "pose";
@@ -95,8 +95,8 @@ function neesCard(one) {
     xLabel: "time [s]", yLabel: "NEES over its degrees of freedom [1]", unit: "", log: true, level: 1,
     band: part === "pose" ? rows[0].nees.band : undefined,
   });
-  return chartCard(one, title, describe, "Squared error over what the estimator stated for it: 1 is honest, above the shaded " +
-    "95 % band of one run it is too sure of itself, below it less sure than it could be." + missingWords(one.rows, "nees"), choose);
+  return chartCard(one, title, describe, "Squared error over what the estimator stated for it: 1 is consistent, above the shaded " +
+    "95 % band of one run it is overconfident, below it timid." + missingWords(one.rows, "nees"), choose);
 }
 
 function nisCard(one) {

@@ -1,7 +1,7 @@
 /** Images of the recording with their tracks, coloured by how far off one estimator's poses leave each of them. */
 const OFF_COLOURS = ["#2563eb", "#06b6d4", "#facc15", "#f97316", "#dc2626"];
 const OFF_MOST_PX = 2;
-const FRAMES_NOTE = "Each circle is a sighting. Its colour says how far it lies from where the track's other sightings, from the estimated poses, say it should be; white: fewer than three sightings. Much red on one thing: it moves, or its tracks slide. Red everywhere: the poses are off.";
+const FRAMES_NOTE = "Each circle is a sighting. Its colour is its distance from the position predicted by the track's other sightings and the estimated poses; white: fewer than three sightings. Much red on one thing: it moves, or its tracks drift. Red everywhere: the poses are off.";
 
 function framesOf(one) {
   if (!one.frames?.length) return null;

@@ -17,8 +17,8 @@ function seedsCase(one, columns) {
         band: { x: banded.t_s, low: banded.low, high: banded.high },
       };
     };
-    cards.push(chartCard(one, "Is the stated uncertainty honest? NEES", describe,
-      "The shaded band, for as many seeds, holds 95 % of a consistent estimator's frames; what that says of each is in words below."));
+    cards.push(chartCard(one, "Is the stated uncertainty consistent? NEES", describe,
+      "The shaded band, for as many seeds, contains 95 % of a consistent estimator's frames; the result for each estimator is stated below."));
   }
   return [el("div", { class: "charts" }, cards)];
 }

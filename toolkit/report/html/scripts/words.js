@@ -1,10 +1,10 @@
-const OUTPUT_MEANING = "causal: what was known at each frame; final: what was said when everything had been seen; both: the two are the same";
-const STATUS_MEANING = "ok: ran to a plausible end; diverged: ran to the end, but left what is plausible; failed: could not go on. overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that refused many; contradicted: tracks that turn the state one way, farther than the stated uncertainty allows; the notes have the figures";
-const TABLE_NOTE = "The best of each recording is set off; a dash says why on pointing at it, and in the notes below. Compare causal with causal and final with final.";
+const OUTPUT_MEANING = "causal: what was estimated at each frame; final: what was estimated from the whole recording; both: the two are the same";
+const STATUS_MEANING = "ok: ran to the end; diverged: ran to the end with implausible estimates; failed: could not go on. overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that rejected many; contradicted: corrections by the tracks that have one direction, by more than the stated uncertainty allows; the notes have the figures";
+const TABLE_NOTE = "The best of each recording is set off; point at a dash, or read the notes below, for why a value is missing. Compare causal with causal and final with final.";
 
 const STATUS_WORDS = {
-  diverged: "diverged: it ran to the end, but its answers left what is physically plausible",
-  failed: "failed: it could not go on; what it had said until then is kept",
+  diverged: "diverged: it ran to the end, but its estimates are physically implausible",
+  failed: "failed: it could not go on; what it had estimated until then is kept",
 };
 
 /** What the case says in words: trouble first, then notes, the audit, the recording, how to repeat it. */
@@ -13,9 +13,9 @@ function wordsOf(one) {
   return [
     el("div", { class: "words" },
       listCard("Notes", notes, "Nothing out of the ordinary."),
-      audit ? auditCard(audit, undecided) : listCard("Is the stated uncertainty honest?", one.words.verdicts),
+      audit ? auditCard(audit, undecided) : listCard("Is the stated uncertainty consistent?", one.words.verdicts),
       listCard("The recording", [`Every estimator started from: ${start}`, ...facts]),
-      one.card?.length ? listCard("What its tracks are like", one.card) : null,
+      one.card?.length ? listCard("Its tracks", one.card) : null,
       manifestCard(one)),
     remarks.length ? folded("Remarks on single numbers", el("ul", {}, remarks.map((text) => el("li", { text })))) : null,
     logsOf(one),
@@ -48,7 +48,7 @@ function folded(title, ...content) {
 function logsOf(one) {
   const logs = new Map(one.rows.filter((row) => row.log && row.log.length).map((row) => [row.estimator, row.log]));
   if (!logs.size) return null;
-  return folded("What the estimators had to say", [...logs].map(([name, lines]) =>
+  return folded("Log of the estimators", [...logs].map(([name, lines]) =>
     el("div", {}, el("h4", { text: name }), el("pre", { text: lines.join("\n") }))));
 }
 

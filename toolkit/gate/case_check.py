@@ -30,7 +30,7 @@ _ARITHMETIC: dict[ArithmeticOfRuns, str] = {
 }
 _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
 SHOWN = 1e-6
-# Fewer timed runs than this scatter too much to be judged (docs/gate.md).
+# Fewer timed runs than this scatter too much to be checked (docs/gate.md).
 FEWEST_TIMED = 16
 Sides = tuple[Array, Array]
 
@@ -40,7 +40,7 @@ _SAME_POSES_BY = {"ate_": ("heldout_", "nees_"), "rpe_": ("heldout_", "nees_"), 
 
 @dataclass(frozen=True)
 class CheckTerms:
-    """Terms of the judgement: whether time counts, and whether a metric that moved passes unless it is worse."""
+    """Terms of the check: whether time counts, and whether a metric that moved passes unless it is worse."""
 
     speed: bool = True
     accept_better: bool = False
@@ -58,7 +58,7 @@ class CaseVerdicts:
     notes: list[str] = field(default_factory=list)
 
 
-def judge_case(
+def check_case(
     case: Case, before: Measured, now: Measured, bounds: Bounds, terms: CheckTerms = USUAL_TERMS
 ) -> CaseVerdicts:
     """Judge one case on the terms given."""
@@ -72,17 +72,17 @@ def judge_case(
         return collected
     if before.hashes != now.hashes:
         collected.notes.append(
-            f"{case.source}: the same measurements but for their last bits, which this processor rounds differently"
+            f"{case.source}: the same measurements except for their last bits, which this processor rounds differently"
         )
     for estimator, was in before.runs.items():
         if estimator in now.absent or estimator not in now.runs:
             why = now.absent.get(estimator, "it was not run")
             collected.verdicts.append(_missing(case, estimator, "", "estimator", why))
         else:
-            _judge_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
+            _check_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
             if terms.speed:
                 collected.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
-                collected.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
+                collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
     return collected
 
 
@@ -111,7 +111,7 @@ def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -
         )
 
 
-def _judge_series(
+def _check_series(
     case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, bounds: Bounds, terms: CheckTerms
 ) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
@@ -134,20 +134,20 @@ def _judge_series(
             if key in changed:
                 collected.verdicts.append(_changed(where, shared[key], changed[key]))
             elif key in shared and shared[key][0].size:
-                _judge_metric(case, Pairs(where, criteria[key], *shared[key]), collected, terms)
-    collected.verdicts += judge_coverage(case, estimator, before, now, bounds)
+                _check_metric(case, Pairs(where, criteria[key], *shared[key]), collected, terms)
+    collected.verdicts += check_coverage(case, estimator, before, now, bounds)
 
 
-def _judge_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: CheckTerms) -> None:
+def _check_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: CheckTerms) -> None:
     """Put a metric among the tests, or hold it to its bound."""
     if case.simulated:
         collected.tests.append(pairs)
         return
     where, now = pairs.where, pairs.after
     if np.ptp(now) > SHOWN * np.abs(now).max():
-        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
+        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} has changed in every run")
     was, is_ = float(np.median(pairs.before)), float(np.median(now))
-    collected.verdicts.append(judge_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
+    collected.verdicts.append(check_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
 
 
 def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdict:
@@ -197,7 +197,7 @@ def _missing(case: Case, estimator: str, output: str, what: str, why: str) -> Ve
     return Verdict(case.source, estimator, output, what, "missing", " ".join(why.split()))
 
 
-def judge_recorded(
+def check_recorded(
     where: Where, criterion: Criterion, before: float, after: float, *, accept_better: bool = False
 ) -> Verdict:
     """Judge one value of a recorded sequence; a move by more than the bound fails either way, unless accepted."""
@@ -237,7 +237,7 @@ def _distance(before: float, after: float) -> float:
     return math.expm1(abs(math.log(after / before)))
 
 
-def judge_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
+def check_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
     """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
     for output, metrics in before.outputs.items():
         pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
@@ -256,8 +256,8 @@ def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
     return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
 
 
-def judge_speed(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
-    """Judge the median over the runs of the time over the reference workload's; few runs are not judged."""
+def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
+    """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
     was, is_ = (np.array([x for x in series.speed if x is not None]) for series in (before, now))
     if min(was.size, is_.size) < FEWEST_TIMED:
         return

@@ -118,7 +118,7 @@ def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline, gate):
 @pytest.mark.parametrize(
     ("was", "now", "fails"),
     [
-        (4.0, 4.4, True),  # too sure of itself, and more so
+        (4.0, 4.4, True),  # overconfident, and more so
         (4.0, 3.6, False),  # nearer to honest
         (0.30, 0.27, True),  # timid, and more so
         (0.30, 0.33, False),
@@ -178,7 +178,7 @@ def test_a_recording_shows_any_change_and_fails_beyond_its_bound(
     assert check.passed == (finding not in ("regressed", "moved"))
 
 
-def test_a_recording_that_moved_down_is_told_in_shares_of_the_smaller_for_so_it_is_judged(baseline, gate):
+def test_a_recording_that_moved_down_is_reported_in_shares_of_the_smaller_as_it_is_checked(baseline, gate):
     """6 % less in the table is 6.38 % of the smaller, of which 5 % is allowed."""
     simulated, recorded = gate.as_measured(baseline)
     changed = gate.edited(gate.another(recorded), lambda n, key, v: v * 0.94 if (n, key) == ("two", "ate_se3_m") else v)
