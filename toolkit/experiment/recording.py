@@ -18,7 +18,7 @@ from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence, why_not_sightings
+from toolkit.sequence import Prior, Sequence, check_runnable, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.threads import on_one_thread
@@ -116,8 +116,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         elif recording.noise.tracks == "correlated":
             whole = _with_doubts(whole, _cut(whole, recording))
         if recording.card and card is None:
-            used = _cut(whole, recording)
-            card = card_of(used, fit_track_noise(used))
+            whole, card = _with_card(whole, _cut(whole, recording))
         used, budget = _cut(whole, recording), recording.tracks.budget
         sequence = _within_budget(used, budget)
         prior = STARTS[recording.start](sequence)
@@ -304,7 +303,13 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     Where they turn out white the noise stays the recording's own. Raises DataError where it cannot be fitted.
     """
     used = used if fit_s is None else _first_seconds(used, fit_s)
-    fitted = fit_track_noise(used)
+    if fit_s is not None and used.frame_count < 2:
+        raise DataError(f"{used.name}: no two frames are in its first {fit_s:g} s; give noise.track_fit_s more")
+    check_runnable(used)
+    try:
+        fitted = fit_track_noise(used)
+    except DataError as error:
+        raise DataError(f"{error}; state it with noise.tracks=correlated, or leave it white") from error
     basis = "all that is used of the recording, so that causal answers know it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
@@ -312,3 +317,12 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
     return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)
+
+
+def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:
+    """Return the whole recording and the card of the tracks that are used, or a fact that says why there is none."""
+    try:
+        return whole, card_of(used, fit_track_noise(used))
+    except DataError as error:
+        fact = f"no card of its tracks: {str(error).removeprefix(f'{used.name}: ')}"
+    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, fact))), None
