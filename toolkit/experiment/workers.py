@@ -74,11 +74,12 @@ class WorkerProcess:
         if self._executor is None:
             self._executor = _executor()
         try:
-            return self._executor.submit(work, *arguments)
+            future: Future[R] = self._executor.submit(work, *arguments)
         except BrokenProcessPool:  # it died with nothing to do
             self.end()
             self._executor = _executor()
-            return self._executor.submit(work, *arguments)
+            future = self._executor.submit(work, *arguments)
+        return future
 
     def end(self) -> None:
         """End the process, whatever it is doing."""
