@@ -58,6 +58,9 @@ class Part:
 
 WHOLE = Part()
 
+# GTSAM's keys have 56 bits for the number of a landmark.
+_LARGEST_ID = 2**56 - 1
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -195,7 +198,19 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
         sequence = simulate(scenario, recording.seed)
     else:
         sequence = load_sequence(source, recording.seed, recording.frontend, progress)
+    sequence = _with_usable_ids(sequence)
     return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))
+
+
+def _with_usable_ids(sequence: Sequence) -> Sequence:
+    """Return a sequence whose track ids can be keys of a factor graph, numbered anew where they cannot, as hashes."""
+    ids = sequence.observations.track_id
+    if not ids.size or (ids.min() >= 0 and ids.max() <= _LARGEST_ID):
+        return sequence
+    anew = replace(sequence.observations, track_id=np.unique(ids, return_inverse=True)[1])
+    fact = f"tracks are numbered anew, in the order of their ids: some of these are not in 0 ... {_LARGEST_ID}"
+    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
+    return replace(sequence, observations=anew, provenance=provenance)
 
 
 def _cut(sequence: Sequence, recording: Recording) -> Sequence:
