@@ -307,3 +307,16 @@ def test_a_recording_without_motion_samples_is_refused_as_that(tmp_path: Path) -
     saved = toolkit.save(tmp_path / "own", tracks=given["tracks"], motion=none, rig=rig_of(sequence))
     with pytest.raises(DataError, match="it has no motion samples"):
         toolkit.compare(saved, "dead-reckoning", workers=1)
+
+
+@pytest.mark.parametrize("filler", [-1.0, 0.0, -999.0])
+def test_a_right_image_written_as_a_place_outside_of_it_is_none(tmp_path: Path, filler: float) -> None:
+    sequence = recorded("twist")
+    given, seen = tables_of(sequence), sequence.observations
+    missing = np.arange(len(seen)) % 3 == 0
+    filled = {name: np.where(missing, filler, given["tracks"][name]) for name in ("uR", "vR")}
+    rig = rig_of(sequence)
+    saved = toolkit.save(tmp_path / "own", tracks={**given["tracks"], **filled}, motion=given["motion"], rig=rig)
+    uv_px = toolkit.load_sequence(saved).observations.uv_px
+    np.testing.assert_array_equal(is_left_only(uv_px), missing)
+    np.testing.assert_allclose(uv_px[:, [0, 2]], seen.uv_px[:, [0, 2]], rtol=0.0, atol=1e-12)  # v is a mean of two
