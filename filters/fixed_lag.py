@@ -56,17 +56,20 @@ class FixedLag:
         self._states, self._points = list[Estimate](), dict[int, Array]()
         self._last_seen_ns: dict[int, int] = {}
         self._log: list[str] = []
+        self._frame = 0
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
+        self._frame, t_ns = packet.index, packet.frame.t_ns
         if self._builder.is_outdated:
-            self._note(packet, self._tree.rebuild(self._builder.window_brought_up_to_date))
-        extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
+            self._note(self._tree.rebuild(self._builder.window_brought_up_to_date))
+        # Before the packet's sightings are chosen: to read a covariance may cost landmarks.
         self._states += [self._state(k) for k in self._window() if self._stamps_ns[k] < t_ns - self._lag_ns]
+        extension = self._builder.extend(packet)
         recovery = self._tree.add(extension, t_ns)
         self._stamps_ns.append(t_ns)
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
-        self._note(packet, recovery)
+        self._note(recovery)
         newest = self._read(packet)
         self._drop_landmarks(packet, newest)
         return replace(newest, info=self._builder.info)
@@ -84,7 +87,12 @@ class FixedLag:
     def _state(self, k: int) -> Estimate:
         """Return a state of the window as it was last read, with the covariance the window has for it."""
         state = self._builder.motion.read(self._values, k, self._stamps_ns[k])
-        return replace(state, cov=state_cov(self._builder.motion, self._tree, k, state.T_world_imu[:3, :3]))
+        motion, R_world_imu = self._builder.motion, state.T_world_imu[:3, :3]
+        try:
+            return replace(state, cov=state_cov(motion, self._tree, k, R_world_imu))
+        except RuntimeError as refusal:
+            self._note(self._tree.rebuilt_by_qr(refusal))
+            return replace(state, cov=state_cov(motion, self._tree, k, R_world_imu))
 
     def _pose(self, k: int) -> Array:
         """Return a pose (4, 4) as it was last read, or as it left the window."""
@@ -116,11 +124,11 @@ class FixedLag:
         if log:
             recovery = self._tree.drop(log.keys())
             lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
-            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
+            self._note(Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
-    def _note(self, packet: Packet, recovery: Recovery) -> None:
+    def _note(self, recovery: Recovery) -> None:
         """Log a recovery, and forget the points of the landmarks that it dropped."""
-        self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
+        self._log += [f"frame {self._frame}: {line}" for line in recovery.log]
         self._forget(recovery.dropped)
         for i in recovery.dropped:
             self._points.pop(i, None)

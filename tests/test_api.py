@@ -313,6 +313,12 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"settings": {3: 4}}, "settings has an int for a key, 3; settings have names"),
         ({"settings": {"window.lag_s": 3.0}}, r"write \{'window': \{'lag_s': ...\}\}, or in TOML window.lag_s without"),
         ({"estimators": "dead-reckoning,ekf"}, r"several names as a list: \['dead-reckoning', 'ekf'\]"),
+        ({"settings": {"window": {"lag_s": np.array([1.0, 2.0])}}}, "window.lag_s is a ndarray; give a number"),
+        ({"settings": {"noise": np.zeros(3)}}, "noise is a ndarray; give"),
+        ({"settings": {"estimators": {"ekf": np.zeros(3)}}}, "estimators.ekf is a ndarray; give"),
+        ({"scheduler": 5}, "scheduler is an int; give a text"),
+        ({"every": np.array([2])}, r"every is array\(\[2\]\), expected a whole number"),
+        ({"to_s": 10**400}, "to_s is 10+, expected a number"),
         ({"source": ["drive", "flight"]}, "source is a list; give one recording"),
     ],
 )

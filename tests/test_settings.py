@@ -46,6 +46,9 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
         ({"nois": {}}, "there is no setting nois; did you mean noise?"),
         ({"window": {"lag_s": -1}}, "window.lag_s: expected number >= 0.001"),
         ({"window": {"lag_s": math.nan}}, "window.lag_s"),
+        # No JSON file has such a number, and so no manifest.
+        ({"outliers": {"smoother_gate_factor": math.inf}}, "outliers.smoother_gate_factor: expected a finite number"),
+        ({"estimators": {"mine": {"gain": -math.inf}}}, "estimators.mine.gain: expected a finite number, not -inf"),
         ({"window": 3}, "window: expected a section of keys, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
         ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 1e-06"),

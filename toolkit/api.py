@@ -12,6 +12,7 @@
 
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -87,7 +88,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         max_frames=None if max_frames is None else _whole("max_frames", max_frames),
         part=Part(_number("from_s", from_s), None if to_s is None else _number("to_s", to_s), _whole("every", every)),
         workers=None if workers is None else _whole("workers", workers),
-        scheduler=scheduler,
+        scheduler=None if scheduler is None else _text("scheduler", scheduler),
     )
     if resume is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
@@ -154,6 +155,12 @@ def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named
     return given or {}
 
 
+def _text(what: str, given: str) -> str:
+    if isinstance(given, str):
+        return given
+    raise SettingsError(f"{what} is {type_of(given)}; give a text")
+
+
 def _path(what: str, given: str | Path) -> Path:
     if isinstance(given, str | Path):
         return Path(given)
@@ -167,14 +174,15 @@ def _paths(what: str, given: Mapping[str, str | Path] | None) -> dict[str, Path]
 def _number(what: str, given: float) -> float:
     try:
         return float(operator.truediv(given, 1.0))
-    except TypeError as error:
+    except (TypeError, OverflowError) as error:
         raise SettingsError(f"{what} is {given!r}, expected a number") from error
 
 
 def _whole(what: str, given: int) -> int:
-    if isinstance(given, bool) or not hasattr(given, "__index__"):
-        raise SettingsError(f"{what} is {given!r}, expected a whole number")
-    return operator.index(given)
+    if not isinstance(given, bool):
+        with suppress(TypeError):
+            return operator.index(given)
+    raise SettingsError(f"{what} is {given!r}, expected a whole number")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

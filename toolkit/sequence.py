@@ -355,7 +355,9 @@ def check_runnable(sequence: Sequence) -> None:
         if bad.size:
             raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]
-    if motion.t_ns.size == 0 or motion.t_ns[0] > first or motion.t_ns[-1] < last:
+    if motion.t_ns.size == 0:
+        raise DataError(f"{name}: it has no motion samples; estimators need some")
+    if motion.t_ns[0] > first or motion.t_ns[-1] < last:
         raise DataError(f"{name}: the motion samples do not span the frames; cut the frames to the motion's time")
 
 

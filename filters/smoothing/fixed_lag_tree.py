@@ -96,6 +96,21 @@ class FixedLagTree:
         factors, values = self._emptied()
         return self._solved(factors if remade is None else remade(factors, values), values)
 
+    def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
+        """Rebuild the tree by QR where GTSAM refused a covariance because of rounding; raise any other error again.
+
+        A covariance is read from the products of several cliques, whose condition may be worse than that of each.
+        """
+        key = variable_named(refusal)
+        if self._by_qr_from_ns is not None:
+            raise refusal
+        self._by_qr_from_ns = self._newest_ns()
+        again = self.rebuild()
+        line = (
+            f"{gtsam.Symbol(key).string()} was indeterminate to rounding in a covariance: solved by QR for some frames"
+        )
+        return Recovery([line, *again.log], again.dropped)
+
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Remove landmarks and their sightings in the window; other variables keep older sightings' information."""
         self._chained.drop(track_ids)

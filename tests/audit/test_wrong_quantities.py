@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.audit import Finding, audit
 from toolkit.geometry import Array
-from toolkit.sequence import Observations, Sequence
+from toolkit.sequence import Observations, Sequence, is_left_only
 from toolkit.simulation import SCENARIOS, simulate
 
 
@@ -126,6 +126,37 @@ def test_missing_sightings_written_as_one_value_are_no_camera_in_the_place_of_bo
     reported = found(replace(drive(), observations=Observations.sorted(frame, track_id, pixels)))
     assert reported["swapped-coordinates"].repaired
     assert f"missing ones, written as {filler:g}" in reported["swapped-coordinates"].detail
+
+
+@pytest.mark.parametrize("filler", [-1.0, 0.0, 9999.0])
+def test_missing_right_images_written_as_one_value_become_sightings_by_the_left_one(filler: float) -> None:
+    missing = np.random.default_rng(0).uniform(size=len(drive().observations)) < 0.2
+
+    def filled(uv_px: Array) -> Array:
+        uv_px[missing, 1] = filler
+        return uv_px
+
+    outcome = audit(with_pixels(filled))
+    reported = {finding.fault: finding for finding in outcome.findings}
+    assert reported.keys() == {"swapped-coordinates", "left-only"}
+    assert reported["swapped-coordinates"].repaired
+    assert (
+        f"{missing.sum()} of {missing.size} sightings have a uR of {filler:g}" in reported["swapped-coordinates"].detail
+    )
+    np.testing.assert_array_equal(is_left_only(outcome.sequence.observations.uv_px), missing)
+
+
+def test_what_both_images_lack_is_no_sighting_by_the_left_one() -> None:
+    seen = drive().observations
+    right, both = (np.arange(len(seen)) % 20 == place for place in (0, 1))
+    uv_px = np.where(both[:, None], -1.0, seen.uv_px)
+    uv_px[right, 1] = -1.0
+    kept = audit(with_pixels(lambda _: uv_px)).sequence.observations.uv_px
+    assert (len(kept), is_left_only(kept).sum()) == (len(seen) - both.sum(), right.sum())
+
+
+def test_right_images_rounded_to_pixels_are_none_that_are_missing() -> None:
+    assert "swapped-coordinates" not in found(with_pixels(np.round))
 
 
 def test_velocities_or_rates_that_are_zero_all_along_are_distinguished() -> None:

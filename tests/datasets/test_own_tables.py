@@ -236,6 +236,7 @@ def test_values_given_in_python_are_named_too(tmp_path: Path) -> None:
         ),
         ({"rig": {}}, "rig: missing fx_px, fy_px"),
         ({"truth": {"t": [1.0]}}, "truth: missing column x, y"),
+        ({"tracks": {**given["tracks"], "uL": given["tracks"]["uL"] + 0j}}, "tracks: column uL holds complex numbers"),
     ):
         with pytest.raises(DataError, match=pattern):
             toolkit.save(tmp_path / "own", **(given | wrong))
@@ -287,3 +288,35 @@ def test_an_empty_right_image_is_a_sighting_by_the_left_one(tmp_path: Path, rows
     np.testing.assert_array_equal(uv_px[3, [0, 2]], sequence.observations.uv_px[3, [0, 2]])
     other = np.arange(len(uv_px)) != 3
     np.testing.assert_array_equal(uv_px[other], sequence.observations.uv_px[other])
+
+
+def test_a_value_that_is_masked_is_none(tmp_path: Path) -> None:
+    sequence = recorded("twist")
+    given = tables_of(sequence)
+    masked = np.arange(len(sequence.observations)) % 5 == 0
+    right = np.ma.masked_array(np.where(masked, 1.0, given["tracks"]["uR"]), masked)
+    rig = rig_of(sequence)
+    saved = toolkit.save(tmp_path / "own", tracks={**given["tracks"], "uR": right}, motion=given["motion"], rig=rig)
+    np.testing.assert_array_equal(is_left_only(toolkit.load_sequence(saved).observations.uv_px), masked)
+
+
+def test_a_recording_without_motion_samples_is_refused_as_that(tmp_path: Path) -> None:
+    sequence = recorded("twist")
+    given = tables_of(sequence)
+    none = {name: column[:0] for name, column in given["motion"].items()}
+    saved = toolkit.save(tmp_path / "own", tracks=given["tracks"], motion=none, rig=rig_of(sequence))
+    with pytest.raises(DataError, match="it has no motion samples"):
+        toolkit.compare(saved, "dead-reckoning", workers=1)
+
+
+@pytest.mark.parametrize("filler", [-1.0, 0.0, -999.0])
+def test_a_right_image_written_as_a_place_outside_of_it_is_none(tmp_path: Path, filler: float) -> None:
+    sequence = recorded("twist")
+    given, seen = tables_of(sequence), sequence.observations
+    missing = np.arange(len(seen)) % 3 == 0
+    filled = {name: np.where(missing, filler, given["tracks"][name]) for name in ("uR", "vR")}
+    rig = rig_of(sequence)
+    saved = toolkit.save(tmp_path / "own", tracks={**given["tracks"], **filled}, motion=given["motion"], rig=rig)
+    uv_px = toolkit.load_sequence(saved).observations.uv_px
+    np.testing.assert_array_equal(is_left_only(uv_px), missing)
+    np.testing.assert_allclose(uv_px[:, [0, 2]], seen.uv_px[:, [0, 2]], rtol=0.0, atol=1e-12)  # v is a mean of two

@@ -1,5 +1,6 @@
 """What the estimators read: the noise, the start, the seeds and the cut that the settings ask for."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,10 @@ import pytest
 from toolkit.audit import Audit, Finding
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
-from toolkit.experiment import Plan, recording
+from toolkit.experiment import Plan, recording, run
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
-from toolkit.sequence import Sequence
+from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
 from toolkit.simulation.track_faults import moving_objects
@@ -230,3 +231,22 @@ def test_a_world_is_drawn_of_simulations_alone() -> None:
     assert np.abs(fixed.truth.T_world_imu - drawn.truth.T_world_imu).max() > 0.01
     with pytest.raises(SettingsError, match="vary=world draws a simulated world"):
         prepare(Recording(fixed, vary="world"))
+
+
+@pytest.mark.parametrize("ids", [lambda track: -track - 1, lambda track: track + 2**56, lambda track: track * 2**50])
+def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run(
+    ids: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    short = load_sequence("drive").truncated(12)
+    seen = short.observations
+    named = replace(short, observations=Observations.sorted(seen.frame, ids(seen.track_id), seen.uv_px))
+    prepared = prepare(Recording(named)).sequence
+    assert {*np.unique(prepared.observations.track_id)} == {*range(np.unique(seen.track_id).size)}
+    assert "tracks are numbered anew" in prepared.provenance.facts[-1]
+    compared = run(Plan((named,), ("batch", "fixed-lag", "isam2"), workers=1))[0]
+    assert [one.status for one in compared.runs] == ["ok"] * 3
+
+
+def test_tracks_with_ids_that_a_graph_can_have_keep_them() -> None:
+    short = load_sequence("drive").truncated(3)
+    assert prepare(Recording(short)).sequence.observations is short.observations

@@ -3,12 +3,12 @@
 import gc
 import os
 import signal
+import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from subprocess import Popen
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -25,7 +25,7 @@ from toolkit.progress import SILENT
 
 Units = Callable[..., list[Unit]]
 Jobs = Callable[..., list[Any]]
-StartsGroup = Callable[..., Popen[str]]
+StartsGroup = Callable[..., subprocess.Popen[str]]
 
 _WORK = """
 import os, signal, time
@@ -279,6 +279,26 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
     assert (tmp_path / "run").exists() == ("what has ended is kept in run" in messages)
     assert {path.name for path in tmp_path.rglob("*")} <= {"run", "outcomes.jsonl"}
     _assert_gone(vislam.pid)
+
+
+def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_path: Path) -> None:
+    """In a program of its own, because Python's resource tracker starts once a program, with the first process."""
+    program = textwrap.dedent("""
+        import signal
+        from toolkit.experiment import workers
+        submit = workers.ProcessPoolExecutor.submit
+        def told(*given):
+            print({"SIGINT", "SIGHUP"} <= {number.name for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])})
+            return submit(*given)
+        workers.ProcessPoolExecutor.submit = told
+        for _ in range(2):
+            process = workers.WorkerProcess()
+            process.submit(int).result()
+            process.end()
+        print(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+    """)
+    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines() == ["True", "True", "set()"]
 
 
 def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -261,3 +261,14 @@ def log_and_point(sequence: Sequence, track_id: int) -> tuple[tuple[str, ...], A
         estimator.step(packet)
     finished = estimator.finish()
     return finished.log, finished.landmarks.points_world[finished.landmarks.track_ids == track_id][0]
+
+
+def test_an_imu_so_good_that_a_covariance_is_refused_does_not_end_it(run_estimator):
+    """GTSAM multiplies cliques to read a covariance; of the oldest state of the first full window it refused it."""
+    camera = replace(FLIGHT.camera, max_tracks=30)
+    sequence = simulate(replace(FLIGHT, camera=camera, duration_s=2.5), 4)
+    run = run_estimator("fixed-lag", replace(sequence, noise=sequence.noise.scaled(0.01)))
+    assert run.status == "ok"
+    assert any("indeterminate to rounding in a covariance: solved by QR" in line for line in run.log)
+    assert run.causal.t_ns.size == run.final.t_ns.size == sequence.frame_count
+    assert np.isfinite(run.final.cov).all()

@@ -97,3 +97,11 @@ def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:
     comparison = run(Plan((walking.truncated(20),), ("dead-reckoning",), workers=1))[0]
     assert comparison.card is None
     assert '"card"' not in to_line(report_document(comparison))
+
+
+def test_a_card_that_cannot_be_had_costs_a_comparison_nothing_and_is_told(walking: Sequence) -> None:
+    settings = settings_of({"card": True}, "test")
+    comparison = run(Plan((walking.truncated(4),), ("dead-reckoning",), settings=settings, workers=1))[0]
+    assert (comparison.card, comparison.runs[0].status) == (None, "ok")
+    text = comparison_text(comparison, width=None)
+    assert "no card of its tracks: " in text and "too few to fit their noise" in text

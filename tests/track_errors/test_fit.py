@@ -72,8 +72,15 @@ def test_noise_that_comes_out_white_leaves_the_recordings_own(white: Sequence) -
 
 
 def test_too_few_tracks_are_refused_with_what_to_do(exact: Sequence) -> None:
+    requested = settings_of({"noise": {"tracks": "fitted"}}, "test").noise
     with pytest.raises(DataError, match=r"too few to fit their noise.*noise\.tracks=correlated"):
-        fit_track_noise(exact.truncated(3))
+        prepare(Recording(exact.truncated(3), noise=requested))
+
+
+def test_a_fit_to_less_than_two_frames_is_refused_with_the_setting_that_says_so(exact: Sequence) -> None:
+    requested = settings_of({"noise": {"tracks": "fitted", "track_fit_s": 0.01}}, "test").noise
+    with pytest.raises(DataError, match=r"no two frames are in its first 0\.01 s; give noise\.track_fit_s more"):
+        prepare(Recording(exact, noise=requested))
 
 
 def test_a_calibration_that_suits_no_motion_is_refused_in_one_line(walking: Sequence) -> None:

@@ -21,7 +21,7 @@ from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, TwistNoise, TwistSamples
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
 from toolkit.sequence import GRAVITY_WORLD, ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig, Truth
@@ -126,6 +126,8 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
     right_px = table.numbers_or_none(TRACKS[2], rows[-1])
     # A single row v is that of both images, or of the left one.
     right_px[:, 1] = np.where(np.isnan(right_px[:, 0]) & (rows == ONE_ROW), np.nan, right_px[:, 1])
+    if rows == TWO_ROWS:
+        right_px[_is_filler(left_px, right_px)] = np.nan
     corners_px = np.hstack([left_px, right_px])
     if rows == TWO_ROWS:
         check_rows(table.what, corners_px)
@@ -135,6 +137,15 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
         row = int(order[twice[0] + 1])
         raise DataError(f"{table.what}: {table.at(row)}: track {track_id[row]} is there twice in its frame; remove one")
     return frames_t_ns, observations(frame, track_id, corners_px)
+
+
+def _is_filler(left_px: Array, right_px: Array) -> BoolArray:
+    """Say which right images (N, 2) are missing and written as -1, 0 or another number that is no place in an image.
+
+    The mean of the rows would hide it. Where the left image (N, 2) has the same value, the whole sighting is missing.
+    """
+    u_right, v_right = right_px.T
+    return np.asarray((u_right == v_right) & (u_right <= 0.0) & (left_px[:, 0] != u_right))
 
 
 def _motion(table: Columns, place: Path, noise: Mapping[str, Any]) -> tuple[MotionSamples, MotionNoise]:

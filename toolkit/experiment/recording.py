@@ -18,7 +18,7 @@ from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence, why_not_sightings
+from toolkit.sequence import Prior, Sequence, check_runnable, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.threads import on_one_thread
@@ -57,6 +57,9 @@ class Part:
 
 
 WHOLE = Part()
+
+# GTSAM's keys have 56 bits for the number of a landmark.
+_LARGEST_ID = 2**56 - 1
 
 
 @dataclass(frozen=True)
@@ -116,8 +119,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         elif recording.noise.tracks == "correlated":
             whole = _with_contradiction(whole, _cut(whole, recording))
         if recording.card and card is None:
-            used = _cut(whole, recording)
-            card = card_of(used, fit_track_noise(used))
+            whole, card = _with_card(whole, _cut(whole, recording))
         used, budget = _cut(whole, recording), recording.tracks.budget
         sequence = _within_budget(used, budget)
         prior = STARTS[recording.start](sequence)
@@ -196,7 +198,19 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
         sequence = simulate(scenario, recording.seed)
     else:
         sequence = load_sequence(source, recording.seed, recording.frontend, progress)
+    sequence = _with_usable_ids(sequence)
     return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))
+
+
+def _with_usable_ids(sequence: Sequence) -> Sequence:
+    """Return a sequence whose track ids can be keys of a factor graph, numbered anew where they cannot, as hashes."""
+    ids = sequence.observations.track_id
+    if not ids.size or (ids.min() >= 0 and ids.max() <= _LARGEST_ID):
+        return sequence
+    anew = replace(sequence.observations, track_id=np.unique(ids, return_inverse=True)[1])
+    fact = f"tracks are numbered anew, in the order of their ids: some of these are not in 0 ... {_LARGEST_ID}"
+    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
+    return replace(sequence, observations=anew, provenance=provenance)
 
 
 def _cut(sequence: Sequence, recording: Recording) -> Sequence:
@@ -304,7 +318,13 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     Where they turn out white the noise stays the recording's own. Raises DataError where it cannot be fitted.
     """
     used = used if fit_s is None else _first_seconds(used, fit_s)
-    fitted = fit_track_noise(used)
+    if fit_s is not None and used.frame_count < 2:
+        raise DataError(f"{used.name}: no two frames are in its first {fit_s:g} s; give noise.track_fit_s more")
+    check_runnable(used)
+    try:
+        fitted = fit_track_noise(used)
+    except DataError as error:
+        raise DataError(f"{error}; state it with noise.tracks=correlated, or leave it white") from error
     basis = "all that is used of the recording, so that causal answers use it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time use too early"
@@ -312,3 +332,12 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
     return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)
+
+
+def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:
+    """Return the whole recording and the card of the tracks that are used, or a fact that says why there is none."""
+    try:
+        return whole, card_of(used, fit_track_noise(used))
+    except DataError as error:
+        fact = f"no card of its tracks: {str(error).removeprefix(f'{used.name}: ')}"
+    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, fact))), None

@@ -62,17 +62,23 @@ class WorkerProcess:
         Signals are held back until the process is started; otherwise resources of a half-started process would be left
         behind. Raises SystemLimitError where the system lets no process be started.
         """
-        with uninterrupted(), _interrupts_held_back(), _refusals_shown():
-            # Python's resource tracker unblocks interrupts when it starts, so it is started before the first process.
-            resource_tracker.ensure_running()
-            if self._executor is None:
-                self._executor = _executor()
-            try:
-                future: Future[R] = self._executor.submit(work, *arguments)
-            except BrokenProcessPool:  # it died with nothing to do
-                self.end()
-                self._executor = _executor()
-                future = self._executor.submit(work, *arguments)
+        with uninterrupted(), _refusals_shown():
+            # Up to Python 3.11 its resource tracker leaves interrupts unblocked when it has started, so they are held
+            # back anew for the process.
+            with _interrupts_held_back():
+                resource_tracker.ensure_running()
+            with _interrupts_held_back():
+                return self._submitted(work, *arguments)
+
+    def _submitted(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
+        if self._executor is None:
+            self._executor = _executor()
+        try:
+            future: Future[R] = self._executor.submit(work, *arguments)
+        except BrokenProcessPool:  # it died with nothing to do
+            self.end()
+            self._executor = _executor()
+            future = self._executor.submit(work, *arguments)
         return future
 
     def end(self) -> None:

@@ -3,15 +3,18 @@
 They are given in TOML, in a manifest or as ``KEY=VALUE``. Descriptions are read from the records themselves.
 """
 
+import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import date, time
+from numbers import Number
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import DataError, did_you_mean, no_such
+from toolkit.errors import DataError, did_you_mean, no_such, type_of
 from toolkit.files.documents import readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings.records import POLICIES, Settings, SettingsError
@@ -27,6 +30,7 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     or out of range; ``place`` says where the values come from.
     """
     _check_keys(given, Settings, "", place)
+    _check_values(given, "", place)
     values = _with_policy(_with_none(given, Settings), place)
     try:
         return msgspec.convert(values, Settings)
@@ -121,6 +125,17 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
             raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
+
+
+def _check_values(given: Mapping[str, Any], prefix: str, place: str) -> None:
+    """Raise SettingsError for a value that no TOML file has, as an array, and for a number that no JSON file has."""
+    for key, value in given.items():
+        if isinstance(value, Mapping):
+            _check_values(value, f"{prefix}{key}.", place)
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise SettingsError(f"{place}: {prefix}{key}: expected a finite number, not {value}")
+        elif not isinstance(value, str | Number | list | date | time | None):
+            raise SettingsError(f"{place}: {prefix}{key} is {type_of(value)}; give a number, a text, true or false")
 
 
 class Described(NamedTuple):

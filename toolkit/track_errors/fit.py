@@ -91,7 +91,7 @@ def fit_track_noise(sequence: Sequence) -> Fit:
     if count < FEWEST_TRACKS:
         raise DataError(
             f"{sequence.name}: {count} visible tracks have three sightings or more, too few to fit their noise to "
-            f"({FEWEST_TRACKS} are needed); state it with noise.tracks=correlated, or leave it white"
+            f"({FEWEST_TRACKS} are needed)"
         )
     try:
         return _fitted(sequence, groups)
@@ -114,8 +114,7 @@ def _fitted(sequence: Sequence, groups: tuple[Tracklets, ...]) -> Fit:
         if state.freedom < LEAST_FREEDOM:
             raise DataError(
                 f"{sequence.name}: {len(sequence.visible) / sequence.frame_count:.1f} visible tracks a frame are too "
-                "few: the camera's motion absorbs their errors, and their noise cannot be fitted; state it with "
-                "noise.tracks=correlated, or leave it white"
+                "few: the camera's motion absorbs their errors, and their noise cannot be fitted"
             )
     assert model is not None
     return _chosen(state, model, sequence)

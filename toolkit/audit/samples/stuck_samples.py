@@ -31,7 +31,7 @@ IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 def check(evidence: Evidence) -> Symptom | None:
     """Count the samples that repeat the one before in a long run; drop them."""
     sequence = evidence.sequence
-    if sequence.motion_kind == "none":
+    if sequence.motion_kind == "none" or not sequence.motion.t_ns.size:
         return None
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
     step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S

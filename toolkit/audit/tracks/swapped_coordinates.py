@@ -9,6 +9,9 @@ Rows and columns may be exchanged in some of the tracks only. The camera's own m
 predicts on which part of its epipolar line a point of unknown depth is seen next (Hartley & Zisserman, "Multiple View
 Geometry in Computer Vision", section 9.2). A track with exchanged rows and columns follows this line once they are
 exchanged back.
+
+A right image that is missing may stand as one value in uR, while uL and v are sound. No two tracks have the same uR to
+the last digit but by chance, or by rounding, and then many values are as frequent.
 """
 
 import itertools
@@ -38,6 +41,9 @@ LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
 TRACK_SIGMAS, LEAST_PAIRS = 4.0, 3
 # Inverse depths (1/m) along an epipolar line, from infinity to half a metre.
 _INVERSE_DEPTHS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 23)])
+# A uR that stands for a missing right image is in so many sightings at least, with so many values of uL, and is so many
+# times as frequent as any other uR. In the sound recordings at hand, one with halves of a pixel among them, it is 2.4.
+FEWEST_FILLED, FEWEST_PLACES, TIMES_AS_FREQUENT = 10, 5, 10
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
 NAMES = ("uL", "uR", "v")
@@ -46,7 +52,7 @@ NAMES = ("uL", "uR", "v")
 def check(evidence: Evidence) -> Symptom | None:
     """Find the order of the coordinates under which tracks and motion agree; exchange them where it is certain."""
     sequence = evidence.sequence
-    if (partly := _rows_in_some_tracks(evidence)) is not None:
+    if (partly := _filled_right(sequence) or _rows_in_some_tracks(evidence)) is not None:
         return partly
     disparity = disparity_px(sequence.observations.uv_px)
     suspect = np.isfinite(disparity) & (disparity <= 0.0)
@@ -69,6 +75,30 @@ def check(evidence: Evidence) -> Symptom | None:
     order_name, remedy = explained[0]
     treatment = "exchanged back, and the tracks agree with the measured motion"
     return Symptom(count, f"{detail}: {order_name}", treatment, remedy, spoils_vision=True)
+
+
+def _filled_right(sequence: Sequence) -> Symptom | None:
+    """Report right images that are missing and written as one value of uR; these sightings have uL and v alone."""
+    observations = sequence.observations
+    uv_px = observations.uv_px
+    values, counts = np.unique(uv_px[np.isfinite(uv_px[:, 1]), 1], return_counts=True)
+    if not values.size:
+        return None
+    *_, second = [0, *np.sort(counts)[:-1]]
+    filler = float(values[np.argmax(counts)])
+    filled = (uv_px[:, 1] == filler) & (uv_px[:, 0] != filler)  # else the left image is missing as well
+    count, places = int(filled.sum()), np.unique(uv_px[filled, 0]).size
+    if count < max(FEWEST_FILLED, TIMES_AS_FREQUENT * second) or places < FEWEST_PLACES:
+        return None
+    without = uv_px.copy()
+    without[filled, 1] = np.nan
+    return Symptom(
+        count=count,
+        detail=f"{count} of {len(uv_px)} sightings have a uR of {filler:g} at {places} values of uL: no right image",
+        treatment="taken as sightings by the left image alone; leave uR empty where there is none",
+        remedy=_with_pixels(sequence, without),
+        harmful=False,
+    )
 
 
 def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:

@@ -209,6 +209,8 @@ class Columns:
         values = np.asarray(self.values[name])
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
+        if values.dtype.kind == "c":
+            raise DataError(f"{self.what}: column {name} holds complex numbers; give their real parts")
         try:
             if values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any():
                 raise ValueError  # Python takes 1_0 for ten
@@ -312,13 +314,20 @@ def _cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in line.split(separator)]
 
 
+def _unmasked(column: Any) -> npt.NDArray[Any]:
+    """Return a column as an array, with NaN where it is masked."""
+    if isinstance(column, np.ma.MaskedArray) and column.mask.any():
+        return np.asarray(np.ma.filled(np.ma.asarray(column, dtype=np.float64), np.nan))
+    return np.asarray(column)
+
+
 def columns_given(what: str, given: Any) -> Columns:
     """Return what a program gives as columns: a mapping of names to values (N,), or anything like a data frame.
 
     Raises DataError where it is none, or its columns differ in length.
     """
     try:
-        values = {str(name): np.asarray(given[name]) for name in given}
+        values = {str(name): _unmasked(given[name]) for name in given}
         lengths = {name: len(column) for name, column in values.items()}
     except (TypeError, KeyError, IndexError, ValueError) as error:
         raise DataError(f"{what}: is no mapping of column names to values ({error}); give a dict of arrays") from error
