@@ -174,6 +174,16 @@ def test_a_full_smoother_claims_the_models_bound_where_there_is_no_truth(run_est
     assert "linearised at its own answer" in notes["claimed_variance"]
 
 
+@pytest.mark.parametrize("scenario", [DRIVE_IMU, DRIVE], ids=lambda scenario: scenario.name)
+def test_a_measured_start_is_placed_as_the_estimates_are_and_its_tilt_is_an_error_where_an_imu_measures_it(scenario):
+    sequence = simulate(SHORT[scenario.name], 3)
+    start, tilted = start_from_measurements(sequence), sequence.truth.T_world_imu[0] @ se3_exp(np.full(6, 0.05))
+    placed = cramer_rao._measured_start(sequence, tilted).T_world_imu
+    level = start.T_world_imu if scenario is DRIVE_IMU else tilted
+    np.testing.assert_allclose(placed[2, :3], level[2, :3], atol=1e-12)
+    np.testing.assert_allclose(placed[:3, 3], tilted[:3, 3], atol=1e-9)
+
+
 def test_measurements_that_do_not_determine_a_state_have_no_bound(sequence, make_run, monkeypatch):
     """As GTSAM says it of a graph that an estimator which has lost its way leaves."""
 

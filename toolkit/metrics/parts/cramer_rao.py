@@ -26,7 +26,7 @@ from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
-from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import left_only, stereo
@@ -154,8 +154,8 @@ def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
     With an IMU its tilt is measured and stays; without one it is the whole pose.
     """
     start = start_from_measurements(sequence)
-    place = place_yaw if sequence.motion_kind == "imu" else place_pose
-    T_world_imu = place(first_pose, start.T_world_imu).apply(start.T_world_imu[None])[0]
+    placement = place_first(first_pose, start.T_world_imu, sequence.motion_kind == "imu")
+    T_world_imu = placement.apply(start.T_world_imu[None])[0]
     v_world = T_world_imu[:3, :3] @ start.T_world_imu[:3, :3].T @ start.v_world
     return Prior(T_world_imu, v_world, start.bias, start.cov, start.source)
 
