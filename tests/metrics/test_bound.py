@@ -11,7 +11,7 @@ from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
 from toolkit.metrics.parts import cramer_rao
 from toolkit.metrics.parts.cramer_rao import efficient
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, simulate
 
 SHORT = {
     s.name: replace(s, duration_s=duration_s, camera=replace(s.camera, max_tracks=40))
@@ -154,6 +154,22 @@ def test_without_an_exact_truth_the_bound_is_what_the_model_claims_and_says_why(
     # The start of this run is drawn; what the model claims has the start from the measurements, which is the gauge.
     assert 0.0 < values["bound_position_m"] < 1.1 * exact["bound_position_m"]
     assert (values["error_over_bound"] is None) == (lacking == "truth")
+
+
+def test_where_tracks_err_otherwise_than_stated_there_is_no_bound_to_lose_against(make_run):
+    """A bound for a pixel of white noise is none for tracks that walk by a tenth of it: estimators would beat it."""
+    tracks = SCENARIOS["drive-realistic"].track_noise
+    white, sequence = simulate(SHORT["drive"], 0), simulate(replace(SHORT["drive"], track_noise=tracks), 0)
+    values, notes = scores(with_error(white, make_run, np.zeros(6)), sequence)
+    assert values["excess_variance"] is None and values["claimed_pose"] is not None
+    assert "the noise is not as stated" in notes["excess_variance"]
+
+
+def test_no_bound_is_computed_under_a_stated_noise_of_tracks(sequence, make_run):
+    told = replace(sequence, rig=replace(sequence.rig, track_noise=SCENARIOS["drive-realistic"].track_noise))
+    values, notes = scores(with_error(sequence, make_run, np.zeros(6)), told)
+    assert set(values.values()) == {None}
+    assert "correlated (noise.tracks)" in notes["bound_position_m"]
 
 
 @pytest.mark.parametrize("name", ["drive", "flight"])
