@@ -38,6 +38,15 @@ def test_no_function_has_more_than_fifty_lines() -> None:
     assert {name: count for name, count in lines.items() if count > MOST_LINES_OF_A_FUNCTION} == {}
 
 
+def test_the_name_of_a_class_stands_for_one_thing() -> None:
+    places: dict[str, list[str]] = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(path.relative_to(PROJECT).as_posix())
+    assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}
+
+
 @pytest.mark.parametrize("init", [path for path in FILES if path.name == "__init__.py"], ids=lambda p: p.parent.name)
 def test_a_folder_names_every_module_in_it(init: Path) -> None:
     text = init.read_text(encoding="utf-8")
