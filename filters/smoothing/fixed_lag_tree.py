@@ -211,14 +211,15 @@ class FixedLagTree:
         eliminated_anew: gtsam.KeyList,
     ) -> None:
         """Add factors and values, remove some factors, and relinearise all chained sightings."""
-        before, together = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph(factors)
-        slots = [*dropped_slots, *self._chained.slots]
+        # A copy: what GTSAM returns changes with the tree.
+        before = gtsam.NonlinearFactorGraph(self._isam.getFactorsUnsafe())
+        together, slots = gtsam.NonlinearFactorGraph(factors), [*dropped_slots, *self._chained.slots]
         together.push_back(self._relinearised(values))
         try:
             result = self._isam.update(together, values, slots, self._order(), _key_list(self._fixed), eliminated_anew)
         except RuntimeError:
             # The new factors are in the tree by now: in the first free slots, in their order.
-            new_slots = _new_slots(before, self._isam.getFactorsUnsafe())
+            new_slots = _new_slots(before, slots, self._isam.getFactorsUnsafe())
             self._chained.placed(new_slots[factors.size() :])
             raise
         placed, ours = list(result.getNewFactorsIndices()), factors.size()
@@ -359,10 +360,12 @@ def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
     return listed
 
 
-def _new_slots(before: gtsam.NonlinearFactorGraph, after: gtsam.NonlinearFactorGraph) -> list[int]:
-    """Return the slots, ascending, that have a factor now and had none before."""
-    was = [slot < before.size() and before.exists(slot) for slot in range(after.size())]
-    return [slot for slot in range(after.size()) if after.exists(slot) and not was[slot]]
+def _new_slots(
+    before: gtsam.NonlinearFactorGraph, removed: Iterable[int], after: gtsam.NonlinearFactorGraph
+) -> list[int]:
+    """Return the slots, ascending, that have a factor now and had none before, or one that was removed."""
+    kept = {slot for slot in range(before.size()) if before.exists(slot)}.difference(removed)
+    return [slot for slot in range(after.size()) if after.exists(slot) and slot not in kept]
 
 
 def _joined(first: gtsam.Values, second: gtsam.Values, keys: Collection[int]) -> gtsam.Values:

@@ -29,6 +29,9 @@ from toolkit.sequence import StereoRig
 
 # Sigma of the prior on a variable that nothing else determines: m for a landmark; rad, m, m/s for a state.
 WEAK_SIGMA = 1.0
+# As an angle, seen from the nearest pose, a landmark's is this at least: far more than any direction or attitude is
+# uncertain, and little enough that GTSAM accepts the landmark, whose direction may be known to 1e-4 rad.
+WEAK_ANGLE_RAD = 0.1
 # The condition number of a landmark's information, scaled to a unit diagonal, beyond which GTSAM refuses it.
 MOST_CONDITION = 7e7
 # The dummy variable, which is eliminated last.
@@ -88,11 +91,24 @@ def _scaled(information: Array) -> Array:
 
 
 def weak_prior(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
-    """Return a weak prior on a variable at its value."""
+    """Return a weak prior on a variable at its value; the values have the poses that saw it, if it is a landmark.
+
+    A prior of a metre would determine the direction of a landmark many kilometres away better than its sightings do,
+    and with it all attitudes.
+    """
     at = values.extract([key])
-    size = at.dim()
-    noise = gtsam.noiseModel.Isotropic.Sigma(size, WEAK_SIGMA)
+    size, sigma = at.dim(), WEAK_SIGMA
+    if kind_of(key) == "l":
+        sigma = max(sigma, WEAK_ANGLE_RAD * _least_distance_m(at.atPoint3(key), values))
+    noise = gtsam.noiseModel.Isotropic.Sigma(size, sigma)
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, np.eye(size), np.zeros(size), noise), at)
+
+
+def _least_distance_m(point: Array, values: gtsam.Values) -> float:
+    """Return the distance of a point (3,) from the nearest of all poses, 0 without any."""
+    poses = gtsam.utilities.allPose3s(values)
+    places = [poses.atPose3(key).translation() for key in poses.keys()]  # noqa: SIM118 - not a mapping
+    return min((float(np.linalg.norm(point - place)) for place in places), default=0.0)
 
 
 def ties_of_the_last(state: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:

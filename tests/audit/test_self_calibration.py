@@ -16,7 +16,7 @@ from toolkit.audit.parts.bundle import (
     RIGHT_ROLL,
     RIGHT_SHIFT,
     Calibration,
-    Window,
+    KeyFrameWindow,
     predicted,
     stride_equations,
 )
@@ -77,7 +77,7 @@ def test_a_stride_is_what_gtsam_preintegrates_and_changes_with_the_biases_alike(
 
 
 @cache
-def window_and_calibration(scenario: Scenario = FLIGHT) -> tuple[Window, Calibration]:
+def window_and_calibration(scenario: Scenario = FLIGHT) -> tuple[KeyFrameWindow, Calibration]:
     """A window of noisy measurements, and a calibration that is off: no residual is zero."""
     sequence = recorded(scenario, 0)
     (window,) = _windows(sequence, Evidence(sequence).camera_motion, np.zeros(3))

@@ -1,7 +1,11 @@
-"""The tree can be read: short files, short functions, and a folder's __init__ that names what lives there."""
+"""The tree can be read: short files, short functions, and a folder's __init__ that names what lives there.
+
+What import-linter proves, it proves of the modules that its contracts name: these are all there are.
+"""
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +38,15 @@ def test_no_function_has_more_than_fifty_lines() -> None:
     assert {name: count for name, count in lines.items() if count > MOST_LINES_OF_A_FUNCTION} == {}
 
 
+def test_the_name_of_a_class_stands_for_one_thing() -> None:
+    places: dict[str, list[str]] = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(path.relative_to(PROJECT).as_posix())
+    assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}
+
+
 @pytest.mark.parametrize("init", [path for path in FILES if path.name == "__init__.py"], ids=lambda p: p.parent.name)
 def test_a_folder_names_every_module_in_it(init: Path) -> None:
     text = init.read_text(encoding="utf-8")
@@ -42,3 +55,46 @@ def test_a_folder_names_every_module_in_it(init: Path) -> None:
         inside = {path.stem for path in init.parent.glob("*.py")} - {"__init__", "__main__"}
         inside |= {path.parent.name for path in init.parent.glob("*/__init__.py")}
         assert {name for name in inside if not re.search(rf"\b{name}\b", text)} == set()
+
+
+def imports(path: Path) -> set[str]:
+    """Return the modules that a file imports, as ``toolkit.models.stereo``."""
+    tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    found = [
+        [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+        for node in tree
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
+    return {name for names in found for name in names}
+
+
+def contract(name: str) -> dict[str, list[str]]:
+    """Return the contract of import-linter of that name."""
+    contracts = tomllib.loads((PROJECT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    return next(one for one in contracts if one["name"] == name)
+
+
+def test_estimators_import_of_the_toolkit_what_the_page_on_extending_names_and_nothing_forbidden() -> None:
+    page = (PROJECT / "docs" / "extending.md").read_text(encoding="utf-8")
+    named = re.search(r"may import from `toolkit` only what measures and models \(([^)]+)\)", page)
+    assert named
+    allowed = set(re.findall(r"`(\w+)`", named[1]))
+    files = (PROJECT / "filters").rglob("*.py")
+    used = {name.split(".")[1] for path in files for name in imports(path) if name.startswith("toolkit.")}
+    assert used == allowed
+    forbidden = contract("Estimators see the measurements and the models, not the judges")["forbidden_modules"]
+    # What is left is below the modules that estimators may import, and reached through them alone.
+    below = {"discovery", "files", "threads", "track_budget"}
+    there = {path.stem for path in (PROJECT / "toolkit").glob("[!_]*.py")}
+    there |= {path.parent.name for path in (PROJECT / "toolkit").glob("*/__init__.py")}
+    assert there == allowed | below | {name.removeprefix("toolkit.") for name in forbidden}
+
+
+def test_every_estimator_without_gtsam_is_held_to_infer_nothing_with_it() -> None:
+    handwritten = {
+        f"filters.{path.stem}"
+        for path in (PROJECT / "filters").glob("[!_]*.py")
+        if not any(name.startswith(("gtsam", "filters.smoothing")) for name in imports(path))
+    }
+    held = contract("The handwritten filters infer nothing with GTSAM")["source_modules"]
+    assert handwritten | {"filters.kalman"} == set(held)

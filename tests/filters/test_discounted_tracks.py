@@ -1,5 +1,7 @@
 """Sightings that count for a share in smoothers: of every cost that share, outliers where they were, old ones too."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from toolkit.geometry import se3_exp
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X, huber_loss, linear_factor
 from toolkit.sequence import StereoFrame
+from toolkit.settings import POLICIES, Settings
 from toolkit.simulation import DRIVE, simulate
 
 SHARE, HUBER = 0.1, 1.5
@@ -79,6 +82,15 @@ def test_factors_made_anew_cost_what_new_ones_do_and_others_stay_as_they_were(ri
     for i in range(expected.size()):
         assert made.at(i).error(values) == pytest.approx(expected.at(i).error(values), rel=1e-12)
     assert made.at(4).error(values) == prior.error(values)
+
+
+@pytest.mark.parametrize("policy", ["robust", "gate"])
+def test_tracks_that_count_for_less_keep_the_loss_of_the_policy(policy, monkeypatch):
+    s, settings = simulate(replace(DRIVE, duration_s=1.0), 0), Settings(outliers=POLICIES[policy])
+    tracks = DiscountedTracks(Setup(s.rig, s.noise, s.prior, s.gravity_world, s.motion_kind, settings=settings))
+    monkeypatch.setattr(DiscountedTracks, "share", SHARE)
+    huber = settings.outliers.smoother_huber
+    assert tracks.now.huber == (None if huber is None else pytest.approx(huber * SHARE**0.5))
 
 
 @pytest.fixture

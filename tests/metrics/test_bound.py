@@ -11,7 +11,7 @@ from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
 from toolkit.metrics.parts import cramer_rao
 from toolkit.metrics.parts.cramer_rao import efficient
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, simulate
 
 SHORT = {
     s.name: replace(s, duration_s=duration_s, camera=replace(s.camera, max_tracks=40))
@@ -156,6 +156,22 @@ def test_without_an_exact_truth_the_bound_is_what_the_model_claims_and_says_why(
     assert (values["error_over_bound"] is None) == (lacking == "truth")
 
 
+def test_where_tracks_err_otherwise_than_stated_there_is_no_bound_to_lose_against(make_run):
+    """A bound for a pixel of white noise is none for tracks that walk by a tenth of it: estimators would beat it."""
+    tracks = SCENARIOS["drive-realistic"].track_noise
+    white, sequence = simulate(SHORT["drive"], 0), simulate(replace(SHORT["drive"], track_noise=tracks), 0)
+    values, notes = scores(with_error(white, make_run, np.zeros(6)), sequence)
+    assert values["excess_variance"] is None and values["claimed_pose"] is not None
+    assert "the noise is not as stated" in notes["excess_variance"]
+
+
+def test_no_bound_is_computed_under_a_stated_noise_of_tracks(sequence, make_run):
+    told = replace(sequence, rig=replace(sequence.rig, track_noise=SCENARIOS["drive-realistic"].track_noise))
+    values, notes = scores(with_error(sequence, make_run, np.zeros(6)), told)
+    assert set(values.values()) == {None}
+    assert "correlated (noise.tracks)" in notes["bound_position_m"]
+
+
 @pytest.mark.parametrize("name", ["drive", "flight"])
 def test_a_full_smoother_attains_and_claims_the_bound_from_a_measured_start(run_estimator, name):
     """What a simulation without its drawn prior is, and a recording whose truth has every state."""
@@ -172,6 +188,16 @@ def test_a_full_smoother_claims_the_models_bound_where_there_is_no_truth(run_est
     # Two in a thousand sightings are cut from batch's last solve.
     assert values["claimed_variance"] == pytest.approx(1.0, abs=0.02)
     assert "linearised at its own answer" in notes["claimed_variance"]
+
+
+@pytest.mark.parametrize("scenario", [DRIVE_IMU, DRIVE], ids=lambda scenario: scenario.name)
+def test_a_measured_start_is_placed_as_the_estimates_are_and_its_tilt_is_an_error_where_an_imu_measures_it(scenario):
+    sequence = simulate(SHORT[scenario.name], 3)
+    start, tilted = start_from_measurements(sequence), sequence.truth.T_world_imu[0] @ se3_exp(np.full(6, 0.05))
+    placed = cramer_rao._measured_start(sequence, tilted).T_world_imu
+    level = start.T_world_imu if scenario is DRIVE_IMU else tilted
+    np.testing.assert_allclose(placed[2, :3], level[2, :3], atol=1e-12)
+    np.testing.assert_allclose(placed[:3, 3], tilted[:3, 3], atol=1e-9)
 
 
 def test_measurements_that_do_not_determine_a_state_have_no_bound(sequence, make_run, monkeypatch):

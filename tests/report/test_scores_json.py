@@ -12,7 +12,7 @@ from toolkit.experiment.comparison import Comparison, Row, consistency_of
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
-from toolkit.report.score_records import PROMISED_KEYS, Metrics
+from toolkit.report.score_records import PROMISED_KEYS, MetricsDocument
 from toolkit.report.scores_json import metrics_document
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
@@ -25,7 +25,7 @@ def document(comparison: Comparison) -> dict[str, Any]:
 
 def test_what_is_written_is_read_back(comparison: Comparison) -> None:
     built = metrics_document(comparison)
-    assert parse(to_text(built), Metrics) == built
+    assert parse(to_text(built), MetricsDocument) == built
 
 
 def test_every_run_and_output_has_one_entry(document: dict[str, Any]) -> None:
@@ -58,13 +58,13 @@ def test_what_the_audit_could_not_decide_is_reported(comparison: Comparison, doc
 
 def test_a_document_of_before_faults_could_be_undecided_is_read(document: dict[str, Any]) -> None:
     older = {key: value for key, value in document.items() if key != "undecided"}
-    assert parse(json.dumps(older), Metrics).undecided is UNSET
+    assert parse(json.dumps(older), MetricsDocument).undecided is UNSET
 
 
 def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], without_truth: Comparison) -> None:
     assert document["sequence"]["path_m"] > 0.0
     blind = metrics_document(without_truth)
-    assert parse(to_text(blind), Metrics) == blind
+    assert parse(to_text(blind), MetricsDocument) == blind
     assert blind.sequence.path_m is None
 
 
@@ -73,7 +73,7 @@ def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
 ) -> None:
     timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
     built = json.loads(to_text(metrics_document(timid)))
-    assert parse(to_text(metrics_document(timid)), Metrics) == metrics_document(timid)
+    assert parse(to_text(metrics_document(timid)), MetricsDocument) == metrics_document(timid)
     low, high = built["runs"][0]["consistency"].pop("band")
     assert (low, high) == (pytest.approx(1.2373 / 6, rel=1e-4), pytest.approx(14.4494 / 6, rel=1e-4))
     assert built["runs"][0]["consistency"] == {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1}
@@ -103,7 +103,7 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
     trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
     leaning = rescored(comparison, lambda row: Scores(row.scores.values | trend, {}))
     built = json.loads(to_text(metrics_document(leaning)))
-    assert parse(to_text(metrics_document(leaning)), Metrics) == metrics_document(leaning)
+    assert parse(to_text(metrics_document(leaning)), MetricsDocument) == metrics_document(leaning)
     assert built["runs"][0]["consistency"] == {
         "verdict": "contradicted",
         "metric": "correction_trend",
@@ -144,5 +144,5 @@ def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Compari
 def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:
     scores = Scores(dict.fromkeys(describe(), float("nan")), {})
     built = metrics_document(rescored(comparison, lambda _: scores))
-    assert parse(to_text(built), Metrics) == built
+    assert parse(to_text(built), MetricsDocument) == built
     assert built.runs[0].metrics["ate_se3_m"] is None

@@ -10,11 +10,14 @@ import pytest
 from toolkit.cli import main
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
+from toolkit.experiment.configuration import Configuration
 from toolkit.files.documents import to_line
 from toolkit.report.card import card_lines, card_record, card_text
 from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.html.payload import payload_of
 from toolkit.report.records import read_card
 from toolkit.report.report_json import report_document
+from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.sequence import Sequence
 from toolkit.settings import settings_of
 from toolkit.simulation.track_faults import disparity_scale, persistent_mismatch
@@ -79,7 +82,7 @@ def test_the_command_refuses_a_recording_without_tracks_in_one_line(capsys: pyte
     assert "too few to fit their noise" in capsys.readouterr().err
 
 
-def test_a_report_has_the_card_where_the_noise_was_fitted(walking: Sequence) -> None:
+def test_a_report_and_its_page_have_the_card_where_the_noise_was_fitted(walking: Sequence, tmp_path: Path) -> None:
     settings = settings_of({"noise": {"tracks": "fitted"}}, "test")
     comparison = run(Plan((walking.truncated(50),), ("dead-reckoning",), settings=settings, workers=1))[0]
     assert comparison.card is not None
@@ -91,6 +94,8 @@ def test_a_report_has_the_card_where_the_noise_was_fitted(walking: Sequence) -> 
         comparison, width=None
     )
     assert any("causal answers use it too early" in fact for fact in report.words.facts)
+    write_run(comparison, tmp_path / "run", MadeBy("vislam compare", Configuration()))
+    assert tuple(payload_of([read_run(tmp_path / "run")])["cases"][0]["card"]) == words
 
 
 def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:

@@ -16,8 +16,8 @@ from toolkit.track_errors import Fit, fit_track_noise, summary_of
 from toolkit.track_errors.adjustment import adjusted, started
 from toolkit.track_errors.tracklets import (
     MOST_SIGHTINGS,
-    Residuals,
     Tailed,
+    TrackletResiduals,
     likelihood,
     linearised,
     middle_of_pair,
@@ -141,7 +141,7 @@ def test_derivatives_are_those_of_the_residuals(exact: Sequence) -> None:
 
 def test_the_gradient_is_that_of_the_likelihood(walking: Sequence) -> None:
     state = started(walking, (tracklets(walking)[5].select(slice(0, 20)),))
-    group = Residuals.of(linearised(state.tracks[0], state.T_world_middle, walking.rig), 1.0)
+    group = TrackletResiduals.of(linearised(state.tracks[0], state.T_world_middle, walking.rig), 1.0)
     at, step = likelihood(group, MODEL), 1e-6
     parts = np.stack([MODEL.noise.white_px, MODEL.noise.walk_px, MODEL.noise.offset_px])
     for part, channel in [(0, 0), (0, 1), (1, 1), (1, 2), (2, 1)]:

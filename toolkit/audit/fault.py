@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-from toolkit.audit.parts.alignment import Alignment, alignment
+from toolkit.audit.parts.alignment import TranslationFit, alignment
 from toolkit.audit.parts.clocks import TruthClock, truth_clock
 from toolkit.audit.parts.integrated_gravity import IntegratedGravity, integrated_gravity
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
@@ -134,7 +134,7 @@ class Evidence:
         return agreement(self.sequence, self.camera_motion)
 
     @cached_property
-    def alignment(self) -> Alignment | None:
+    def alignment(self) -> TranslationFit | None:
         """The scale of vision and the position of the camera; None without ``intervals``, or where undetermined."""
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 

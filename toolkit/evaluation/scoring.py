@@ -34,7 +34,7 @@ from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
-from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
 from toolkit.metrics.parts.consistency import (
     NOT_MET,
@@ -349,7 +349,7 @@ def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level:
         if not met[0]:
             raise Unavailable(NOT_PLACED)
         # The truth moves into the estimate's world, in which the covariances are stated.
-        true = (place_yaw if level else place_pose)(poses[0], true[0]).apply(true)
+        true = place_first(poses[0], true[0], level).apply(true)
     orientation, position = _nees(true, poses, *covs)
     scores = Scores(dict(zip(_NEES_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
     return scores.remarked(_NEES_KEYS, PLACED if placed else "")

@@ -21,7 +21,7 @@ from toolkit.models.twist import TwistIncrement
 Keys = tuple[int, ...]
 
 
-class Linearised(NamedTuple):
+class LinearisedStack(NamedTuple):
     """Whitened residuals (N, 6) and their Jacobians (N, 6, d) to each variable of a factor, in its order."""
 
     residuals: Array
@@ -38,7 +38,7 @@ class StackedFactors(Protocol):
     def residuals(self, values: gtsam.Values) -> Array:
         """Return the whitened residuals (N, 6)."""
 
-    def linearised(self, values: gtsam.Values) -> Linearised:
+    def linearised(self, values: gtsam.Values) -> LinearisedStack:
         """Return residuals and derivatives about some values."""
 
 
@@ -94,14 +94,14 @@ class StackedSteps:
         """Return the whitened residuals (N, 6)."""
         return _whitened(self.whitening, se3_log(self._errors(values)[1]))
 
-    def linearised(self, values: gtsam.Values) -> Linearised:
+    def linearised(self, values: gtsam.Values) -> LinearisedStack:
         """Return residuals and derivatives about some values."""
         step_now, error_pose = self._errors(values)
         error = se3_log(error_pose)
         by_end = self.whitening @ np.linalg.inv(se3_right_jacobian(error))
         by_step = -by_end @ se3_adjoint(se3_inverse(error_pose))
         by_start = by_step @ se3_adjoint(se3_inverse(step_now))
-        return Linearised(_whitened(self.whitening, error), (by_start, by_end, by_step @ self.d_step_d_bias))
+        return LinearisedStack(_whitened(self.whitening, error), (by_start, by_end, by_step @ self.d_step_d_bias))
 
     def _errors(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Return the steps (N, 4, 4) with the biases of the values, and their errors at the ends."""
@@ -142,14 +142,14 @@ class StackedBridges:
         """Return the whitened residuals (N, 6)."""
         return self._change(se3_log(self._steps(values)))
 
-    def linearised(self, values: gtsam.Values) -> Linearised:
+    def linearised(self, values: gtsam.Values) -> LinearisedStack:
         """Return residuals and derivatives about some values."""
         steps = self._steps(values)
         logs = se3_log(steps)
         ends = np.linalg.inv(se3_right_jacobian(logs)) / self.lasting_s[..., None, None] / self.sigmas[:, None, :, None]
         starts = -ends @ se3_adjoint(se3_inverse(steps))
         by_poses = (-starts[:, 0], starts[:, 1] - ends[:, 0], ends[:, 1])
-        return Linearised(self._change(logs), by_poses)
+        return LinearisedStack(self._change(logs), by_poses)
 
     def _steps(self, values: gtsam.Values) -> Array:
         """Return the motions (N, 2, 4, 4) over the two intervals."""

@@ -19,7 +19,7 @@ from toolkit.estimate import Output
 from toolkit.files.documents import read
 from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
 from toolkit.report.manifest import Manifest
-from toolkit.report.score_records import Metrics, Seeds, Undecided
+from toolkit.report.score_records import MetricsDocument, Seeds, Undecided
 
 Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
 Quantiles = Annotated[tuple[float, float, float], Meta(description="10, 50 and 90 %")]
@@ -34,7 +34,7 @@ __all__ = [
     "CardRecord",
     "CheckDocument",
     "Manifest",
-    "Metrics",
+    "MetricsDocument",
     "Report",
     "Seeds",
     "SeedsReport",
@@ -295,9 +295,9 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
             _check_lengths({"t_s": self.t_s, **nees, **errors})
 
 
-def read_metrics(path: Path) -> Metrics:
+def read_metrics(path: Path) -> MetricsDocument:
     """Read a ``metrics.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, Metrics, remedy=_REPEAT)
+    return read(path, MetricsDocument, remedy=_REPEAT)
 
 
 def read_seeds(path: Path) -> Seeds:

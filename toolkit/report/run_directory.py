@@ -35,7 +35,7 @@ from toolkit.report.manifest import manifest_document
 from toolkit.report.records import (
     CameraFrame,
     Manifest,
-    Metrics,
+    MetricsDocument,
     Report,
     Seeds,
     SeedsReport,
@@ -276,7 +276,7 @@ class RunFiles:
     """The run directory of one seed; trajectories, landmarks (M, 3) and images by the names the report gives them."""
 
     directory: Path
-    scores: Metrics
+    scores: MetricsDocument
     report: Report
     manifest: Manifest
     tracks: dict[str, DrawnPath]

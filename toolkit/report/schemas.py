@@ -13,12 +13,12 @@ from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.differences import DiffRecord
 from toolkit.report.export import BundleRecord
-from toolkit.report.records import CardRecord, CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
+from toolkit.report.records import CardRecord, CheckDocument, Manifest, MetricsDocument, Report, Seeds, SeedsReport
 from toolkit.report.verify_text import VerificationRecord
 
 # By the name of the schema's file, without its ending.
 RECORDS: Mapping[str, type[msgspec.Struct]] = {
-    "metrics-1": Metrics,
+    "metrics-1": MetricsDocument,
     "seeds-1": Seeds,
     "report-1": Report,
     "report-over-seeds-1": SeedsReport,

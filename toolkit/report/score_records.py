@@ -102,7 +102,7 @@ class ScoredRun(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"metrics.{key} is null, and notes does not say why")
 
 
-class Metrics(Struct, frozen=True, kw_only=True):
+class MetricsDocument(Struct, frozen=True, kw_only=True):
     """Every estimator's scores on one sequence."""
 
     schema: Literal["vislam.metrics/1"]

@@ -16,7 +16,7 @@ from toolkit.report.score_records import (
     ConsistencyMark,
     LogEntry,
     MetricOverSeeds,
-    Metrics,
+    MetricsDocument,
     QuantilesAll,
     RunOverSeeds,
     ScoredRun,
@@ -28,9 +28,9 @@ from toolkit.report.score_records import (
 from toolkit.sequence import Sequence
 
 
-def metrics_document(comparison: Comparison) -> Metrics:
+def metrics_document(comparison: Comparison) -> MetricsDocument:
     """Return the scores of a comparison; a value that is not finite becomes null with a note."""
-    return Metrics(
+    return MetricsDocument(
         schema="vislam.metrics/1",
         sequence=_sequence(comparison.sequence),
         audit=tuple(of_attributes(AuditEntry, finding) for finding in comparison.findings),
@@ -59,7 +59,7 @@ def seeds_document(over: Comparison) -> Seeds:
     )
 
 
-def scores_document(comparison: Comparison) -> Metrics | Seeds:
+def scores_document(comparison: Comparison) -> MetricsDocument | Seeds:
     """Return the scores of a comparison, of one seed or over many."""
     return seeds_document(comparison) if comparison.over_seeds else metrics_document(comparison)
 

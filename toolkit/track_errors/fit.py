@@ -16,8 +16,8 @@ from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
 from toolkit.track_errors.tracklets import (
     Likelihood,
-    Residuals,
     Tailed,
+    TrackletResiduals,
     Tracklets,
     joined,
     likelihood,
@@ -120,13 +120,14 @@ def _fitted(sequence: Sequence, groups: tuple[Tracklets, ...]) -> Fit:
     return _chosen(state, model, sequence)
 
 
-def _residuals(state: Adjusted, sequence: Sequence) -> list[Residuals]:
+def _residuals(state: Adjusted, sequence: Sequence) -> list[TrackletResiduals]:
     return [
-        Residuals.of(linearised(group, state.T_world_middle, sequence.rig), state.freedom) for group in state.tracks
+        TrackletResiduals.of(linearised(group, state.T_world_middle, sequence.rig), state.freedom)
+        for group in state.tracks
     ]
 
 
-def _most_likely(groups: list[Residuals], free: BoolArray, start: Tailed | None) -> tuple[Tailed, Likelihood]:
+def _most_likely(groups: list[TrackletResiduals], free: BoolArray, start: Tailed | None) -> tuple[Tailed, Likelihood]:
     """Return the most likely noise with the parts (3, 3) that are free, and its likelihood."""
     begin = _START_PX if start is None else np.maximum(_parts(start.noise), 2.0 * _LEAST_PX)
     degrees = _START_DEGREES if start is None else start.degrees

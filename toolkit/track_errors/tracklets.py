@@ -125,7 +125,7 @@ def middle_of_pair(rig: StereoRig) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearisedTracklets:
     """Residuals (B, n, 3) px, measured minus predicted in (c, d, v), and derivatives of the prediction.
 
     ``d_landmark`` (B, n, 3, 3) by the landmark's own (c, d, v); ``d_pose`` (B, n, 3, 6) by the sighting's pose of the
@@ -137,7 +137,7 @@ class Linearised:
     d_pose: Array
 
 
-def linearised(tracks: Tracklets, T_world_middle: Array, rig: StereoRig) -> Linearised:
+def linearised(tracks: Tracklets, T_world_middle: Array, rig: StereoRig) -> LinearisedTracklets:
     """Linearise the tracks about their landmarks and the poses (K, 4, 4) of the camera in the middle of the pair."""
     T_now_first = (
         se3_inverse(T_world_middle)[tracks.frames] @ T_world_middle[tracks.first_frame][:, None]
@@ -163,7 +163,7 @@ def linearised(tracks: Tracklets, T_world_middle: Array, rig: StereoRig) -> Line
     d_landmark[..., 1, 1] += 1.0 / point[..., 2]
     by_position = np.broadcast_to(-inverse_depth[:, None, None, None] * np.eye(3), by_landmark.shape)
     d_pose = d_point @ np.concatenate([skew(point), by_position], axis=-1)
-    return Linearised(tracks.cdv_px - predicted, d_landmark, d_pose)
+    return LinearisedTracklets(tracks.cdv_px - predicted, d_landmark, d_pose)
 
 
 def _d_cdv_d_point(point: Array, disparity_px: Array, rig: StereoRig) -> Array:
@@ -189,22 +189,22 @@ def whitened(per_channel: Array, values: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class TrackletResiduals:
     """Residuals (3, B, n) px of B tracks, channel by channel, and their derivatives by the landmark (3, B, 3, n)."""
 
     px: Array
     by_landmark: Array
 
     @classmethod
-    def of(cls, tracks: Linearised, freedom: float) -> "Residuals":
+    def of(cls, tracks: LinearisedTracklets, freedom: float) -> "TrackletResiduals":
         """Return the residuals about adjusted poses, scaled to the size of errors by the remaining share of freedom."""
         px = np.moveaxis(tracks.residual_px, 2, 0) / np.sqrt(freedom)
         by_landmark = tracks.d_landmark.transpose(2, 0, 3, 1)
         return cls(np.ascontiguousarray(px), np.ascontiguousarray(by_landmark))
 
-    def select(self, rows: slice) -> "Residuals":
+    def select(self, rows: slice) -> "TrackletResiduals":
         """Return the residuals of some tracks."""
-        return Residuals(self.px[:, rows], self.by_landmark[:, rows])
+        return TrackletResiduals(self.px[:, rows], self.by_landmark[:, rows])
 
     @property
     def equations(self) -> int:
@@ -238,7 +238,7 @@ class Likelihood:
     chi2: Array
 
 
-def likelihood(tracks: Residuals, model: Tailed) -> Likelihood:
+def likelihood(tracks: TrackletResiduals, model: Tailed) -> Likelihood:
     """Return the likelihood of tracks of one length."""
     n = tracks.px.shape[2]
     cov = model.noise.cov(np.arange(float(n)))

@@ -37,7 +37,7 @@ NEAR_M = 0.01
 _OWN = "x, y, z"
 
 
-class Reading(NamedTuple):
+class ExtrinsicConvention(NamedTuple):
     """An extrinsic (4, 4) under another convention than the given one.
 
     ``name`` is the convention, ``cause`` says what is wrong with the given extrinsic, and ``done`` what is done to it.
@@ -101,39 +101,41 @@ def _exchanged(alone: str) -> Symptom:
     )
 
 
-def _readings(given: Array) -> tuple[Reading, ...]:
+def _readings(given: Array) -> tuple[ExtrinsicConvention, ...]:
     """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
     place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
-    as_given = Reading(given, _OWN, "", "", place_m)
+    as_given = ExtrinsicConvention(given, _OWN, "", "", place_m)
     return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
 
 
-def _of_body(given: Array, turn: Array) -> Reading:
+def _of_body(given: Array, turn: Array) -> ExtrinsicConvention:
     axes = axes_named(turn[:3, :3])
     cause = f"the motion samples' axes are the extrinsic's {axes}"
-    return Reading(turn @ given, axes, cause, "the extrinsic is rotated to the samples' axes", given[:3, 3])
+    return ExtrinsicConvention(turn @ given, axes, cause, "the extrinsic is rotated to the samples' axes", given[:3, 3])
 
 
-def _of_camera(given: Array, turn: Array) -> Reading:
+def _of_camera(given: Array, turn: Array) -> ExtrinsicConvention:
     axes = axes_named(turn[:3, :3].T)
     cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
     done = "the camera's rotation is corrected, its position is kept"
-    return Reading(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
+    return ExtrinsicConvention(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
 
 
-def _inverse(given: Array) -> Reading:
+def _inverse(given: Array) -> ExtrinsicConvention:
     T_imu_cam, cause = se3_inverse(given), "T_imu_cam is inverted, from the IMU to the camera"
-    return Reading(T_imu_cam, "the inverse of the extrinsic", cause, "the extrinsic is inverted", T_imu_cam[:3, 3])
+    return ExtrinsicConvention(
+        T_imu_cam, "the inverse of the extrinsic", cause, "the extrinsic is inverted", T_imu_cam[:3, 3]
+    )
 
 
-def _best_two(readings: tuple[Reading, ...], costs: Array) -> tuple[int, int]:
+def _best_two(readings: tuple[ExtrinsicConvention, ...], costs: Array) -> tuple[int, int]:
     """Return the best reading, and the best among those under which the camera looks another way."""
     order = [int(k) for k in np.argsort(costs.mean(axis=1))]
     twins = _twins(readings, order[0])
     return order[0], next(k for k in order if k not in twins)
 
 
-def _twins(readings: tuple[Reading, ...], one: int) -> list[int]:
+def _twins(readings: tuple[ExtrinsicConvention, ...], one: int) -> list[int]:
     """Return the readings under which the camera looks the same way as under one, which is among them.
 
     A rotation of the camera's axes and one of the body's can be such a pair. The given extrinsic and its inverse have
@@ -145,7 +147,9 @@ def _twins(readings: tuple[Reading, ...], one: int) -> list[int]:
     return [k for k in range(len(readings)) if k == one or (apart_rad[k] < SAME_WAY_RAD and not {k, one} & {*alone})]
 
 
-def _settled(evidence: Evidence, intervals: Intervals, twins: list[Reading]) -> tuple[Reading, str]:
+def _settled(
+    evidence: Evidence, intervals: Intervals, twins: list[ExtrinsicConvention]
+) -> tuple[ExtrinsicConvention, str]:
     """Return the best of readings that look the same way, at the position that turns show, and any doubt in words."""
     costs = _costs(intervals, np.stack([one.T_imu_cam for one in twins])).mean(axis=1)
     place_m, doubt = _placed(evidence, intervals, twins[int(np.argmin(costs))])
@@ -154,7 +158,7 @@ def _settled(evidence: Evidence, intervals: Intervals, twins: list[Reading]) -> 
     return placed[int(np.argmin(costs))], doubt
 
 
-def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple[Array, str]:
+def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConvention) -> tuple[Array, str]:
     """Return the position (3,) m of a reading's camera, or its other one where turns show that, and doubt in words."""
     here, other = reading.T_imu_cam[:3, 3], reading.other_m
     turned = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=reading.T_imu_cam))

@@ -61,7 +61,7 @@ class Regression(NamedTuple):
     in_motion: float
 
 
-class Alignment(NamedTuple):
+class TranslationFit(NamedTuple):
     """Relative excess of the camera's translation, and the correction (3,) m of its position in the IMU frame.
 
     ``lever_cov_m2`` (3, 3) is the covariance of the correction. By chance the scale exceeds ``scale_by_chance`` less
@@ -80,7 +80,7 @@ class Alignment(NamedTuple):
         return np.sqrt(np.diag(self.lever_cov_m2))
 
 
-def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
+def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> TranslationFit | None:
     """Regress the camera's translation on the measured motion; None where there is too little to solve for it."""
     if intervals.v_mps is not None:
         step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
@@ -88,7 +88,7 @@ def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) ->
     return _with_accelerations(sequence, camera, intervals)
 
 
-def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_s: float) -> Alignment:
+def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_s: float) -> TranslationFit:
     """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
 
     Noise of the regressor biases the scale. Of the regression of one velocity on the other and the inverse regression,
@@ -105,7 +105,7 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
     error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
     by_chance = (1.0 + scale) ** 2 * _by_chance(whole)
-    return Alignment(Scalar(scale, error), whole.found[_LEVER], cov[_LEVER, _LEVER], by_chance, whole)
+    return TranslationFit(Scalar(scale, error), whole.found[_LEVER], cov[_LEVER, _LEVER], by_chance, whole)
 
 
 def _by_chance(whole: Regression) -> float:
@@ -134,7 +134,7 @@ def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> 
     return measured, seen, np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
 
 
-def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
+def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> TranslationFit | None:
     """Solve for the scale and the lever arm from displacements of the camera over strides within windows."""
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     stride = max(1, round(STRIDE_S / float(np.median(np.diff(frame_s)))))
@@ -161,7 +161,7 @@ def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Int
     found, cov = _robust_with_cov(response, jacobian, prior, block.astype(int))
     scale = Scalar(float(found[0]), float(np.sqrt(cov[0, 0])))
     by_chance = chance_sigmas(np.unique(block).size) * scale.error
-    return Alignment(scale, found[_LEVER], cov[_LEVER, _LEVER], by_chance)
+    return TranslationFit(scale, found[_LEVER], cov[_LEVER, _LEVER], by_chance)
 
 
 def _strides(sequence: Sequence, camera: CameraMotion, kept: IntArray) -> CameraMotion:

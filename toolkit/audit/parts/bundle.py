@@ -70,7 +70,7 @@ class Calibration(NamedTuple):
         return Calibration(after, late_s, self.bias + step[_BIASES], change_s, shift_px, roll_rad)
 
 
-class Window(NamedTuple):
+class KeyFrameWindow(NamedTuple):
     """A window of n key frames and T points, in the axes of the IMU at the first key frame.
 
     Attitudes (n, 3, 3), positions, velocities and, in the IMU's own axes, rates of rotation (n, 3); gravity (3,), the
@@ -95,7 +95,7 @@ class Window(NamedTuple):
         """Number of the window's own unknowns, without its points."""
         return self.strides.state_size * len(self.position) + self.strides.gravity_size
 
-    def moved(self, own: Array, points: Array) -> "Window":
+    def moved(self, own: Array, points: Array) -> "KeyFrameWindow":
         """Return the window after steps of its own unknowns and of its points (T, 3)."""
         count = len(self.position)
         state, gravity = np.split(own, [self.strides.state_size * count])
@@ -139,12 +139,12 @@ class _Back(NamedTuple):
         return own, (tracks.point_root.swapaxes(1, 2) @ rest[:, :, None])[..., 0]
 
 
-def moved(window: Window, reduced: Reduced, step: Array) -> Window:
+def moved(window: KeyFrameWindow, reduced: Reduced, step: Array) -> KeyFrameWindow:
     """Return the window after a step (21,) of the calibration and the step of its own unknowns that follows from it."""
     return window.moved(*reduced.back.steps(step))
 
 
-def reduce(window: Window, calibration: Calibration) -> Reduced:
+def reduce(window: KeyFrameWindow, calibration: Calibration) -> Reduced:
     """Linearise the window and eliminate its own unknowns and its points."""
     tracks, by_stride = _tracks(window, calibration), _strides(window, calibration)
     own, seen, information = window.unknowns, _seen(window), by_stride.information
@@ -165,7 +165,7 @@ def reduce(window: Window, calibration: Calibration) -> Reduced:
     )
 
 
-def _seen(window: Window) -> IntArray:
+def _seen(window: KeyFrameWindow) -> IntArray:
     """Return the unknowns (E,) that sightings depend on: the poses and the calibration except for the biases."""
     of_poses = window.strides.state_size * np.arange(len(window.position))[:, None] + np.arange(POSE)
     return np.concatenate([of_poses.ravel(), window.unknowns + _OF_CAMERA])
@@ -197,7 +197,7 @@ class Predicted(NamedTuple):
     d_point: Array
 
 
-def predicted(window: Window, calibration: Calibration) -> Predicted:
+def predicted(window: KeyFrameWindow, calibration: Calibration) -> Predicted:
     """Predict every sighting: the point in the IMU frame, moved on over the camera's delay, then projected.
 
     If a pose changes by [phi, rho] on its right, a point q in its axes changes by [q]x phi - rho. The Jacobians neglect
@@ -242,7 +242,7 @@ def _weighted(residual_px: Array, rig: StereoRig) -> Array:
     return np.asarray(rig.whitener / np.sqrt(scale2 + chi2 / CAUCHY_SIGMAS**2)[:, None, None])
 
 
-def _tracks(window: Window, calibration: Calibration) -> _Tracks:
+def _tracks(window: KeyFrameWindow, calibration: Calibration) -> _Tracks:
     """Return the tracks' normal equations in the poses and the camera, without the points."""
     seen, key, track = predicted(window, calibration), window.key, window.track
     weight = _weighted(window.uv_px - seen.uv_px, calibration.rig)
@@ -278,7 +278,7 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     return _Tracks(information - flat.T @ flat, gradients, root, point_cross, rest)
 
 
-def _strides(window: Window, calibration: Calibration) -> _Normal:
+def _strides(window: KeyFrameWindow, calibration: Calibration) -> _Normal:
     """Return the normal equations of the motion between the key frames, with gradients by parts of a second or more."""
     residual, jacobian = stride_equations(window, calibration)
     whitener, state = window.strides.whitener, window.strides.state_size
@@ -295,7 +295,7 @@ def _strides(window: Window, calibration: Calibration) -> _Normal:
     return _Normal(information, np.add.reduceat(gradients, part))
 
 
-def stride_equations(window: Window, calibration: Calibration) -> tuple[Array, Array]:
+def stride_equations(window: KeyFrameWindow, calibration: Calibration) -> tuple[Array, Array]:
     """Return the residuals (m, k) of the strides and their derivatives (m, k, j) by states, gravity and biases."""
     attitudes, position, velocity = window.R_first_imu, window.position, window.velocity
     return window.strides.equations(attitudes, position, velocity, window.gravity, calibration.bias)

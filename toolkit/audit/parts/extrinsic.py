@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.alignment import TURN, Alignment, Regression, robust_with_formal_cov
+from toolkit.audit.parts.alignment import TURN, Regression, TranslationFit, robust_with_formal_cov
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import INFLATION, Scalar, chance_bound, in_motion
 from toolkit.geometry import Array, skew
@@ -43,7 +43,7 @@ MOST_ERROR_RATIO = 4.0
 LEAST_BOUND_RAD = 5e-6
 
 
-def way_gone(sequence: Sequence, intervals: Intervals, found: Alignment, way_m: Array) -> Scalar:
+def way_gone(sequence: Sequence, intervals: Intervals, found: TranslationFit, way_m: Array) -> Scalar:
     """Return where the camera is along a vector (3,) m from the given position: 0 is its start, 1 its end."""
     return share_of_way(found.lever_m, found.lever_cov_m2 + _systematic_cov_m2(sequence, intervals), way_m)
 

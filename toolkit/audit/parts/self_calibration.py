@@ -15,8 +15,8 @@ from toolkit.audit.parts.bundle import (
     GYRO_BIAS,
     RIGHT_SHIFT,
     Calibration,
+    KeyFrameWindow,
     Reduced,
-    Window,
     moved,
     reduce,
 )
@@ -123,7 +123,7 @@ def self_calibration(
 class _At(NamedTuple):
     """Where an adjustment is linearised: the windows, the calibration, and its corrections so far (21,)."""
 
-    windows: list[Window]
+    windows: list[KeyFrameWindow]
     calibration: Calibration
     moved_by: Array
 
@@ -219,7 +219,7 @@ def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[
     return np.asarray(cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))), np.asarray(inverse)
 
 
-def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[Window]:
+def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[KeyFrameWindow]:
     """Return the windows in which the motion is known and there are enough tracks."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     stride = max(1, round(STRIDE_S / step_s))
@@ -255,7 +255,7 @@ def _roughly_moved(sequence: Sequence, camera: CameraMotion) -> tuple[Array, Boo
     return np.where(known[:, None, None], T_before_after, measured), np.ones_like(known)
 
 
-def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: Array) -> Window | None:
+def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: Array) -> KeyFrameWindow | None:
     """Return a window of frames (n,), initialised by the camera's own motion; None with too few tracks."""
     sighting, key, track = _long_tracks(sequence, keys)
     if track.size == 0 or track[-1] + 1 < FEWEST_TRACKS:
@@ -271,7 +271,7 @@ def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: A
     velocity, gravity = _velocities(T_first_imu, strides)
     w_radps = _rates(sequence, keys) - w_bias
     position, later = T_first_imu[:, :3, 3], float(np.mean(keys[1:] > sequence.frame_count // 2)) - 0.5
-    return Window(
+    return KeyFrameWindow(
         T_first_imu[:, :3, :3], position, velocity, w_radps, gravity, later, strides, key, track, uv_px, points
     )
 

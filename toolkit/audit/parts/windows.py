@@ -92,7 +92,7 @@ def moving(both: Array, least: float) -> BoolArray:
     return np.asarray(np.linalg.norm(both[1], axis=1) > least)
 
 
-class Compared(NamedTuple):
+class WindowMedian(NamedTuple):
     """A median over windows, its standard error, and the bound of the difference that it exceeds only by chance."""
 
     value: float
@@ -100,26 +100,26 @@ class Compared(NamedTuple):
     by_chance: float
 
 
-def compared(each: Array) -> Compared:
+def compared(each: Array) -> WindowMedian:
     """Return the median over windows (M,).
 
     With few windows neither the error of the median nor that of the mean is certain, so the larger one is used.
     """
     error = max(float(median_error(each[:, None])[0]), float(np.std(each)) / np.sqrt(each.size))
-    return Compared(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
+    return WindowMedian(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
 
 
-def off_by(both: Array) -> Compared:
+def off_by(both: Array) -> WindowMedian:
     """Return the difference of both motions (2, M, 3), as a share of the larger."""
     return compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
 
 
-def longer(seen: Array, true: Array) -> tuple[Compared, bool]:
+def longer(seen: Array, true: Array) -> tuple[WindowMedian, bool]:
     """Return the ratio of displacements (M, 3) along the true ones, and whether scaling removes the difference."""
     scale = _ratio(seen, true)
     return scale, scale.value > 0.0 and off_by(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
 
 
-def _ratio(seen: Array, true: Array) -> Compared:
+def _ratio(seen: Array, true: Array) -> WindowMedian:
     """Return the ratio of displacements (M, 3) along the true ones."""
     return compared((seen * true).sum(axis=1) / (true**2).sum(axis=1))

@@ -20,7 +20,7 @@ from toolkit.audit.parts.windows import (
     LEAST_WINDOWS,
     SYSTEMATIC,
     WINDOW_S,
-    Compared,
+    WindowMedian,
     Windows,
     longer,
     moving,
@@ -118,7 +118,7 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     return _symptom(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
 
 
-def _doubtful(scale: Compared) -> Undecided | None:
+def _doubtful(scale: WindowMedian) -> Undecided | None:
     """Return a scale that is beyond chance and within the limit of sound recordings, as undecided."""
     if abs(scale.value - 1.0) <= scale.by_chance:
         return None

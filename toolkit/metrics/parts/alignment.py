@@ -48,6 +48,15 @@ def place_yaw(truth: Array, estimate: Array) -> Alignment:
     return Alignment(rotation, truth[:3, 3] - rotation @ estimate[:3, 3])
 
 
+def place_first(truth: Array, estimate: Array, level: bool) -> Alignment:
+    """Place the first estimated pose (4, 4) on the true one, by heading and position alone where the world is level.
+
+    An estimator starts in a world of its own. With an IMU the vertical is measured, so that a tilt is an error and
+    stays; without one the whole first pose is arbitrary.
+    """
+    return place_yaw(truth, estimate) if level else place_pose(truth, estimate)
+
+
 def fit_se3(truth: Array, estimate: Array) -> Alignment:
     """Fit rotation and translation to positions (n, 3) by least squares (Umeyama, eqs. 38-43 with c = 1).
 

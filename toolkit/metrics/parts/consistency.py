@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
-from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.association import finite_poses, median_period_ns, true_poses_at
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Unavailable
@@ -183,8 +183,7 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
     if placed:
         if rows[0] != 0:
             raise Unavailable(NOT_PLACED)
-        place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
-        poses = place(true_poses[0], poses[0]).apply(poses)
+        poses = place_first(true_poses[0], poses[0], evaluation.level).apply(poses)
     return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, poses, placed)
 
 

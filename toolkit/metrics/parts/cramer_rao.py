@@ -26,7 +26,7 @@ from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
-from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import left_only, stereo
@@ -40,7 +40,8 @@ from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is
 # A sighting whose residual at the truth is this improbable is a mismatch and adds no information.
 _MISMATCH_PROBABILITY = 1e-6
 _POINT_ITERATIONS = 5
-# The motion's chi-square at an exact truth, over its degrees of freedom: 1, and 0.85 to 1.15 for 20 steps of an IMU.
+# The chi-square of motion and of sightings at an exact truth, over its degrees of freedom: 1. That of motion is 0.85 to
+# 1.15 for 20 steps of an IMU.
 _EXACT = (0.8, 1.25)
 
 
@@ -121,6 +122,11 @@ def _problem_at_truth(sequence: Sequence) -> _Problem:
         raise Unavailable(
             f"the truth is not exact: the measured motion is off it by {ratio:.2g} times the stated noise, squared"
         )
+    ratio, by_chance = _sighting_chi_square(problem)
+    if not _EXACT[0] - by_chance < ratio < _EXACT[1] + by_chance:
+        raise Unavailable(
+            f"the noise is not as stated: at the truth the tracks err by {ratio:.2g} times the stated noise, squared"
+        )
     return problem
 
 
@@ -140,7 +146,12 @@ def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> _Problem:
 
 
 def _problem(sequence: Sequence, prior: Prior | None, poses: Array, v_world: Array, bias: Array) -> _Problem:
-    """Return the problem about states (K, 4, 4), (K, 3), (K, 6), from the given prior or the measured start."""
+    """Return the problem about states (K, 4, 4), (K, 3), (K, 6), from the given prior or the measured start.
+
+    Raises Unavailable where the rig states a noise of tracks: here every sighting informs by itself.
+    """
+    if sequence.rig.track_noise is not None:
+        raise Unavailable("no bound is computed where errors of a track are stated to be correlated (noise.tracks)")
     model = motion_model(sequence.noise, sequence.gravity_world)
     start = model.initial_belief(_measured_start(sequence, poses[0]) if prior is None else prior)
     states = tuple(Belief(start.layout, *state, start.cov) for state in zip(poses, v_world, bias, strict=True))
@@ -154,8 +165,8 @@ def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
     With an IMU its tilt is measured and stays; without one it is the whole pose.
     """
     start = start_from_measurements(sequence)
-    place = place_yaw if sequence.motion_kind == "imu" else place_pose
-    T_world_imu = place(first_pose, start.T_world_imu).apply(start.T_world_imu[None])[0]
+    placement = place_first(first_pose, start.T_world_imu, sequence.motion_kind == "imu")
+    T_world_imu = placement.apply(start.T_world_imu[None])[0]
     v_world = T_world_imu[:3, :3] @ start.T_world_imu[:3, :3].T @ start.v_world
     return Prior(T_world_imu, v_world, start.bias, start.cov, start.source)
 
@@ -169,6 +180,20 @@ def _motion_chi_square(problem: _Problem) -> float:
         error = before.predicted(prediction).error_to(problem.states[packet.index])
         distances.append(float(error @ np.linalg.solve(prediction.noise, error)) / error.size)
     return float(np.mean(distances)) if distances else 1.0
+
+
+def _sighting_chi_square(problem: _Problem) -> tuple[float, float]:
+    """Return the mean squared residual of sightings at true poses, and five standard deviations of it by chance.
+
+    It is over the degrees of freedom that the landmarks, fitted to them, leave; 1 where there are none.
+    """
+    squared, dof = 0.0, -3 * problem.track_ids.size
+    for packet, state in zip(problem.packets, problem.states, strict=True):
+        uvs_px = packet.frame.uvs_px
+        seen = stereo.predict(problem.points[problem.rows(packet.frame)], state.T_world_imu, problem.rig)
+        squared += float(np.square(left_only.whitened_residuals(uvs_px, seen.uv_px, problem.rig)).sum())
+        dof += int(np.broadcast_to(left_only.degrees_of_freedom(uvs_px), len(uvs_px)).sum())
+    return (squared / dof, 5.0 * float(np.sqrt(2.0 / dof))) if dof > 0 else (1.0, 0.0)
 
 
 def _without_mismatches(

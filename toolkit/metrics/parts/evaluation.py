@@ -8,7 +8,7 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.metrics.parts.alignment import Alignment, fit_se3, place_pose, place_yaw
+from toolkit.metrics.parts.alignment import Alignment, fit_se3, place_first
 from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
 from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.metrics.parts.scores import Unavailable
@@ -45,9 +45,8 @@ class AgainstTruth:
         Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
         and position of the first pose are aligned; without one, the whole first pose is.
         """
-        place = place_yaw if self.level else place_pose
         pairs = self.compared
-        return place(pairs.truth[0], pairs.estimate[0]).apply(pairs.estimate)
+        return place_first(pairs.truth[0], pairs.estimate[0], self.level).apply(pairs.estimate)
 
     @cached_property
     def se3_alignment(self) -> Alignment:
