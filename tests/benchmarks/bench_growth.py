@@ -53,10 +53,16 @@ def with_window(**changed: float) -> Settings:
 
 GROWTHS = {
     "tracks": Growth(
-        (25, 50, 100, 200), (*FILTERS, "fixed-lag"), lambda n: (recording(tracks=int(n)), DEFAULTS), per_frame=True
+        (50, 100, 200, 400, 800),
+        (*FILTERS, "fixed-lag"),
+        lambda n: (recording(tracks=int(n)), DEFAULTS),
+        per_frame=True,
     ),
     "frames": Growth(
-        (200, 400, 800, 1600), (*FILTERS, *SMOOTHERS), lambda n: (recording(frames=int(n)), DEFAULTS), per_frame=False
+        (200, 400, 800, 1600, 3200),
+        (*FILTERS, *SMOOTHERS),
+        lambda n: (recording(frames=int(n)), DEFAULTS),
+        per_frame=False,
     ),
     "window": Growth(
         (0.5, 1.0, 2.0, 4.0),
