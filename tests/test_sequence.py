@@ -164,7 +164,7 @@ FRAMES = at_ms(0, 100, 200)
         (FRAMES, at_ms(0, 100, 100, 200), "motion sample 2 is not after"),
         (FRAMES, at_ms(50, 100, 200), "do not span"),
         (FRAMES, at_ms(0, 100), "do not span"),
-        (FRAMES, at_ms(), "do not span"),
+        (FRAMES, at_ms(), "no motion samples"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(frames, stamps, complaint):

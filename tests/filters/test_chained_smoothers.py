@@ -204,7 +204,7 @@ def test_a_landmark_behind_every_camera_that_saw_it_does_not_come_into_a_tree_bu
     assert recovery.dropped == {lost}
     assert recovery.log == [f"l{lost} was behind every camera that saw it and was dropped"]
     assert not estimator._tree.values().exists(L(lost))
-    estimator._note(packets[5], recovery)
+    estimator._note(recovery)
     for packet in packets[6:9]:
         estimator.step(packet)
     assert estimator._tree.values().exists(L(lost)) == (lost in packets[8].frame.track_ids)
