@@ -24,6 +24,7 @@ from toolkit.estimator import find
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import DRIVE_IMU, simulate
+from toolkit.simulation.scenes import Scene, SceneOf, road
 
 FILTERS = ("ekf", "riekf", "msckf-fej", "msckf-slam")
 SMOOTHERS = ("fixed-lag", "isam2", "batch")
@@ -39,10 +40,17 @@ class Growth:
     per_frame: bool
 
 
-def recording(tracks: int = 100, frames: int = 80) -> Recorded:
+def recording(tracks: int = 100, frames: int = 80, scene: SceneOf = road) -> Recorded:
     """Return a simulated drive with an IMU, so many tracks in view at a time."""
     camera = replace(DRIVE_IMU.camera, max_tracks=tracks)
-    return simulate(replace(DRIVE_IMU, camera=camera, duration_s=frames / camera.rate_hz), 0)
+    return simulate(replace(DRIVE_IMU, scene=scene, camera=camera, duration_s=frames / camera.rate_hz), 0)
+
+
+def crowded_road(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
+    """Return the drive's scene with eight landmarks in the place of each: more than 800 are in view."""
+    scene, rng = road(duration_s, drawn), np.random.default_rng(0)
+    beside = [scene.points + rng.normal(0.0, 0.5, scene.points.shape) for _ in range(7)]
+    return replace(scene, points=np.concatenate([scene.points, *beside]))
 
 
 def with_window(**changed: float) -> Settings:
@@ -55,7 +63,7 @@ GROWTHS = {
     "tracks": Growth(
         (50, 100, 200, 400, 800),
         (*FILTERS, "fixed-lag"),
-        lambda n: (recording(tracks=int(n)), DEFAULTS),
+        lambda n: (recording(tracks=int(n), scene=crowded_road), DEFAULTS),
         per_frame=True,
     ),
     "frames": Growth(
