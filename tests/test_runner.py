@@ -117,6 +117,12 @@ OF_GTSAM = "\nIndeterminate linear system near variable\n77 (Symbol: l7).\n\nThe
         (RuntimeError(OF_GTSAM), "RuntimeError: Indeterminate linear system near variable 77 (Symbol: l7)."),
         (EstimatorError("no\nway"), "no way"),
         (ValueError(), "ValueError"),
+        (
+            np.linalg.LinAlgError("Singular matrix"),
+            "rounding left a matrix without a root or an inverse (LinAlgError: Singular matrix); the usual cause is a "
+            "stated noise far below the errors of the measurements: set a larger one "
+            "(noise.pixel_sigma_px, noise.motion_scale)",
+        ),
     ],
 )
 def test_the_reason_of_a_failed_run_is_one_line_that_says_what_happened(error, reason, sequence):

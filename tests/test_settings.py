@@ -51,7 +51,7 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
         ({"estimators": {"mine": {"gain": -math.inf}}}, "estimators.mine.gain: expected a finite number, not -inf"),
         ({"window": 3}, "window: expected a section of keys, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
-        ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 1e-06"),
+        ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 0.001"),
         ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or none, got string"),
     ],
 )

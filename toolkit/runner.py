@@ -152,12 +152,22 @@ def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate
 
 
 def _failed(name: str, online: list[Estimate], timings: Timings, error: BaseException) -> Run:
-    why = one_line(str(error)) if isinstance(error, EstimatorError) else in_words(error)
-    log = [f"failed after {len(online)} estimates: {why}"]
+    log = [f"failed after {len(online)} estimates: {_reason(error)}"]
     if not isinstance(error, EstimatorError):
         log += [line.rstrip() for line in traceback.format_exception(error)]
     causal = Trajectory.of(online) if online else None
     return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(online), tuple(log))
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, EstimatorError):
+        return one_line(str(error))
+    if isinstance(error, np.linalg.LinAlgError):
+        return (
+            f"rounding left a matrix without a root or an inverse ({in_words(error)}); the usual cause is a "
+            "stated noise far below the errors of the measurements: set a larger one (noise.pixel_sigma_px, noise.motion_scale)"
+        )
+    return in_words(error)
 
 
 def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
