@@ -165,7 +165,8 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, np.linalg.LinAlgError):
         return (
             f"rounding left a matrix without a root or an inverse ({in_words(error)}); the usual cause is a "
-            "stated noise far below the errors of the measurements: set a larger one (noise.pixel_sigma_px, noise.motion_scale)"
+            "stated noise far below the errors of the measurements: set a larger one "
+            "(noise.pixel_sigma_px, noise.motion_scale)"
         )
     return in_words(error)
 
