@@ -78,6 +78,13 @@ def test_the_word_none_is_no_value_where_a_setting_may_have_none() -> None:
         settings_of({"window": {"landmarks": "none"}}, "run.toml")
 
 
+def test_single_values_hold_on_top_of_a_policy_in_whatever_order_they_are_named() -> None:
+    both = ("outliers.gate_probability=0.9", "outliers.policy=gate")
+    one, other = (settings_of(with_assignments({}, order), "--set").outliers for order in (both, both[::-1]))
+    assert one == other
+    assert (one.policy, one.gate_probability, one.joint_huber) == ("gate", 0.9, None)
+
+
 @pytest.mark.parametrize("text", ["window.lag_s", "=3", "start.early=3"])
 def test_an_assignment_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(SettingsError):
