@@ -268,6 +268,26 @@ def test_a_setting_that_the_command_line_gives_two_values_is_refused(
     assert one_line().endswith(f"and --set {words[-1]} give {key} two values; leave one out\n")
 
 
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (None, "manifest.json: holds no settings"),
+        ({"window": {"imu_clones": 3}}, "there is no setting window.imu_clones"),
+        ({"noise": {"pixel_sigma_px": 1e-5}}, "noise.pixel_sigma_px: expected number >= 0.001"),
+    ],
+)
+def test_a_manifest_of_another_version_is_refused_with_its_command(
+    vislam: Vislam, one_line: OneLine, settings: dict[str, Any] | None, why: str
+) -> None:
+    command = "vislam compare drive --out old"
+    given = {"schema": "vislam.manifest/1", "command": command} | ({} if settings is None else {"settings": settings})
+    Path("manifest.json").write_text(json.dumps(given))
+    assert vislam("compare", "--config", "manifest.json") == 2
+    message = one_line()
+    assert why in message
+    assert message.endswith(f"; where another version wrote it, give its command: {command}\n")
+
+
 def test_an_option_and_a_setting_may_say_the_same(vislam: Vislam) -> None:
     same = ("--window", "3s", "--set", "window.lag_s=3", "--seed", "2", "--set", "first_seed=2")
     assert vislam("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run", *same) == 0
