@@ -107,6 +107,32 @@ def test_an_estimator_that_cannot_go_on_says_why_in_one_line(sequence):
     assert done.log == (f"failed after {FRAMES} estimates: the smoother's error is not a number",)
 
 
+# As GTSAM words it: an empty line, what it found, and a paragraph of advice.
+OF_GTSAM = "\nIndeterminate linear system near variable\n77 (Symbol: l7).\n\nThe most common cause is\nsomething else."
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (RuntimeError(OF_GTSAM), "RuntimeError: Indeterminate linear system near variable 77 (Symbol: l7)."),
+        (EstimatorError("no\nway"), "no way"),
+        (ValueError(), "ValueError"),
+        (
+            np.linalg.LinAlgError("Singular matrix"),
+            "rounding left a matrix without a root or an inverse (LinAlgError: Singular matrix); the usual cause is a "
+            "stated noise far below the errors of the measurements: set a larger one "
+            "(noise.pixel_sigma_px, noise.motion_scale)",
+        ),
+    ],
+)
+def test_the_reason_of_a_failed_run_is_one_line_that_says_what_happened(error, reason, sequence):
+    class Ends(Perfect):
+        def finish(self) -> Finished:
+            raise error
+
+    assert run(Ends, sequence).log[0] == f"failed after {FRAMES} estimates: {reason}"
+
+
 def test_an_error_while_building_is_a_failed_run(sequence):
     def build(setup: Setup) -> Estimator:
         raise ValueError("no such noise")
@@ -151,8 +177,8 @@ class Unconverged(Perfect):
 def test_a_solve_that_did_not_converge_is_a_failure_that_is_still_shown(sequence):
     done = run(Unconverged, sequence)
     assert done.status == "failed"
-    assert done.log[0] == "all is well"
-    assert "did not converge" in done.log[1]
+    assert "did not converge" in done.log[0], "a failed run begins with the reason"
+    assert done.log[1] == "all is well"
     assert done.final is not None
 
 

@@ -51,7 +51,7 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
         ({"estimators": {"mine": {"gain": -math.inf}}}, "estimators.mine.gain: expected a finite number, not -inf"),
         ({"window": 3}, "window: expected a section of keys, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
-        ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 1e-06"),
+        ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 0.001"),
         ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or none, got string"),
     ],
 )
@@ -76,6 +76,13 @@ def test_the_word_none_is_no_value_where_a_setting_may_have_none() -> None:
     assert settings_of({"window": {"lag_s": "none"}}, "run.toml") == DEFAULTS
     with pytest.raises(SettingsError, match="expected integer, got string"):
         settings_of({"window": {"landmarks": "none"}}, "run.toml")
+
+
+def test_single_values_hold_on_top_of_a_policy_in_whatever_order_they_are_named() -> None:
+    both = ("outliers.gate_probability=0.9", "outliers.policy=gate")
+    one, other = (settings_of(with_assignments({}, order), "--set").outliers for order in (both, both[::-1]))
+    assert one == other
+    assert (one.policy, one.gate_probability, one.joint_huber) == ("gate", 0.9, None)
 
 
 @pytest.mark.parametrize("text", ["window.lag_s", "=3", "start.early=3"])

@@ -71,6 +71,15 @@ def one_line(message: str) -> str:
     return _LONG_WORD.sub(lambda word: f"{word[0][:_SHOWN]}...{word[0][-_SHOWN:]}", line)
 
 
+def in_words(error: BaseException, where: str = "") -> str:
+    """Return the type of an error, where it was raised and the first paragraph of its message, as one line.
+
+    GTSAM's messages begin with an empty line and end with a paragraph of general advice.
+    """
+    first = re.split(r"\n\s*\n", str(error).strip(), maxsplit=1)[0]
+    return one_line(f"{type(error).__name__}{where}: {first}").removesuffix(":")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return the known name most like a misspelt one, whatever the case of its letters, or "" where none is close."""
     by_folded = {candidate.casefold(): candidate for candidate in known}

@@ -16,6 +16,11 @@ from toolkit.geometry import Array, IntArray, read_only
 from toolkit.sequence import Packet
 
 Status = Literal["ok", "diverged", "failed"]
+STATUS_MEANING: Mapping[Status, str] = {
+    "ok": "ran to the end",
+    "diverged": "ran to the end with implausible estimates",
+    "failed": "could not go on",
+}
 Output = Literal["causal", "final"]
 Arithmetic = Literal["compiled", "numpy"]
 # What several runs of an estimator computed with: "both" where they differ.

@@ -20,7 +20,7 @@ import numpy as np
 
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
-from toolkit.errors import DataError, EstimatorError
+from toolkit.errors import DataError, EstimatorError, in_words, one_line
 from toolkit.estimate import (
     Estimate,
     Finished,
@@ -133,8 +133,8 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         if (interrupt := _interrupt_behind(error)) is not None:
             raise interrupt from None
         return replace(_failed(name, online, clock.timings(), error), arithmetic=compilation.ran)
-    run = _ended(name, online, finished, clock.timings(), sequence)
-    return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)
+    finished = replace(finished, log=(*compilation.log, *finished.log))
+    return replace(_ended(name, online, finished, clock.timings(), sequence), arithmetic=compilation.ran)
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
@@ -152,12 +152,23 @@ def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate
 
 
 def _failed(name: str, online: list[Estimate], timings: Timings, error: BaseException) -> Run:
-    why = str(error) if isinstance(error, EstimatorError) else f"{type(error).__name__}: {error}"
-    log = [f"failed after {len(online)} estimates: {why}"]
+    log = [f"failed after {len(online)} estimates: {_reason(error)}"]
     if not isinstance(error, EstimatorError):
         log += [line.rstrip() for line in traceback.format_exception(error)]
     causal = Trajectory.of(online) if online else None
     return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(online), tuple(log))
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, EstimatorError):
+        return one_line(str(error))
+    if isinstance(error, np.linalg.LinAlgError):
+        return (
+            f"rounding left a matrix without a root or an inverse ({in_words(error)}); the usual cause is a "
+            "stated noise far below the errors of the measurements: set a larger one "
+            "(noise.pixel_sigma_px, noise.motion_scale)"
+        )
+    return in_words(error)
 
 
 def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
@@ -166,7 +177,7 @@ def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timin
     log = list(finished.log)
     if not finished.converged:
         status = "failed"
-        log.append("the solve did not converge; its result is shown but is no estimate to rely on")
+        log.insert(0, "the solve did not converge; its result is shown but is no estimate to rely on")
     run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(online), tuple(log))
     return with_divergence(run, sequence)
 

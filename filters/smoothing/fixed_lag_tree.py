@@ -8,11 +8,12 @@ the newest in the root. The last covariance of the oldest and the first of the n
 update costs no more. A dummy variable follows the newest state, for the condition number of the cliques
 (``indeterminate``).
 
-A variable that makes the system indeterminate gets a weak prior at its value. A landmark that does so again in the same
-frame is dropped, and so are landmarks without a determined depth in a clique for which GTSAM names another variable. If
-a state does so for the first time, the cause is rounding in the normal equations: the window is then solved by QR,
-which takes ten times as long, until vision has been available again for the length of the window. In either case a new
-tree is built from the factors of the old one, with the same estimates.
+A variable that makes the system indeterminate gets a weak prior at its value; if it is a landmark, so do all others
+whose own factors do not determine them. A landmark that does so again in the same frame is dropped, and so are
+landmarks without a determined depth in a clique for which GTSAM names another variable. If a state does so for the
+first time, the cause is rounding in the normal equations: the window is then solved by QR, which takes ten times as
+long, until vision has been available again for the length of the window. In either case a new tree is built from the
+factors of the old one, with the same estimates.
 
 Chained sightings are relinearised about the latest estimates in every frame, and everything else must be linearised
 there with them. A direction that neither motion nor vision observes, such as an exchange of tilt and accelerometer
@@ -140,36 +141,35 @@ class FixedLagTree:
             except RuntimeError as refusal:
                 # The new factors are in the tree by now, but the tree is not usable any more.
                 key, dropped_slots = variable_named(refusal), ()
+                beyond = self._undetermined() if kind_of(key) == "l" else []
                 if kind_of(key) != "l" and self._by_qr_from_ns is None:
-                    self._by_qr_from_ns = self._newest_ns()
+                    self._by_qr_from_ns, culprits = self._newest_ns(), [key]
                     factors, values = self._emptied()
                     remedy = "to rounding: solved by QR for some frames"
-                elif culprits := self._undetermined(but=key) if kind_of(key) == "l" else []:
+                elif kind_of(key) == "l" and (key in with_prior or (beyond and key not in beyond)):
+                    culprits = sorted({key, *with_prior.intersection(beyond)}) if key in with_prior else beyond
+                    factors, values = self._without(culprits, *self._emptied())
+                    dropped |= {gtsam.Symbol(culprit).index() for culprit in culprits}
+                    remedy = ("although fixed by a weak prior, " if key in with_prior else "") + "and was dropped"
+                else:
+                    # GTSAM would name the others one by one.
+                    culprits = sorted({key, *beyond}.difference(with_prior))
                     factors, values = self._emptied()
                     for culprit in culprits:
-                        factors, values = self._without(culprit, factors, values)
-                        dropped.add(gtsam.Symbol(culprit).index())
-                    key, remedy = culprits[0], f"and was dropped, {len(culprits)} in all"
-                elif key in with_prior and kind_of(key) == "l":
-                    factors, values = self._without(key, *self._emptied())
-                    dropped.add(gtsam.Symbol(key).index())
-                    remedy = "although fixed by a weak prior, and was dropped"
-                else:
-                    factors, values = self._emptied()
-                    factors.add(weak_prior(key, values))
-                    with_prior.add(key)
+                        factors.add(weak_prior(culprit, values))
+                    with_prior.update(culprits)
                     remedy = "and has a weak prior at its value"
-                log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
+                in_all = f", {len(culprits)} in all" if len(culprits) > 1 else ""
+                log.append(f"{gtsam.Symbol(culprits[0]).string()} was indeterminate {remedy}{in_all}")
             else:
                 behind, self._behind = self._behind, set()
                 log += [f"l{i} was behind every camera that saw it and was dropped" for i in sorted(behind)]
                 return Recovery(log, dropped | behind)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
-    def _undetermined(self, but: int) -> list[int]:
-        """Return the landmarks that their own factors do not determine; none if ``but`` is among them."""
-        beyond = undetermined(without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint())
-        return [] if but in beyond else beyond
+    def _undetermined(self) -> list[int]:
+        """Return the landmarks that their own factors do not determine."""
+        return undetermined(without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint())
 
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())
@@ -275,21 +275,23 @@ class FixedLagTree:
         return factors, values
 
     def _without(
-        self, key: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
+        self, landmarks: list[int], factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return factors and values without a landmark and its sightings; the prior is marginalised over it."""
-        self._chained.drop([gtsam.Symbol(key).index()])
-        kept = gtsam.NonlinearFactorGraph()
-        for factor in (factors.at(i) for i in range(factors.size())):
-            if not _is_removed_with(key, factor):
-                kept.add(factor)
-        if kept.keys().count(key):
-            self._landmark_stamps_ns[key] = self._oldest_ns - 1
-            kept.add(weak_prior(key, values))
-        else:
-            values.erase(key)
-            self._forget([key])
-        return kept, values
+        """Return factors and values without landmarks and their sightings; the prior is marginalised over them."""
+        self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
+        for key in landmarks:
+            kept = gtsam.NonlinearFactorGraph()
+            for factor in (factors.at(i) for i in range(factors.size())):
+                if not _is_removed_with(key, factor):
+                    kept.add(factor)
+            if kept.keys().count(key):
+                self._landmark_stamps_ns[key] = self._oldest_ns - 1
+                kept.add(weak_prior(key, values))
+            else:
+                values.erase(key)
+                self._forget([key])
+            factors = kept
+        return factors, values
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params = gtsam.ISAM2Params()

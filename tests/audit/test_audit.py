@@ -3,13 +3,20 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from toolkit.audit import audit, faults
 from toolkit.errors import UnknownNameError
-from toolkit.sequence import Sequence, check_runnable
+from toolkit.sequence import Observations, Sequence, check_runnable
+from toolkit.simulation.faults import identity_intrinsics, zero_intrinsics
+
+
+def beyond_single_precision(sequence: Sequence) -> Sequence:
+    seen = sequence.observations
+    return replace(sequence, observations=Observations(seen.frame, seen.track_id, seen.uv_px * 1e200))
 
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
@@ -63,6 +70,14 @@ def test_the_audit_imports_nothing_that_takes_as_long_as_an_audit() -> None:
 def test_every_fault_has_a_summary_of_one_line() -> None:
     assert len(faults()) == 49
     assert all(summary and "\n" not in summary for summary in faults().values())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("break_it", [zero_intrinsics, identity_intrinsics, beyond_single_precision])
+def test_what_is_broken_is_reported_without_a_warning_of_numpy(
+    clean_recording: Callable[..., Sequence], break_it: Callable[[Sequence], Sequence]
+) -> None:
+    assert audit(break_it(clean_recording().truncated(40))).findings
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])

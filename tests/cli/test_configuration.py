@@ -84,13 +84,13 @@ def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vis
     assert settings["arithmetic"] == "numpy"
 
 
-def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam) -> None:
+def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vislam: Vislam) -> None:
     Path("run.toml").write_text(
         'start = "truth"\nfirst_seed = 7\n[window]\nlag_s = 3.0\nmost_states = 9\n'
         '[compare]\nsequences = ["drive-imu"]\nestimators = ["batch"]\nmax_frames = 8\n'
     )
     words = ("drive", "--estimators", "dead-reckoning", "--max-frames", "5", "--seed", "2", "--start", "measurements")
-    given = ("--set", "window.lag_s=4", "--set", "first_seed=9", "--set", "start=truth")
+    given = ("--set", "window.lag_s=4", "--set", "first_seed=2", "--set", "start=measurements")
     assert vislam("compare", "--config", "run.toml", *words, *given, "--out", "run") == 0
     document = manifest()
     settings = document["settings"]
@@ -241,3 +241,60 @@ def test_a_second_file_of_settings_is_refused(capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit):
         parser().parse_args(["compare", "drive", "--config", "a.toml", "--config", "b.toml"])
     assert "--config is given twice; it takes one file, and --set changes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--window", "3s", "--set", "window.lag_s=2"),
+        ("--outliers", "gate", "--set", "outliers.policy=robust"),
+        ("--no-fast", "--set", "arithmetic=auto"),
+        ("--start", "truth", "--set", "start=measurements"),
+        ("--seed", "1", "--set", "first_seed=2"),
+        ("--seeds", "2", "--set", "seeds=3"),
+        ("--vary", "world", "--set", "vary=noise"),
+        ("--tracks", "images", "--set", "frontend.tracks=auto"),
+        ("--topics", "imu=/a", "--set", "frontend.topics=imu=/b"),
+        ("--columns", "bound", "--set", "metrics.bound=false"),
+        ("--set", "window.lag_s=1", "--set", "window.lag_s=2"),
+    ],
+    ids=" ".join,
+)
+def test_a_setting_that_the_command_line_gives_two_values_is_refused(
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...]
+) -> None:
+    key = words[-1].partition("=")[0]
+    assert vislam("compare", "drive", *words) == 2
+    assert one_line().endswith(f"and --set {words[-1]} give {key} two values; leave one out\n")
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (None, "manifest.json: holds no settings"),
+        ({"window": {"imu_clones": 3}}, "there is no setting window.imu_clones"),
+        ({"noise": {"pixel_sigma_px": 1e-5}}, "noise.pixel_sigma_px: expected number >= 0.001"),
+    ],
+)
+def test_a_manifest_of_another_version_is_refused_with_its_command(
+    vislam: Vislam, one_line: OneLine, settings: dict[str, Any] | None, why: str
+) -> None:
+    command = "vislam compare drive --out old"
+    given = {"schema": "vislam.manifest/1", "command": command} | ({} if settings is None else {"settings": settings})
+    Path("manifest.json").write_text(json.dumps(given))
+    assert vislam("compare", "--config", "manifest.json") == 2
+    message = one_line()
+    assert why in message
+    assert message.endswith(f"; where another version wrote it, give its command: {command}\n")
+
+
+def test_an_option_and_a_setting_may_say_the_same(vislam: Vislam) -> None:
+    same = ("--window", "3s", "--set", "window.lag_s=3", "--seed", "2", "--set", "first_seed=2")
+    assert vislam("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run", *same) == 0
+    assert manifest()["settings"]["window"]["lag_s"] == 3.0
+
+
+@pytest.mark.parametrize("text", ["seeds=9", "first_seed=3", "vary=world"])
+def test_a_baseline_takes_no_settings_of_its_seeds(vislam: Vislam, one_line: OneLine, text: str) -> None:
+    assert vislam("baseline", "drive:1", "--set", text) == 2
+    assert f"--set {text} is for compare" in one_line()

@@ -290,6 +290,18 @@ def test_an_empty_right_image_is_a_sighting_by_the_left_one(tmp_path: Path, rows
     np.testing.assert_array_equal(uv_px[other], sequence.observations.uv_px[other])
 
 
+@pytest.mark.parametrize("lacking", ["uR", "vR"])
+def test_half_a_right_image_is_none_and_the_left_one_is_used(tmp_path: Path, lacking: str) -> None:
+    sequence = recorded("twist")
+    given, seen = tables_of(sequence), sequence.observations
+    missing = np.arange(len(seen)) % 3 == 0
+    tracks = {**given["tracks"], lacking: np.where(missing, np.nan, given["tracks"][lacking])}
+    saved = toolkit.save(tmp_path / "own", tracks=tracks, motion=given["motion"], rig=rig_of(sequence))
+    uv_px = toolkit.load_sequence(saved).observations.uv_px
+    np.testing.assert_array_equal(is_left_only(uv_px), missing)
+    assert np.isfinite(uv_px[:, [0, 2]]).all()
+
+
 def test_a_value_that_is_masked_is_none(tmp_path: Path) -> None:
     sequence = recorded("twist")
     given = tables_of(sequence)

@@ -186,6 +186,26 @@ def test_the_slots_of_isam2_are_those_of_its_chained_sightings_whatever_was_drop
     assert (rows.pose[rows.track_ids[rows.point] == dropped] > 8).all()
 
 
+@pytest.mark.parametrize("offset_px", [10.0, 30.0, 100.0])
+def test_landmarks_whose_stated_offset_leaves_no_depth_do_not_end_fixed_lag(offset_px, oracle):
+    """GTSAM refuses nearly every landmark of the first frame; what it refused is in the next tree once, not twice."""
+    track_noise = TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, offset_px, 0.0]))
+    sequence = oracle.with_track_errors(SHORT_FLIGHT, NOISE, 3)
+    stated = replace(sequence, rig=replace(sequence.rig, track_noise=track_noise))
+    estimator = endless(setup_of(stated, Settings()))
+    for packet in stated.packets():
+        estimator.step(packet)
+        factors = estimator._tree._isam.getFactorsUnsafe()
+        slots = {slot for slot in range(factors.size()) if factors.exists(slot) and is_sighting(factors.at(slot))}
+        assert set(estimator._tree._chained.slots) == slots
+    assert any("has a weak prior" in line for line in estimator.finish().log)
+
+
+def is_sighting(factor):
+    keys = factor.keys()
+    return len(keys) > 1 and any_landmark(factor)
+
+
 def any_landmark(factor):
     keys = factor.keys()
     return any(kind_of(key) == "l" for key in keys)

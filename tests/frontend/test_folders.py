@@ -392,6 +392,22 @@ def test_of_a_recording_with_few_of_its_images_these_are_used_where_requested(as
     assert f"7 of {FRAMES} image pairs lack a file and are left out" in sequence.provenance.facts
 
 
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (Frontend(epipolar_px=1e-9), "frontend.epipolar_px=1e-09 is too strict"),
+        (Frontend(forward_backward_px=1e-9), "frontend.forward_backward_px=1e-09 is too strict"),
+        (Frontend(nearest_m=100.0), "frontend.nearest_m=100 is too strict"),
+        (Frontend(patch_correlation=1 - 1e-9), "frontend.patch_correlation=0.999999999 is too strict"),
+    ],
+)
+def test_a_setting_that_finds_no_corner_in_the_right_images_is_named(
+    asl: Path, own_cache: Path, settings: Frontend, named: str
+) -> None:
+    with pytest.raises(DataError, match=re.escape(named)):
+        load_sequence(str(asl), 0, settings)
+
+
 def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
     for camera in (0, 1):
         for path in reversed(images(asl, camera)):

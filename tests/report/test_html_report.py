@@ -5,19 +5,22 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from toolkit.errors import DataError, OutputError
+from toolkit.estimate import STATUS_MEANING, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.metrics import Scores
+from toolkit.report import messages
 from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.payload import evenly, payload_of, running_median, with_peaks
 from toolkit.report.run_directory import MadeBy, read_run, write_run
+from toolkit.report.schemas import schema_files
 
 Json = dict[str, Any]
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
@@ -142,6 +145,19 @@ def test_every_script_is_part_of_the_page() -> None:
 
     (folder,) = package.__path__
     assert {path.stem for path in (Path(folder) / "scripts").iterdir()} == set(SCRIPTS)
+
+
+def test_a_status_means_the_same_on_the_page_in_the_notes_and_in_the_documents(page: str) -> None:
+    assert list(STATUS_MEANING) == list(get_args(Status))
+    each = "; ".join(f"{status}: {meaning}" for status, meaning in STATUS_MEANING.items())
+    assert f'STATUS_MEANING = "{each}. ' in page
+    for status, meaning in STATUS_MEANING.items():
+        of_the_notes, of_the_page = f"{status}: it {meaning}. ", f'{status}: "{status}: it {meaning}'
+        assert (status == "ok") or (messages._STATUS[status].startswith(of_the_notes) and of_the_page in page)
+    described = "; ".join(STATUS_MEANING.values())
+    documented = (Path(__file__).parents[2] / "docs/metrics-json.md").read_text(encoding="utf-8")
+    assert f'| `status` | `"ok"`, `"diverged"` or `"failed"` | {described} |' in documented
+    assert f'"description": "{described}"' in schema_files()["metrics-1.json"]
 
 
 def test_a_hostile_name_stays_text(run_called: Callable[[str], Path], page: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 from toolkit.errors import DataError
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
-from toolkit.sequence import Sequence
+from toolkit.sequence import Observations, Sequence
 from toolkit.settings import settings_of
 from toolkit.simulation.faults import few_tracks, identity_intrinsics
 from toolkit.track_errors import Fit, fit_track_noise, summary_of
@@ -92,8 +92,22 @@ def test_so_few_tracks_a_frame_that_the_motion_takes_them_up_are_refused(
     walking: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("toolkit.track_errors.fit.FEWEST_TRACKS", 30)
-    with pytest.raises(DataError, match="visible tracks a frame are too few"):
+    with pytest.raises(DataError, match=r"usable sightings a frame .* are too few"):
         fit_track_noise(few_tracks(walking, 9))
+
+
+def test_the_sightings_that_are_too_few_are_counted_without_those_by_the_left_image_alone(walking: Sequence) -> None:
+    seen = walking.observations
+    uv_px = seen.uv_px.copy()
+    uv_px[np.random.default_rng(1).random(len(seen)) < 0.5, 1] = np.nan
+    sequence = replace(walking, observations=Observations(seen.frame, seen.track_id, uv_px))
+    used = [group.frames.size for group in tracklets(sequence)]
+    with pytest.raises(DataError, match=r"usable sightings a frame") as refused:
+        fit_track_noise(sequence)
+    counted = re.search(r"([\d.]+) usable", str(refused.value))
+    assert counted is not None
+    assert float(counted[1]) == pytest.approx(sum(used) / sequence.frame_count, rel=0.05)
+    assert float(counted[1]) < 0.25 * len(sequence.visible) / sequence.frame_count
 
 
 def test_withheld_tracks_are_not_looked_at(walking: Sequence) -> None:

@@ -4,6 +4,8 @@ A file with a ``FAULT`` in one of these folders is a fault and needs no registra
 ``samples``, ``calibration``, ``agreement`` (of vision with the motion) and ``truth``; ``parts`` has computations that
 several faults share. Read ``fault``, then ``tracks.no_disparity`` (the smallest fault), then ``tracks.stale_frames``
 and ``calibration.mixed_axes`` (repairs of tracks and of the calibration).
+
+The audit itself reports values that are impossible, so that NumPy's warnings about them are not shown.
 """
 
 import importlib
@@ -38,6 +40,7 @@ class Audit:
     undecided: Mapping[str, str] = field(default_factory=dict)
 
 
+@np.errstate(all="ignore")
 def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     """Check every fault in turn and repair it, unless its name is in ``keep``; each sees the repairs before it.
 
@@ -61,6 +64,7 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     return Audit(evidence.sequence, tuple(findings), undecided)
 
 
+@np.errstate(all="ignore")
 def checked_again(found: Audit, name: str, sequence: Sequence) -> Audit:
     """Return an audit with one fault, which must have no repair, checked again in a changed recording."""
     fault = next(fault for fault in _ordered() if fault.name == name)

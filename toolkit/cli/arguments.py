@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     Subcommands = argparse._SubParsersAction["Parser"]
 
     from toolkit.experiment.recording import Recording
-    from toolkit.settings import Settings
 
 # "s" last, which the others end with.
 _TIMES = {"min": 60.0, "ms": 1e-3, "s": 1.0}
@@ -201,21 +200,6 @@ def _seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
 
 
-class _Once(argparse.Action):
-    """Stores the value of an option that is given once: a second one would pass over the first."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        if getattr(namespace, self.dest) is not None:
-            parser.error(f"{option_string} is given twice; it takes one file, and --set changes single settings")
-        setattr(namespace, self.dest, values)
-
-
 def add_option(
     parser: argparse.ArgumentParser | argparse._ArgumentGroup, option: str, default: object, what: str, **kind: Any
 ) -> None:
@@ -242,57 +226,6 @@ def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "--estimators", metavar="NAME,...", type=names, help=f"{what} (default: those that 'vislam list' marks)"
     )
-
-
-def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the file and the single assignments that change settings."""
-    parser.add_argument(
-        "--config",
-        metavar="FILE",
-        type=Path,
-        action=_Once,
-        help="settings in TOML, or the manifest.json of a run to repeat",
-    )
-    parser.add_argument(
-        "--outliers",
-        metavar="POLICY",
-        help="how every estimator treats inconsistent measurements (see docs/settings.md)",
-    )
-    parser.add_argument(
-        "--window",
-        metavar="SECONDS",
-        type=positive_seconds,
-        help="length of the window of windowed filters and smoothers",
-    )
-    parser.add_argument(
-        "--no-fast",
-        action="store_true",
-        help="use NumPy only, even where the extra 'fast' provides compiled code for filters",
-    )
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="one setting, as in window.lag_s=3 (see 'vislam list'); may be repeated",
-    )
-
-
-def requested_assignments(options: argparse.Namespace) -> list[str]:
-    """Return what --outliers, --window, --no-fast and --set say, in that order, as assignments."""
-    arithmetic = "numpy" if options.no_fast else None
-    named = {"outliers.policy": options.outliers, "window.lag_s": options.window, "arithmetic": arithmetic}
-    return [*(f"{key}={value}" for key, value in named.items() if value is not None), *options.set]
-
-
-def requested_settings(options: argparse.Namespace) -> "Settings":
-    """Return the settings of --config and --set; raises SettingsError for one that does not exist."""
-    from toolkit.experiment.configuration import read_configuration
-    from toolkit.settings import settings_of, with_assignments
-
-    values = {} if options.config is None else read_configuration(options.config)[1]
-    place = "the command line" if options.config is None else str(options.config)
-    return settings_of(with_assignments(values, requested_assignments(options)), place)
 
 
 def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "see the exit status") -> None:

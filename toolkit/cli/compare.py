@@ -17,7 +17,6 @@ from toolkit.cli.arguments import (
     add_output_arguments,
     add_part_arguments,
     add_repair_arguments,
-    add_settings_arguments,
     add_tracks_argument,
     add_workers_argument,
     at_least,
@@ -25,9 +24,9 @@ from toolkit.cli.arguments import (
     kept_faults,
     named_file,
     names,
-    requested_assignments,
     with_tracks,
 )
+from toolkit.cli.settings_arguments import add_settings_arguments, check_said_once, requested_assignments
 from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
@@ -215,7 +214,7 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 
 def _configuration(options: argparse.Namespace) -> Configuration:
-    """Return what is to be compared and how: the file of --config, over it --set, over that the other arguments."""
+    """Return what is to be compared and how: the file of --config, and over it the command line."""
     from toolkit.experiment.configuration import configuration, read_configuration
     from toolkit.metrics import requests_of
     from toolkit.settings import with_assignments
@@ -238,8 +237,9 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
     settings = with_assignments(settings, assignments)
     settings |= {key: value for key, value in named.items() if value is not None}
-    switches = () if options.columns == ("all",) else requests_of(options.columns)
-    settings = with_assignments(settings, [f"metrics.{switch}=true" for switch in switches])
+    switches = [] if options.columns == ("all",) else [f"metrics.{name}" for name in requests_of(options.columns)]
+    check_said_once({switch: (f"--columns {','.join(options.columns)}", True) for switch in switches}, options.set)
+    settings = with_assignments(settings, [f"{switch}=true" for switch in switches])
     settings = with_tracks(settings, options)
     return configuration(request, settings, place)
 

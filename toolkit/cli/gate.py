@@ -12,13 +12,12 @@ from toolkit.cli.arguments import (
     UsageError,
     add_estimators_argument,
     add_option,
-    add_settings_arguments,
     add_workers_argument,
     at_least,
     command,
     positive_seconds,
-    requested_settings,
 )
+from toolkit.cli.settings_arguments import add_settings_arguments, requested_settings
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -107,6 +106,7 @@ def baseline(options: argparse.Namespace) -> int:
     from toolkit.progress import of_this_process
     from toolkit.report.manifest import made_here
 
+    _check_seeds_are_options(options.set)
     cases = _cases(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
     check_writable(out, "{")
@@ -126,7 +126,8 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     from toolkit.gate.trajectory_files import Scoring
     from toolkit.report.manifest import made_here
 
-    if options.sequences or options.estimators or options.duration or options.set or options.config:
+    settings = (options.set, options.config, options.outliers, options.window, options.no_fast)
+    if options.sequences or options.estimators or options.duration or any(settings):
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
     out = options.out or Path("trajectory-baseline.json")
     check_writable(out, "{")
@@ -151,6 +152,15 @@ def command_to_keep(words: list[str]) -> str:
         else:
             kept.append(word)
     return shlex.join(kept)
+
+
+def _check_seeds_are_options(assignments: list[str]) -> None:
+    """Raise UsageError for a setting of the seeds, which a baseline has in its cases."""
+    from toolkit.settings import assigned
+
+    for text in assignments:
+        if assigned(text)[0] in ("first_seed", "seeds", "vary"):
+            raise UsageError(f"--set {text} is for compare; a baseline's --seeds are from 0, and draw the noise")
 
 
 def _cases(options: argparse.Namespace) -> list[Case]:

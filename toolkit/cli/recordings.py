@@ -12,14 +12,13 @@ from toolkit.cli.arguments import (
     UsageError,
     add_option,
     add_recording_arguments,
-    add_settings_arguments,
     add_topics_argument,
     at_least,
     command,
     positive_seconds,
     requested_recording,
-    requested_settings,
 )
+from toolkit.cli.settings_arguments import add_settings_arguments, requested_settings
 from toolkit.errors import printable
 
 if TYPE_CHECKING:

@@ -146,13 +146,11 @@ def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audi
     is enough to find what the whole would show. Where something is found there, the whole is audited.
     """
     sequence = _loaded(recording, progress)
-    # The audit itself reports values that are not finite, so that NumPy's warnings about them add nothing.
-    with np.errstate(all="ignore"):
-        beginning = _to_audit(sequence, recording)
-        found = audit(beginning, recording.keep)
-        if beginning is sequence:
-            return found
-        return audit(sequence, recording.keep) if found.findings else replace(found, sequence=sequence)
+    beginning = _to_audit(sequence, recording)
+    found = audit(beginning, recording.keep)
+    if beginning is sequence:
+        return found
+    return audit(sequence, recording.keep) if found.findings else replace(found, sequence=sequence)
 
 
 def _to_audit(sequence: Sequence, recording: Recording) -> Sequence:
@@ -293,8 +291,7 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
     """Return the audit's findings, with the tracks tested against the noise that the settings state instead."""
-    with np.errstate(all="ignore"):
-        return checked_again(audited, "track-scatter", used)
+    return checked_again(audited, "track-scatter", used)
 
 
 def _stated_track_noise(requested: Noise) -> TrackNoise:

@@ -232,8 +232,22 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "
-            "ones; the calibration is not that of these images, or they are no pairs"
+            f"ones; the calibration is not that of these images, or they are no pairs{_too_strict(settings)}"
         )
+
+
+def _too_strict(settings: Frontend) -> str:
+    """Return the end of the message: the settings that find fewer corners in right images than the defaults do."""
+    default = Frontend()
+    stricter = {
+        "nearest_m": settings.nearest_m > default.nearest_m,
+        "forward_backward_px": settings.forward_backward_px < default.forward_backward_px,
+        "epipolar_px": settings.epipolar_px < default.epipolar_px,
+        "patch_px": settings.patch_px < default.patch_px,
+        "patch_correlation": settings.patch_correlation > default.patch_correlation,
+    }
+    named = [f"frontend.{name}={getattr(settings, name):.12g}" for name, is_so in stricter.items() if is_so]
+    return f", or {' or '.join(named)} is too strict" if named else ""
 
 
 def _all_alike(pairs: Sequence[StampedPair], rig: RectifiedPair, bits: int) -> bool:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from toolkit.audit import Finding
+from toolkit.estimate import STATUS_MEANING
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.disagreement import FARTHEST, FarthestPose, MotionTest
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
@@ -39,10 +40,12 @@ _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
 _STATUS = {
     "diverged": (
-        "diverged: it ran to the end, but its estimates are physically implausible. That is a result, not a "
-        "crash: its scores are those of the whole trajectory, and its figure shows where it went."
+        f"diverged: it {STATUS_MEANING['diverged']}. That is a result, not a crash: its scores are those of the whole "
+        "trajectory, and its figure shows where it went."
     ),
-    "failed": "failed: it could not go on. What it had estimated until then, if anything, is kept and scored.",
+    "failed": (
+        f"failed: it {STATUS_MEANING['failed']}. What it had estimated until then, if anything, is kept and scored."
+    ),
 }
 
 

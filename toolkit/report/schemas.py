@@ -7,8 +7,10 @@ from pathlib import Path
 
 import msgspec
 
+from toolkit.errors import OutputError, one_line
 from toolkit.evaluation.document import EvaluationRecord
 from toolkit.files.documents import schema
+from toolkit.files.writing import write_text
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.differences import DiffRecord
@@ -40,10 +42,26 @@ def schema_files() -> dict[str, str]:
 
 
 def write_schemas(directory: Path) -> None:
-    """Write every schema into an existing directory, in the place of earlier ones."""
+    """Write every schema into a directory, in the place of earlier ones; it is made where it is missing.
+
+    Raises OutputError where it cannot be written.
+    """
     for name, text in schema_files().items():
-        (directory / name).write_text(text, encoding="utf-8")
+        write_text(directory / name, text)
+
+
+def main(arguments: list[str]) -> int:
+    """Write the schemas into the directory that is named; return the exit status."""
+    if len(arguments) != 1:
+        print("usage: python -m toolkit.report.schemas DIR", file=sys.stderr)
+        return 2
+    try:
+        write_schemas(Path(arguments[0]))
+    except OutputError as error:
+        print(f"error: {one_line(str(error).partition(';')[0])}; name another directory", file=sys.stderr)
+        return error.exit_status
+    return 0
 
 
 if __name__ == "__main__":
-    write_schemas(Path(sys.argv[1]))
+    sys.exit(main(sys.argv[1:]))

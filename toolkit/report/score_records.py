@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.estimate import Output, Status
+from toolkit.estimate import STATUS_MEANING, Output, Status
 from toolkit.files.documents import Count, Value
 from toolkit.metrics import contract_keys
 
@@ -87,9 +87,7 @@ class ScoredRun(Struct, frozen=True, kw_only=True):
 
     estimator: Annotated[str, Meta(description="its name, as in vislam list, or what was read from a file")]
     output: Annotated[Output, Meta(description="what it estimated at each frame, or from the whole recording")]
-    status: Annotated[
-        Status, Meta(description="ran to the end; ran to the end with implausible estimates; could not go on")
-    ]
+    status: Annotated[Status, Meta(description="; ".join(STATUS_MEANING.values()))]
     metrics: Annotated[dict[str, Value], ALL_PROMISED]
     notes: Notes
     log: Annotated[tuple[str, ...], Meta(description="what the estimator had to recover from")]

@@ -86,21 +86,28 @@ def read_toml(path: Path) -> dict[str, Any]:
 def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return nested values with ``section.key=value`` put in, the value as TOML writes it or a bare word."""
     result: dict[str, Any] = {key: dict(v) if isinstance(v, Mapping) else v for key, v in given.items()}
-    for text in assignments:
-        key, equals, value = text.partition("=")
-        if not equals or not key.strip():
-            raise SettingsError(f"--set takes KEY=VALUE, as in window.lag_s=3, not {text!r}")
-        *sections, name = key.strip().split(".")
+    # A policy first: the single values on top of it hold, in whatever order they are named.
+    for text in sorted(assignments, key=lambda text: assigned(text)[0] != _POLICY):
+        key, value = assigned(text)
+        *sections, name = key.split(".")
         at = result
         for section in sections:
             at = at.setdefault(section, {})
             if not isinstance(at, dict):
                 raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
-        at[name] = _value(value.strip())
-        if key.strip() == _POLICY:
+        at[name] = value
+        if key == _POLICY:
             # Naming a policy replaces all values of the former one.
             result["outliers"] = {"policy": at[name]}
     return result
+
+
+def assigned(text: str) -> tuple[str, Any]:
+    """Return key and value of ``section.key=value``; raises SettingsError where it is none."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SettingsError(f"--set takes KEY=VALUE, as in window.lag_s=3, not {text!r}")
+    return key.strip(), _value(value.strip())
 
 
 def _value(text: str) -> Any:

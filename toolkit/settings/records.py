@@ -133,11 +133,12 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
 class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     """The noise every estimator assumes; by default what the recording states or its samples show."""
 
+    # Below 1e-5 px, rounding leaves covariances that are not positive definite.
     pixel_sigma_px: (
         Annotated[
             float,
             _setting(
-                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", ge=1e-6, le=100.0
+                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", ge=1e-3, le=100.0
             ),
         ]
         | None

@@ -90,8 +90,8 @@ def fit_track_noise(sequence: Sequence) -> Fit:
     count = sum(len(group.first_frame) for group in groups)
     if count < FEWEST_TRACKS:
         raise DataError(
-            f"{sequence.name}: {count} visible tracks have three sightings or more, too few to fit their noise to "
-            f"({FEWEST_TRACKS} are needed)"
+            f"{sequence.name}: {count} visible tracks begin with three successive sightings by both images, too few to "
+            f"fit their noise to ({FEWEST_TRACKS} are needed)"
         )
     try:
         return _fitted(sequence, groups)
@@ -113,11 +113,18 @@ def _fitted(sequence: Sequence, groups: tuple[Tracklets, ...]) -> Fit:
         state = adjusted(state, model, sequence, _STEPS)
         if state.freedom < LEAST_FREEDOM:
             raise DataError(
-                f"{sequence.name}: {len(sequence.visible) / sequence.frame_count:.1f} visible tracks a frame are too "
-                "few: the camera's motion absorbs their errors, and their noise cannot be fitted"
+                f"{sequence.name}: {_used_a_frame(groups):.1f} usable sightings a frame (by both images, of tracks "
+                "that begin with three in succession) are too few: the camera's motion absorbs their errors, and their "
+                "noise cannot be fitted"
             )
     assert model is not None
     return _chosen(state, model, sequence)
+
+
+def _used_a_frame(groups: tuple[Tracklets, ...]) -> float:
+    """Return the mean number of sightings used, over the frames that have any."""
+    frames = np.concatenate([group.frames.ravel() for group in groups])
+    return frames.size / np.unique(frames).size
 
 
 def _residuals(state: Adjusted, sequence: Sequence) -> list[TrackletResiduals]:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from toolkit import runner
-from toolkit.errors import EstimatorError
+from toolkit.errors import EstimatorError, in_words, one_line
 from toolkit.estimator import Build
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.metrics import Evaluation, Unavailable
@@ -215,12 +215,12 @@ def _check(name: str, remedy: str, find: Callable[[], str]) -> CheckedPromise:
 
 def _error_message(error: Exception) -> str:
     if isinstance(error, EstimatorError):
-        return str(error)
+        return one_line(str(error))
     frames = error.__traceback__
     while frames is not None and frames.tb_next is not None:
         frames = frames.tb_next
     where = "" if frames is None else f" in line {frames.tb_lineno} of {frames.tb_frame.f_code.co_name}"
-    return f"{type(error).__name__}{where}: {error}"
+    return in_words(error, where)
 
 
 def _consistent(name: str, build: Build) -> CheckedPromise:

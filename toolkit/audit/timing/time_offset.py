@@ -155,13 +155,16 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     near = [shift for shift in (-late_s, step_s - late_s) if abs(offset.value - shift) <= NEAR_SIGMAS * offset.error]
     if not near:
         return None
-    shifts = " or ".join(f"{1e3 * shift:+.0f}" for shift in near)
+    shifts, sigmas = " or ".join(f"{1e3 * shift:+.0f}" for shift in near), abs(offset.value) / offset.error
+    from_zero = "which is consistent with zero as well"
+    if sigmas > NEAR_SIGMAS:
+        from_zero = f"{sigmas:.1f} standard errors from zero"
     return Symptom.warning(
         count=1,
         detail=(
             f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the "
             f"camera's clock were to be shifted by {shifts} ms; by the tracks the offset is "
-            f"{1e3 * offset.value:+.0f} +- {1e3 * offset.error:.0f} ms, which is consistent with zero as well"
+            f"{1e3 * offset.value:+.0f} +- {1e3 * offset.error:.0f} ms, {from_zero}"
         ),
         treatment="if frames and twists were taken together, give them the same stamps",
     )

@@ -3,7 +3,7 @@ const STATUS_MEANING = "ok: ran to the end; diverged: ran to the end with implau
 const TABLE_NOTE = "The best of each recording is set off; point at a dash, or read the notes below, for why a value is missing. Compare causal with causal and final with final.";
 
 const STATUS_WORDS = {
-  diverged: "diverged: it ran to the end, but its estimates are physically implausible",
+  diverged: "diverged: it ran to the end with implausible estimates",
   failed: "failed: it could not go on; what it had estimated until then is kept",
 };
 
