@@ -13,6 +13,7 @@ from filters import dead_reckoning
 from toolkit import datasets, discovery, metrics, runner
 from toolkit.cli import main
 from toolkit.errors import DataError, ExtensionError, VislamError
+from toolkit.estimator import find
 from toolkit.simulation import DRIVE, simulate
 
 METRIC = """'''A metric of another project.'''
@@ -129,6 +130,18 @@ def test_a_module_that_is_no_dataset_says_what_it_lacks(announce: Announce) -> N
         ExtensionError, match=r"empty.py: defines neither recognises\(path\) and load\(path\) nor BUILT_IN"
     ):
         datasets.formats()
+
+
+def test_two_packages_cannot_offer_a_sequence_of_the_same_name(announce: Announce) -> None:
+    announce("toolkit.datasets", {"their_world.py": "BUILT_IN = {'drive': lambda seed: None}\n"})
+    with pytest.raises(ExtensionError, match=r"their_world\.py: both offer the sequence drive; rename one"):
+        datasets.built_ins()
+
+
+def test_an_estimators_file_that_is_no_python_is_named_with_its_line(announce: Announce) -> None:
+    announce("toolkit.estimators", {"broken.py": "import math\ndef (\n"})
+    with pytest.raises(ExtensionError, match=r"broken\.py: line 2 is no Python \(invalid syntax\)"):
+        find("broken").summary()
 
 
 def test_two_datasets_cannot_share_a_name(announce: Announce) -> None:

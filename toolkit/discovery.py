@@ -88,7 +88,10 @@ class FoundModule:
 @lru_cache(maxsize=64)
 def _parsed(path: Path, _state: tuple[int, int]) -> ast.Module:
     """Return a module's syntax, which is read once in each state of the file."""
-    return ast.parse(path.read_text(encoding="utf-8"))
+    try:
+        return ast.parse(path.read_text(encoding="utf-8"))
+    except SyntaxError as error:
+        raise ExtensionError(f"{path}: line {error.lineno} is no Python ({error.msg}); correct it there") from error
 
 
 def _paired(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:

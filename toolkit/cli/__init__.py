@@ -1,8 +1,8 @@
 """The command ``vislam``: subcommands by what they are about; whatever is slow to import is imported to run.
 
-Reading order: arguments (what commands share, and how one is declared), then the commands about one thing in a file
-each: compare, evaluate, runs, recordings, gate, parts. Beside them completion, for shells. Here: how a command is run,
-and what becomes of errors, signals and its output.
+Reading order: arguments (what commands share, and how one is declared), settings_arguments (the options that change
+settings), then the commands about one thing in a file each: compare, evaluate, runs, recordings, gate, parts. Beside
+them completion, for shells. Here: how a command is run, and what becomes of errors, signals and its output.
 """
 
 import errno

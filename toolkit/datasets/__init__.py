@@ -23,7 +23,7 @@ import numpy as np
 
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import DataError, ExtensionError, did_you_mean
+from toolkit.errors import DataError, ExtensionError, did_you_mean, type_of
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
@@ -134,7 +134,19 @@ def _found() -> _Found:
         if not isinstance(module, RecordingFormat | BuiltIns):
             raise ExtensionError(f"{found.path}: defines neither recognises(path) and load(path) nor BUILT_IN")
         modules[found.name] = module
+    _check_built_ins_differ(modules)
     return _Found(modules, missing)
+
+
+def _check_built_ins_differ(modules: Mapping[str, ModuleType]) -> None:
+    """Raise ExtensionError where two modules offer a built-in sequence of the same name."""
+    offered_by: dict[str, object] = {}
+    for module in (module for module in modules.values() if isinstance(module, BuiltIns)):
+        file = getattr(module, "__file__", module)
+        for name in module.BUILT_IN:
+            if name in offered_by:
+                raise ExtensionError(f"{offered_by[name]} and {file}: both offer the sequence {name}; rename one")
+            offered_by[name] = file
 
 
 def _readers() -> dict[str, RecordingFormat]:
@@ -191,8 +203,8 @@ def load_sequence(
         else:
             sequence = reader.load(path)
         if not isinstance(sequence, Sequence):
-            file, given = getattr(reader, "__file__", reader), type(sequence).__name__
-            raise ExtensionError(f"{source}: load in {file} returned a {given}; it must return a Sequence")
+            file = getattr(reader, "__file__", reader)
+            raise ExtensionError(f"{source}: load in {file} returned {type_of(sequence)}; it must return a Sequence")
         _check_types(sequence)
         check_stated(sequence)
     return sequence
