@@ -81,8 +81,8 @@ def table(lines: list[dict[str, Any]]) -> Iterator[str]:
         groups[tuple(line[key] for key in ("scenario", "tracks", "slips", "estimator", "output"))].append(line)
     for key, runs in sorted(groups.items()):
         values = [one["values"] for one in runs if one["values"]["excess_variance"] is not None]
-        if not values:
-            yield f"| {' | '.join(key)} | no bound: {runs[0]['why']} |"
+        if len(values) < 2:
+            yield f"| {' | '.join(key)} | {len(values)} of {len(runs)} with a bound, {runs[0]['why'] or 'too few'} |"
             continue
         excess, pose, stated = (
             np.array([one[name] for one in values]) for name in ("excess_variance", "excess_pose", "claimed_variance")
