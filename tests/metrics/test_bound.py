@@ -165,13 +165,6 @@ def test_where_tracks_err_otherwise_than_stated_there_is_no_bound_to_lose_agains
     assert "the noise is not as stated" in notes["excess_variance"]
 
 
-def test_no_bound_is_computed_under_a_stated_noise_of_tracks(sequence, make_run):
-    told = replace(sequence, rig=replace(sequence.rig, track_noise=SCENARIOS["drive-realistic"].track_noise))
-    values, notes = scores(with_error(sequence, make_run, np.zeros(6)), told)
-    assert set(values.values()) == {None}
-    assert "correlated (noise.tracks)" in notes["bound_position_m"]
-
-
 @pytest.mark.parametrize("name", ["drive", "flight"])
 def test_a_full_smoother_attains_and_claims_the_bound_from_a_measured_start(run_estimator, name):
     """What a simulation without its drawn prior is, and a recording whose truth has every state."""
