@@ -1,4 +1,4 @@
-"""How close estimators come to the Cramér-Rao bound where the errors of tracks are correlated, and told so.
+"""How close estimators come to the Cramér-Rao bound where the errors of tracks are correlated and this is stated.
 
     python tests/benchmarks/bound_of_tracks.py run results.jsonl [--seeds 20] [--slips none]
     python tests/benchmarks/bound_of_tracks.py table results.jsonl
@@ -40,7 +40,7 @@ OUTPUTS = {
 
 
 class Case(NamedTuple):
-    """One recording: a scenario, its seed, the noise of tracks that is told, and whether tracks slip."""
+    """One recording: a scenario, its seed, where the noise of tracks comes from, and whether tracks slip."""
 
     scenario: str
     seed: int
@@ -101,7 +101,7 @@ def _stated_of_true(stated: Array, excess: Array) -> Array:
 
 
 def main() -> None:
-    """Run what is asked for, or print the table."""
+    """Make the runs that are requested, or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table"))
     parser.add_argument("results", type=Path)
@@ -110,19 +110,19 @@ def main() -> None:
     parser.add_argument("--tracks", default="stated,fitted")
     parser.add_argument("--slips", default="none,some")
     parser.add_argument("--estimators", default=",".join(OUTPUTS))
-    asked = parser.parse_args()
-    known = [json.loads(line) for line in asked.results.read_text().splitlines()] if asked.results.exists() else []
-    if asked.what == "table":
+    options = parser.parse_args()
+    known = [json.loads(line) for line in options.results.read_text().splitlines()] if options.results.exists() else []
+    if options.what == "table":
         print("\n".join(table(known)))
         return
     done = {(*(one[key] for key in Case._fields), one["estimator"]) for one in known}
-    scenarios, tracks = asked.scenarios.split(","), asked.tracks.split(",")
-    each = [(t, p) for t in tracks for p in asked.slips.split(",")]
-    cases = [Case(s, seed, t, p) for t, p in each for seed in range(asked.seeds) for s in scenarios]
+    scenarios, tracks = options.scenarios.split(","), options.tracks.split(",")
+    each = [(t, p) for t in tracks for p in options.slips.split(",")]
+    cases = [Case(s, seed, t, p) for t, p in each for seed in range(options.seeds) for s in scenarios]
     for case in cases:
-        for estimator in asked.estimators.split(","):
+        for estimator in options.estimators.split(","):
             if (*case, estimator) not in done:
-                with asked.results.open("a") as results:
+                with options.results.open("a") as results:
                     results.writelines(json.dumps(line) + "\n" for line in scored(case, estimator))
 
 

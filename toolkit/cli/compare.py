@@ -26,7 +26,7 @@ from toolkit.cli.arguments import (
     names,
     with_tracks,
 )
-from toolkit.cli.settings_arguments import add_settings_arguments, check_said_once, requested_assignments
+from toolkit.cli.settings_arguments import add_settings_arguments, check_given_once, requested_assignments
 from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     settings = with_assignments(settings, assignments)
     settings |= {key: value for key, value in named.items() if value is not None}
     switches = [] if options.columns == ("all",) else [f"metrics.{name}" for name in requests_of(options.columns)]
-    check_said_once({switch: (f"--columns {','.join(options.columns)}", True) for switch in switches}, options.set)
+    check_given_once({switch: (f"--columns {','.join(options.columns)}", True) for switch in switches}, options.set)
     settings = with_assignments(settings, [f"{switch}=true" for switch in switches])
     settings = with_tracks(settings, options)
     return configuration(request, settings, place)

@@ -1,4 +1,4 @@
-"""The options that change settings, and what they say together."""
+"""The options that change settings, and the settings they give together."""
 
 import argparse
 from collections.abc import Iterable, Mapping
@@ -10,7 +10,7 @@ from toolkit.cli.arguments import UsageError, positive_seconds
 if TYPE_CHECKING:
     from toolkit.settings import Settings
 
-# Options that are short for a setting, by their names in a parsed command line, in the order in which they are told.
+# Options that are short for a setting, by their names in a parsed command line; messages name them in this order.
 _SHORT_FOR = {
     "outliers": "outliers.policy",
     "window": "window.lag_s",
@@ -73,35 +73,35 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def requested_assignments(options: argparse.Namespace) -> list[str]:
-    """Return what --outliers, --window, --no-fast and --set say, in that order, as assignments.
+    """Return --outliers, --window, --no-fast and --set, in that order, as assignments.
 
     Raises UsageError where a setting is given two values.
     """
-    check_said_once(_said(options), options.set)
+    check_given_once(_given_by_options(options), options.set)
     arithmetic = "numpy" if options.no_fast else None
     named = {"outliers.policy": options.outliers, "window.lag_s": options.window, "arithmetic": arithmetic}
     return [*(f"{key}={value}" for key, value in named.items() if value is not None), *options.set]
 
 
-def _said(options: argparse.Namespace) -> dict[str, tuple[str, Any]]:
-    """Return by setting the option that is short for it, as it was given, and its value."""
+def _given_by_options(options: argparse.Namespace) -> dict[str, tuple[str, Any]]:
+    """Return for each setting the option that is short for it, as it was given, and its value."""
     given = {key: (name, getattr(options, name, None)) for name, key in _SHORT_FOR.items()}
-    said = {
+    values = {
         key: (f"--{name} {value:g}" if isinstance(value, float) else f"--{name} {value}", value)
         for key, (name, value) in given.items()
         if value is not None
     }
-    return said | ({"arithmetic": ("--no-fast", "numpy")} if options.no_fast else {})
+    return values | ({"arithmetic": ("--no-fast", "numpy")} if options.no_fast else {})
 
 
-def check_said_once(said: Mapping[str, tuple[str, Any]], assignments: Iterable[str]) -> None:
+def check_given_once(given: Mapping[str, tuple[str, Any]], assignments: Iterable[str]) -> None:
     """Raise UsageError where assignments of --set give a setting another value than an option, or another of them.
 
-    ``said`` has by setting the option that is short for it, as it was given, and its value.
+    ``given`` has by setting the option that is short for it, as it was given, and its value.
     """
     from toolkit.settings import assigned
 
-    known = dict(said)
+    known = dict(given)
     for text in assignments:
         key, value = assigned(text)
         option, before = known.setdefault(key, (f"--set {text}", value))
