@@ -5,9 +5,6 @@ What it approximates: only the noise, by its stated model. Every measurement is 
 msckf-fej and from landmarks mapped along it: from a start that has diverged, that is dead-reckoned or whose covariance
 is too small it converges to poor local minima. The window of that causal pass is as short with an IMU as without one,
 because the solver finds what a longer window would add.
-
-Where the rig states a track noise model, two more solves follow the schedule. In them each track is a Markov chain of
-sightings (``filters/smoothing/track_chain.py``).
 """
 
 import gtsam
@@ -16,23 +13,19 @@ import numpy as np
 from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import SlidingWindowFilter
-from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.indeterminate import with_covariances
-from filters.smoothing.robust_schedule import MotionFactors, Smoothed, seen_ids, solve_robustly, worth_smoothing
-from filters.smoothing.scale_state import ScaleState
-from filters.smoothing.track_chain import scale_in
+from filters.smoothing.robust_schedule import MotionFactors, seen_ids, solve_robustly, worth_smoothing
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
-from toolkit.models.gap_bridge import bridged, bridges
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import stacked
-from toolkit.sequence import Packet, StereoFrame
+from toolkit.sequence import Packet
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut; IMU as stated"
-RULES = {"window": "it keeps every state", "disparity_scale": True, "bridge_gaps": True, "match_tracks": True}
+RULES = {"window": "it keeps every state"}
 DEFAULT = True
 
 
@@ -46,16 +39,10 @@ class Batch:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
-        noise = setup.settings.noise
-        self._scale = None if noise.disparity_scale is None else ScaleState(noise.disparity_scale)
-        self._tracks = DiscountedTracks(setup)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        # The first solves give tracks their full weight, and a causal pass that does so as well starts them nearer to
-        # the optimum (0027: 4 iterations instead of 16).
-        self._causal_pass = SlidingWindowFilter(
-            setup, AtFirstEstimates(), window_s=setup.settings.window.seconds("twist"), scores_tracks=False
-        )
+        window_s = setup.settings.window.seconds("twist")
+        self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates(), window_s=window_s)
         self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []
@@ -73,25 +60,15 @@ class Batch:
         track_ids = worth_smoothing(all_frames, known)
         frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
         start = self._start(known, track_ids)
-        factors = self._motion_factors(frames)
-        if self._scale is not None:
-            self._scale.add_to(factors.graph, start)
-        smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._tracks, self._progress)
-        trajectory, log = self._with_covariances(smoothed)
-        values = smoothed.solution.values
-        landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, log + self._tracks.messages)
-
-    def _with_covariances(self, smoothed: Smoothed) -> tuple[Trajectory, tuple[str, ...]]:
+        smoothed = solve_robustly(self._motion_factors(), frames, self._rig, start, self._outliers, self._progress)
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
-        trajectory, linear = Trajectory.of(states), smoothed.graph.linearize(values)
-        if self._scale is None:
-            return with_covariances(trajectory, linear, self._motion)
-        return self._scale.with_covariances(trajectory, linear, self._motion, scale_in(values))
+        trajectory, log = with_covariances(Trajectory.of(states), smoothed.graph.linearize(values), self._motion)
+        landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
+        return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 
-    def _motion_factors(self, frames: list[StereoFrame]) -> MotionFactors:
-        """Return the prior, the motion factors and the gap bridges, preintegrated about the causal pass's last bias."""
+    def _motion_factors(self) -> MotionFactors:
+        """Return the prior and the motion factors, preintegrated about the causal pass's last bias."""
         graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias
         assert best_bias is not None
@@ -99,10 +76,7 @@ class Batch:
         increments = {k: self._motion.integrate(motion, best_bias) for k, motion in moved.items()}
         for k, increment in increments.items():
             graph.push_back(increment.factors(k))
-        bridge = self._causal_pass.bridge
-        over = {} if bridge is None or bridge.noise is None else bridges(frames, bridge.noise)
-        graph.push_back(bridged(over))
-        return MotionFactors(graph, stacked(increments, over))
+        return MotionFactors(graph, stacked(increments, {}))
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()

@@ -8,7 +8,6 @@ from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 0, "the measured motion alone"
-RULES = {"match_tracks": True}
 DEFAULT = True
 
 

@@ -15,7 +15,6 @@ from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the other's uncertainty as noise"
-RULES = {"tracks": "each landmark is a Gaussian of its own, without a state for the error of its track"}
 DEFAULT = True
 
 

@@ -13,9 +13,6 @@ times as large on `drive-imu` (NEES 3.0 -> 1.1). With thirty tracks that are nev
 odometry, which measures how much nearer landmarks come, restarting costs more than the old Jacobians do: on real drives
 the error was 6 % larger. What remains approximate: an update is one Gauss-Newton step with Jacobians at first
 estimates.
-
-Where the residuals of landmarks turn out correlated although white noise is stated, their sightings are given less
-weight (:mod:`filters.kalman.residual_correlation`).
 """
 
 from functools import partial
@@ -24,12 +21,10 @@ from filters.kalman.inverse_depth import InverseDepthBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
-from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
 RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth, share, IMU matched"
-RULES = {"tracks": "a landmark in its state has no state for the error of its track", "match_tracks": True}
 
 # With an IMU a landmark may have moved from its first estimate by this share of its distance before it is restarted.
 MOST_MOVED = 0.3
@@ -38,6 +33,5 @@ MOST_MOVED = 0.3
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam)
-    correlation = LandmarkCorrelation.of(setup)
     at = AtFirstEstimates(MOST_MOVED) if setup.motion_kind == "imu" else AtFirstEstimates()
-    return OnlineOutput(JointEkf(setup, at, belief, correlation=correlation))
+    return OnlineOutput(JointEkf(setup, at, belief))

@@ -7,9 +7,6 @@ the window. Three faults are recovered from, and the log lists them:
 - a landmark that has fallen behind the camera is dropped and started again from its next sighting;
 - a variable that makes the window's system indeterminate is held at its value;
 - a landmark whose gate has rejected more sightings than it was built from is started again, if the rejected ones agree.
-
-Where the rig states a track noise model, the innovation of each sighting of a track, given the sighting before it, is a
-residual of two poses and the landmark (``filters/smoothing/chained_window.py``).
 """
 
 from dataclasses import replace
@@ -18,21 +15,19 @@ import gtsam
 import numpy as np
 
 from filters.kalman.thinning import Thinned
-from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
-from filters.smoothing.graph_builder import LEARNT_AFTER_FRAMES, GraphBuilder
+from filters.smoothing.graph_builder import GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models.factors import X, points_of
+from toolkit.models.factors import points_of
 from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
-RULES = {"bridge_gaps": True, "match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:
@@ -46,8 +41,7 @@ class FixedLag:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
         self._rig = setup.rig
-        chained = ChainedWindow(setup.rig, setup.settings.outliers.smoother_huber)
-        self._tree = FixedLagTree(self._lag_ns, chained)
+        self._tree = FixedLagTree(self._lag_ns)
         self._builder = GraphBuilder(setup)
         self._stamps_ns: list[int] = []
         # The window when it was last read: the values of its variables, and its landmarks (3,) m.
@@ -61,8 +55,6 @@ class FixedLag:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
         self._frame, t_ns = packet.index, packet.frame.t_ns
-        if self._builder.is_outdated:
-            self._note(self._tree.rebuild(self._builder.window_brought_up_to_date))
         # Before the packet's sightings are chosen: to read a covariance may cost landmarks.
         self._states += [self._state(k) for k in self._window() if self._stamps_ns[k] < t_ns - self._lag_ns]
         extension = self._builder.extend(packet)
@@ -72,13 +64,13 @@ class FixedLag:
         self._note(recovery)
         newest = self._read(packet)
         self._drop_landmarks(packet, newest)
-        return replace(newest, info=self._builder.info)
+        return newest
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
         states = [*self._states, *map(self._state, self._window())]
         landmarks = Landmarks.of(self._points | self._in_window)
-        return Finished(Trajectory.of(states), landmarks, log=(*self._builder.log(), *self._log))
+        return Finished(Trajectory.of(states), landmarks, log=tuple(self._log))
 
     def _window(self) -> range:
         """Return the numbers of the states in the window."""
@@ -94,10 +86,6 @@ class FixedLag:
             self._note(self._tree.rebuilt_by_qr(refusal))
             return replace(state, cov=state_cov(motion, self._tree, k, R_world_imu))
 
-    def _pose(self, k: int) -> Array:
-        """Return a pose (4, 4) as it was last read, or as it left the window."""
-        return self._states[k].T_world_imu if k < len(self._states) else self._values.atPose3(X(k)).matrix()
-
     def _read(self, packet: Packet) -> Estimate:
         """Read the window's landmarks and return its newest state; states that have left keep their last values."""
         self._values = self._tree.values()
@@ -108,9 +96,6 @@ class FixedLag:
         self._forget(left)
         self._in_window = points_of(self._values, self._last_seen_ns)
         self._builder.update(newest, self._in_window)
-        k = packet.index - LEARNT_AFTER_FRAMES
-        if k >= 0:
-            self._builder.learn(k, np.array([self._pose(k), self._pose(k + 1)]))
         return newest
 
     def _drop_landmarks(self, packet: Packet, newest: Estimate) -> None:

@@ -32,17 +32,12 @@ from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.joint_landmarks import LandmarkSightings
 from filters.kalman.linearisation import AtLatestEstimates, Linearisation
 from filters.kalman.online_output import OnlineOutput
-from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.sequence import StereoFrame, StereoRig
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"
-RULES = {
-    "tracks": "a landmark in its state has no state for the error of its track",
-    "match_tracks": ("imu",),
-}
 # Length of a step in standard deviations of the updated state.
 NEGLIGIBLE_STEP = 1e-4
 MOST_STEPS, MOST_HALVINGS = 10, 6
@@ -51,8 +46,7 @@ MOST_STEPS, MOST_HALVINGS = 10, 6
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
-    correlation = LandmarkCorrelation.of(setup) if setup.motion_kind == "imu" else None
-    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct, correlation))
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct))
 
 
 class Iterate(NamedTuple):

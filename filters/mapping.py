@@ -16,7 +16,6 @@ from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
-RULES = {"tracks": "each landmark is a Gaussian of its own, without a state for the error of its track"}
 
 
 def build(setup: Setup) -> Estimator:

@@ -7,7 +7,6 @@ from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf",)
-RULES = {"bridge_gaps": True, "match_tracks": True}
 RUNG, CHANGE = 60, "+ past poses, bridge; one update a track, at its end, by share; usual errors, 1 step"
 
 

@@ -7,7 +7,6 @@ from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf", "li2013high")
-RULES = {"bridge_gaps": True, "match_tracks": True}
 RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 

@@ -10,12 +10,6 @@ group, and only through them does the propagation of the error depend on the est
 A landmark is anchored in the camera that first saw it, and is parametrised by its inverse depth from there. In metres
 the squared position error was 2.2 times as large on drive-imu, and 1.3 times in flight. What remains approximate: an
 update is one Gauss-Newton step, and a landmark's first estimate is one stereo sighting, whose depth is not Gaussian.
-
-Beside an IMU, landmarks whose residuals are correlated have a smaller weight
-(:mod:`filters.kalman.residual_correlation`). The position error was 0.73 +- 0.06 of that with full weights on six draws
-of `flight-realistic`. Beside odometry all landmarks have their full weight: over seven drives and two draws the
-position error would be 0.85 +- 0.08 of that, and the NEES a sixth, but on one of the drives the error would be 1.5
-times as large.
 """
 
 from functools import partial
@@ -24,19 +18,13 @@ from filters.kalman.invariant import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
-from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
 RUNG, CHANGE = 40, "+ right-invariant error, Jacobians at latest estimates, anchors; share with an IMU"
-RULES = {
-    "tracks": "a landmark in its state has no state for the error of its track",
-    "match_tracks": ("imu",),
-}
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
-    correlation = LandmarkCorrelation.of(setup) if setup.motion_kind == "imu" else None
-    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correlation=correlation))
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief))

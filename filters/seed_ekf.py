@@ -28,7 +28,6 @@ CITES = ("kang_vislam",)
 RUNG, CHANGE = 10, "+ vision as in the report: map and pose updated in turn, biases fixed, no gate"
 RULES = {
     "outliers": "the report's filter has neither gate nor loss",
-    "tracks": "the report's filter models white noise only",
 }
 
 

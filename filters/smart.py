@@ -5,22 +5,15 @@ never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When th
 marginalised with it at their current linearisation; a track that is still seen starts again, so no landmark is
 remembered beyond the window. The causal answer is the newest state. The final answer is each state as it left the
 window, with the covariance it had in the window.
-
-Where the rig states a track noise model, the innovation of each sighting of a track, given the sighting before it, is a
-residual of two poses: a Markov chain (:class:`toolkit.models.correlated_noise.Chain`). A track that starts again keeps
-its age.
 """
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.thinning import Thinned
-from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera
@@ -36,7 +29,6 @@ from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
 RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept; no bridge"
-RULES = {"match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:
@@ -50,43 +42,35 @@ class Smart:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
-        self._tracks, self._camera = DiscountedTracks(setup), RobustCamera.of(setup.rig, outliers.smoother_huber)
+        self._camera = RobustCamera.of(setup.rig, outliers.smoother_huber)
         self._outlier_check, self._landmarks = OutlierCheck(setup.rig, outliers), KnownLandmarks(setup.rig)
         self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._belief = self._predicted = self._motion.initial_belief(setup.prior)
-        self._noise = MatchedNoise.of(setup)
+        self._belief = self._motion.initial_belief(setup.prior)
         self._tracked = TrackedWindow.empty()
         self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
-        self._frames = deque[StereoFrame]()
         self._points: dict[int, Array] = {}
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        self._frames.append(packet.frame)
-        tracked = self._extended(self._noise.applied(packet))
+        tracked = self._extended(packet)
         try:
             self._solution = solve_window(tracked.window, self._camera)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; the window starts again at this frame")
             self._complete_all()
-            self._settle(len(self._tracked.window.keys))
             tracked = self._started(packet)
             self._solution = solve_window(tracked.window, self._camera)
         self._tracked = replace(tracked, window=self._solution.window)
         self._read(packet)
         self._shorten(packet)
-        return replace(self._states[-1], info=self._noise.info)
+        return self._states[-1]
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
         self._complete_all()
-        return Finished(
-            Trajectory.of(self._states),
-            Landmarks.of(self._points),
-            log=(*self._noise.messages, *self._tracks.messages, *self._log),
-        )
+        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
 
     def _extended(self, packet: Packet) -> TrackedWindow:
         """Return the window with the packet's predicted state and its sightings."""
@@ -96,8 +80,8 @@ class Smart:
         prediction = increment.predict(self._belief)
         expected = relative_to_its_map(self._belief).predicted(prediction)
         # The predicted state is the initial value; the solver iterates from it.
-        _, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks, self._tracks.share)
-        self._belief = self._predicted = self._belief.predicted(prediction)
+        _, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks)
+        self._belief = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
     def _started(self, packet: Packet) -> TrackedWindow:
@@ -129,8 +113,7 @@ class Smart:
         self._points |= points
         self._belief = self._belief.at(self._states[-1])
         self._landmarks.keep(points)
-        self._landmarks.see(self._tracked.newest(packet.frame), points, self._belief.T_world_imu, self._tracks.share)
-        self._noise.learn(packet.frame.t_ns, self._predicted, self._belief)
+        self._landmarks.see(self._tracked.newest(packet.frame), points, self._belief.T_world_imu)
 
     def _complete(self, places: Iterable[int]) -> None:
         """Give states of the window, by their indices in it, their covariance there."""
@@ -149,19 +132,5 @@ class Smart:
         leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
         if leaving:
             self._complete(range(leaving))
-            self._learn(leaving)
-            self._settle(leaving)
             window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
-            self._camera = RobustCamera.of(*self._tracks.now)
-
-    def _settle(self, leaving: int) -> None:
-        """Score tracks at the window's oldest ``leaving`` states, whose poses no longer change."""
-        for state in self._states[-len(self._tracked.window.keys) :][:leaving]:
-            self._tracks.settle(self._frames.popleft(), state.T_world_imu)
-
-    def _learn(self, leaving: int) -> None:
-        """Measure the residual correlation of the tracks that leave with the oldest ``leaving`` states."""
-        window = self._tracked.window
-        going = np.unique(window.sightings.point[window.sightings.pose < leaving])
-        self._tracks.learn_from(window.sightings.of_points(going), window.poses, window.points)

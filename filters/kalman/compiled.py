@@ -19,15 +19,12 @@ from filters.kalman.joint import JointBelief, times_root, transposed_root_times,
 from filters.kalman.landmark_map import LandmarkMap
 from filters.kalman.linearisation import Integrator
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_gate import TestedTracks, TrackTest, WindowPoses
-from filters.kalman.track_scores import FEWEST_SIGHTINGS as FEWEST_CORRELATED
 from filters.kalman.tracks_in_view import FollowedTracks, Information, RootedWindow
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
 from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise, TwistMotion, TwistNoise
-from toolkit.models import corrections, correlated_noise, left_only
-from toolkit.models.corrections import LEAST_TAKEN, CorrectionTest
+from toolkit.models import left_only
 from toolkit.models.gating import (
     FEWEST_SIGHTINGS,
     LEAST_DEPTH_M,
@@ -37,10 +34,9 @@ from toolkit.models.gating import (
 )
 from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
 from toolkit.models.motion import Increment, MotionModel, motion_model, predicted
-from toolkit.models.state import Belief, Layout, Prediction
+from toolkit.models.state import Belief, Prediction
 from toolkit.models.stereo import StereoPrediction
 from toolkit.sequence import StereoRig, is_left_only
-from toolkit.track_noise import CHANNELS
 
 _GATE_RULES = np.array(
     [
@@ -50,7 +46,6 @@ _GATE_RULES = np.array(
         triangulation.ROUNDING,
         LEAST_DISPARITY_PX,
         LEAST_DEPTH_M,
-        multiview.REFINEMENTS,
         MISMATCHED_TRACK_FACTOR,
     ]
 )
@@ -80,7 +75,7 @@ def track_test(compilation: Compilation) -> TrackTest:
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
         points, reliable, nis, dof, worst, H, residuals, owners = kernel.test_tracks(
-            _as_kernel_arrays((sightings.uvs_px, sightings.seen, sightings.ages)),
+            _as_kernel_arrays((sightings.uvs_px, sightings.seen)),
             _as_kernel_arrays(window),
             _camera(rig),
             _GATE_RULES,
@@ -119,7 +114,7 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         counted = tracks.counted
         if counted.left_only.any():
             return tracks_in_view.information(tracks, window, rig, gate)
-        arrays = _as_kernel_arrays((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
+        arrays = _as_kernel_arrays((counted.uvs_px, counted.seen, tracks.weights, tracks.points))
         poses, root = _as_kernel_arrays((window.poses, window.poses_at)), window.root
         threshold = np.inf if gate.huber is None else float(huber_threshold(3, gate.huber))
         rules = np.array([LEAST_DEPTH_M, float(gate.bound(3)), threshold])
@@ -132,34 +127,6 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         return Information(points, weights, in_front, matrix, root.T @ vector - eliminated.T @ taken)
 
     return tracks_in_view.Steps(followed, information)
-
-
-# Adds the residuals of tracks, with points (F, 3) m seen from poses (W, 4, 4), to a residual correlation.
-Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
-
-
-def learning(compilation: Compilation) -> Learn:
-    """Return the function that adds tracks to a residual correlation: :meth:`ResidualCorrelation.learn`."""
-    kernel = _kernel(compilation, "corrections")
-    if kernel is None:
-        return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
-
-    def learn(
-        correlation: ResidualCorrelation, sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig
-    ) -> None:
-        """Add tracks as the definition does, which is called where right images are missing."""
-        if not correlation.matches:
-            return
-        if sightings.left_only.any():
-            correlation.learn(sightings, points, poses)
-            return
-        arrays, (points, poses) = (
-            _as_kernel_arrays((sightings.uvs_px, sightings.seen)),
-            _as_kernel_arrays((points, poses)),
-        )
-        correlation.add(*kernel.successive_residuals(arrays, points, poses, _camera(rig), FEWEST_CORRELATED))
-
-    return learn
 
 
 def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
@@ -188,24 +155,6 @@ def images(compilation: Compilation) -> multiview.Images:
         return uvs_px, depths_m
 
     return multiview.Images(plain, linearised)
-
-
-def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], CorrectionTest]:
-    """Return the function that tests a correction of a belief: :func:`toolkit.models.corrections.correction_test`."""
-    kernel = _kernel(compilation, "corrections")
-    if kernel is None:
-        return corrections.correction_test
-
-    def given(belief: Belief) -> tuple[Array, Array, Array]:
-        return _pose_of(belief), np.concatenate([belief.v_world, belief.bias]), np.ascontiguousarray(belief.cov)
-
-    def tested(before: Belief, after: Belief) -> CorrectionTest:
-        """Test a correction as the definition does."""
-        return CorrectionTest(
-            *kernel.test_correction(given(before), given(after), _block_indices(before.layout), LEAST_TAKEN)
-        )
-
-    return tested
 
 
 def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
@@ -333,12 +282,6 @@ def _pose_of(belief: Belief) -> Array:
     return np.array(belief.T_world_imu[None], order="C")
 
 
-def _block_indices(layout: Layout) -> IntArray:
-    """Return the indices of velocity, accel bias and gyro bias in the error state, -1 for what the layout lacks."""
-    blocks = (layout.velocity, layout.accel_bias, layout.gyro_bias)
-    return np.array([-1 if block is None else block.start for block in blocks])
-
-
 def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:
     return np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.baseline_m]), np.array(rig.T_imu_cam[None])
 
@@ -346,13 +289,7 @@ def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:
 @lru_cache(maxsize=4)
 def _camera(rig: StereoRig) -> tuple[Array, ...]:
     """Return a rig in the form that the kernels of the windowed filters take."""
-    none = np.empty((0, 3))
-    variances, channels = none, none
-    if rig.track_noise is not None:
-        noise = rig.track_noise
-        white = np.maximum(noise.white_px, correlated_noise.LEAST_WHITE_PX)
-        variances, channels = np.square([white, noise.walk_px, noise.offset_px]), np.array(CHANNELS)
-    return *_intrinsics(rig), np.array(rig.whitener, order="C"), variances, channels
+    return *_intrinsics(rig), np.array(rig.whitener, order="C")
 
 
 @lru_cache(maxsize=4)

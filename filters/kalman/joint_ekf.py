@@ -13,10 +13,8 @@ from filters.kalman import joint_landmarks, multiview
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from filters.kalman.residual_correlation import LandmarkCorrelation
 from filters.kalman.triangulation import triangulate
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
@@ -38,8 +36,7 @@ class Correct(Protocol):
 class JointEkf:
     """Propagate, drop lost or outdated landmarks, correct pose and landmarks together, start new landmarks.
 
-    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is computed. If
-    there is a ``correlation``, it decides the weight of landmarks; without one they have their full weight.
+    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is computed.
     """
 
     def __init__(
@@ -48,15 +45,12 @@ class JointEkf:
         linearisation: Linearisation,
         belief: Callable[[Belief], JointBelief] = JointBelief,
         correct: Correct = joint_landmarks.correct,
-        correlation: LandmarkCorrelation | None = None,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._outliers = setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
-        self._noise = MatchedNoise.of(setup)
-        self._correlation = correlation or LandmarkCorrelation(setup.rig, matches=False)
 
     @property
     def joint(self) -> JointBelief:
@@ -65,28 +59,20 @@ class JointEkf:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        propagate(self._joint, self._motion, self._at, self._noise.applied(packet).motion)
-        predicted = self._joint.core
+        propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._correlation.share)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
-        self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
-        joint = self._joint
-        self._correlation.learn_frame(packet.frame, joint.landmark_ids, joint.points, joint.clones[-1])
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
-        return self._joint.core.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
+        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
         """Return the last estimate of every landmark of the run."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
-
-    def log(self) -> tuple[str, ...]:
-        """Return the log lines for the user."""
-        return self._noise.messages + self._correlation.messages
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start landmarks for the frame's tracks that are not in the state, from this single view."""
@@ -96,7 +82,6 @@ class JointEkf:
             frame.track_ids[new],
             frame.uvs_px[new][:, None],
             np.ones((int(new.sum()), 1), dtype=bool),
-            frame.ages[new][:, None],
         )
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]

@@ -13,22 +13,16 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dgeqrf
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.models import correlated_noise, left_only, stereo
+from toolkit.models import left_only, stereo
 from toolkit.sequence import StereoRig, is_left_only
-
-REFINEMENTS = 3
 
 
 class TrackSightings(NamedTuple):
-    """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W).
-
-    ``ages`` (F, W) is the age of each sighting in frames, since the first sighting of the track in the recording.
-    """
+    """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W)."""
 
     track_ids: IntArray
     uvs_px: Array
     seen: BoolArray
-    ages: IntArray
 
     @property
     def left_only(self) -> BoolArray:
@@ -43,25 +37,20 @@ class TrackSightings(NamedTuple):
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return the tracks of a mask (F,) or of some rows; the object itself if the mask is all True."""
         if rows.dtype == np.bool_:
-            rows = rows.nonzero()[0]  # once for all four arrays; indexing by a mask would repeat it for each
+            rows = rows.nonzero()[0]  # once for all three arrays; indexing by a mask would repeat it for each
             if rows.size == self.track_ids.size:
                 return self
-        return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
+        return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
 
     def since(self, begin: int) -> "TrackSightings":
         """Return the sightings from pose ``begin`` on."""
         if not begin:
             return self
-        return TrackSightings(self.track_ids, self.uvs_px[:, begin:], self.seen[:, begin:], self.ages[:, begin:])
+        return TrackSightings(self.track_ids, self.uvs_px[:, begin:], self.seen[:, begin:])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":
         """Return the tracks of both, concatenated."""
-        track_ids, uvs_px = (
-            np.concatenate([self.track_ids, other.track_ids]),
-            np.concatenate([self.uvs_px, other.uvs_px]),
-        )
-        seen, ages = np.concatenate([self.seen, other.seen]), np.concatenate([self.ages, other.ages])
-        return TrackSightings(track_ids, uvs_px, seen, ages)
+        return TrackSightings(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 class Images(NamedTuple):
@@ -75,22 +64,16 @@ class Images(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3).
-
-    ``decorrelation`` (F, 3W, 3W) makes the rows of a track independent of each other; None where they already are.
-    """
+    """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3)."""
 
     residuals: Array
     H_pose: Array
     H_point: Array
     depth_m: Array
-    decorrelation: Array | None = None
 
     def select(self, rows: BoolArray | IntArray) -> "Linearised":
         """Return the rows of the tracks of a mask (F,) or of some indices."""
-        mixing = None if self.decorrelation is None else self.decorrelation[rows]
-        residuals, H_pose, H_point, depth_m = (array[rows] for array in self._arrays())
-        return Linearised(residuals, H_pose, H_point, depth_m, mixing)
+        return Linearised(*(array[rows] for array in self))
 
     def scaled(self, factors: Array) -> "Linearised":
         """Return all rows of each track multiplied by its factor (F,)."""
@@ -98,16 +81,6 @@ class Linearised(NamedTuple):
         return self._replace(
             residuals=by * self.residuals, H_pose=by[..., None] * self.H_pose, H_point=by[..., None] * self.H_point
         )
-
-    def joined(self, other: "Linearised") -> "Linearised":
-        """Return the tracks of both, concatenated."""
-        pairs = zip(self._arrays(), other._arrays(), strict=True)
-        residuals, H_pose, H_point, depth_m = (np.concatenate(pair) for pair in pairs)
-        mixings = [mixing for mixing in (self.decorrelation, other.decorrelation) if mixing is not None]
-        return Linearised(residuals, H_pose, H_point, depth_m, np.concatenate(mixings) if mixings else None)
-
-    def _arrays(self) -> tuple[Array, Array, Array, Array]:
-        return self.residuals, self.H_pose, self.H_point, self.depth_m
 
 
 def _in_imu(points: Array, poses: Array) -> Array:
@@ -143,32 +116,6 @@ def linearise(
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))
 
 
-def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
-    """Return linearised tracks with the matrix that makes their rows independent under the rig's track noise model."""
-    if rig.track_noise is None:
-        return linearised
-    mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen, sightings.left_only)
-    return linearised._replace(decorrelation=mixing)
-
-
-def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
-    """Return the points (F, 3) that best fit sightings of correlated noise, starting from the best fit for white noise.
-
-    Gauss-Newton, each step no longer than a fifth of the distance to the newest pose that saw the point.
-    """
-    count, window = sightings.seen.shape
-    for _ in range(REFINEMENTS):
-        here = decorrelated(linearise(sightings, points, poses, poses, rig), sightings, rig)
-        assert here.decorrelation is not None
-        H = here.decorrelation @ here.H_point.reshape(count, 3 * window, 3)
-        residual = here.decorrelation @ here.residuals.reshape(count, 3 * window, 1)
-        H_transposed = np.swapaxes(H, 1, 2)
-        step = np.linalg.solve(H_transposed @ H, H_transposed @ residual)[..., 0]
-        most = 0.2 * here.depth_m.min(axis=1)
-        points = points + step * np.minimum(1.0, most / np.maximum(np.linalg.norm(step, axis=1), 1e-9))[:, None]
-    return points
-
-
 class Constraints(NamedTuple):
     """Constraints of F tracks on the W poses: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
 
@@ -195,10 +142,6 @@ def without_landmark(linearised: Linearised, sightings: TrackSightings) -> Const
     tracks, window = sightings.seen.shape
     dof = sightings.degrees_of_freedom
     stacked = linearised.residuals.reshape(tracks, 3 * window, 1)
-    if linearised.decorrelation is not None:
-        basis = null_space(linearised)
-        H = np.swapaxes(by_pose(basis) @ linearised.H_pose, 1, 2).reshape(tracks, 3 * window - 3, 6 * window)
-        return Constraints((basis @ stacked)[..., 0], H, dof)
     vectors, weighted = _reflectors(linearised)
     residuals = (stacked - vectors @ (weighted @ stacked))[:, 3:, 0]
     reached = np.swapaxes(by_pose(weighted) @ linearised.H_pose, 1, 2).reshape(tracks, 3, 6 * window)
@@ -217,16 +160,10 @@ def by_pose(rows: Array) -> Array:
 def null_space(linearised: Linearised) -> Array:
     """Return rows (F, 3W - 3, 3W) whose span is the left null space of the landmark's Jacobian.
 
-    Multiplied by them, a track's residuals are independent and of unit variance. Where the rows are correlated and are
-    decorrelated by M, the result is N^T M, with the rows of N^T spanning the left null space of ``M H_point``.
+    Multiplied by them, a track's residuals are independent and of unit variance.
     """
-    mixing = linearised.decorrelation
-    if mixing is None:
-        vectors, weighted = _reflectors(linearised)
-        return np.asarray((np.eye(vectors.shape[1]) - vectors @ weighted)[:, 3:])
-    H_point = linearised.H_point.reshape(*mixing.shape[:2], 3)
-    q, _ = np.linalg.qr(mixing @ H_point, mode="complete")
-    return np.asarray(np.swapaxes(q[:, :, 3:], 1, 2) @ mixing)
+    vectors, weighted = _reflectors(linearised)
+    return np.asarray((np.eye(vectors.shape[1]) - vectors @ weighted)[:, 3:])
 
 
 def _reflectors(linearised: Linearised) -> tuple[Array, Array]:

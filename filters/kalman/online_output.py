@@ -9,17 +9,13 @@ from toolkit.sequence import Packet
 
 
 class Filter(Protocol):
-    """Answers at every frame and remembers its landmarks; a derived class need not define ``log``."""
+    """Answers at every frame and remembers its landmarks."""
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
 
     def landmarks(self) -> Landmarks:
         """Return the last estimate of every landmark of the run."""
-
-    def log(self) -> tuple[str, ...]:
-        """Return the log lines for the user."""
-        return ()
 
 
 class OnlineOutput:
@@ -36,7 +32,7 @@ class OnlineOutput:
 
     def finish(self) -> Finished:
         """Return the estimates of every frame and the last estimates of the landmarks."""
-        return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._filter.log())
+        return Finished(Trajectory.of(self._estimates), self._filter.landmarks())
 
 
 @dataclass

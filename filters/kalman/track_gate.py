@@ -92,8 +92,6 @@ def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bound
     """
     points, reliable = triangulate(sightings.uvs_px, sightings.seen, window.poses, rig)
     sightings, points = sightings.select(reliable), points[reliable]
-    if rig.track_noise is not None:
-        points = multiview.refined(sightings, points, window.poses, rig)
     groups = list(_by_first_pose(sightings.seen))
     if len(groups) == 1 and not groups[0][0]:
         return _constrained(sightings, points, window, rig, bounds)
@@ -142,7 +140,7 @@ def _constrained(
     sightings: TrackSightings, points: Array, window: WindowPoses, rig: StereoRig, bounds: Array
 ) -> TestedTracks:
     """Eliminate the landmarks (F, 3) of tracks and test the tracks."""
-    linearised = _linearised(sightings, points, window, rig)
+    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig)
     constraints = multiview.without_landmark(linearised, sightings)
     covs = innovation_covs(constraints, window.cov)
     nis = mahalanobis_squared(constraints.residuals, covs)
@@ -158,17 +156,6 @@ def _constrained(
     owner = np.repeat(below, constraints.H.shape[1])
     residuals = constraints.residuals[below].reshape(-1)
     return TestedTracks(sightings, points, nis, constraints.dof, worst, H[used], residuals[used], owner[used])
-
-
-def _linearised(
-    sightings: TrackSightings,
-    points: Array,
-    window: WindowPoses,
-    rig: StereoRig,
-    images: multiview.Images = multiview.NUMPY,
-) -> Linearised:
-    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig, images)
-    return multiview.decorrelated(linearised, sightings, rig)
 
 
 def innovation_covs(constraints: Constraints, P: Array) -> Array:
@@ -220,7 +207,8 @@ class TrackGate:
     def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
         """Return some rows (m,) of the accepted tracks, linearised with their landmarks and weighted."""
         sightings, points = tracks.sightings.select(rows), tracks.points[rows]
-        linearised = _linearised(sightings, points, self._window, self._rig, self._images)
+        poses, poses_at, _ = self._window
+        linearised = multiview.linearise(sightings, points, poses, poses_at, self._rig, self._images)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:

@@ -61,7 +61,7 @@ class FollowedTracks(NamedTuple):
     def none(cls) -> "FollowedTracks":
         """Return no tracks."""
         ids, nothing = np.empty(0, dtype=np.int64), np.empty((0, 0))
-        sightings = TrackSightings(ids, np.empty((0, 0, 3)), nothing.astype(bool), nothing.astype(np.int64))
+        sightings = TrackSightings(ids, np.empty((0, 0, 3)), nothing.astype(bool))
         return cls(sightings, ids, np.empty((0, 3)), nothing)
 
     def select(self, rows: BoolArray) -> "FollowedTracks":
@@ -201,14 +201,6 @@ class _Rows(NamedTuple):
         by = factors[..., None]
         return _Rows(by * self.residuals, by[..., None] * self.H_point, by[..., None] * self.H_pose, self.depth_m)
 
-    def mixed(self, mixing: Array) -> "_Rows":
-        """Return each track's rows, stacked by sighting, multiplied by a matrix (F, 3 W, 3 W)."""
-        tracks, window = self.residuals.shape[:2]
-        residuals = (mixing @ self.residuals.reshape(tracks, 3 * window, 1)).reshape(tracks, window, 3)
-        H_point = (mixing @ self.H_point.reshape(tracks, 3 * window, 3)).reshape(tracks, window, 3, 3)
-        H_pose = np.swapaxes(multiview.by_pose(mixing) @ self.H_pose, 1, 2)
-        return _Rows(residuals, H_point, H_pose.reshape(tracks, window, 3, 6 * window), self.depth_m)
-
 
 def _rows(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig) -> tuple[_Rows, BoolArray]:
     """Return the tracks' rows, zero where rejected, and which tracks (F,) are in front of all their cameras.
@@ -218,8 +210,6 @@ def _rows(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig) -> tuple
     counted = tracks.counted
     seen = multiview.linearise(counted, tracks.points, window.poses, window.poses_at, rig)
     rows = _Rows(seen.residuals, seen.H_point, seen.H_pose, seen.depth_m)
-    mixing = multiview.decorrelated(seen, counted, rig).decorrelation
-    rows = rows if mixing is None else rows.mixed(mixing)
     if ((tracks.weights > 0.0) & (tracks.weights < 1.0)).any():
         rows = rows.scaled(np.sqrt(tracks.weights))
     nearest_m = seen.depth_m.min(axis=1)

@@ -26,7 +26,7 @@ _MOST_TIED = 50
 # If no landmark is seen from more states than this, COLAMD is taken without counting.
 _FEWEST_STANDING = 150
 # Dimension of each kind of variable. The bias of twists has half of it, which does not change the choice.
-_SIZES = {"x": 6, "v": 3, "b": 6, "l": 3, "s": 1}
+_SIZES = {"x": 6, "v": 3, "b": 6, "l": 3}
 
 
 def cheaper_order(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> Order:

@@ -14,19 +14,13 @@ landmarks without a determined depth in a clique for which GTSAM names another v
 first time, the cause is rounding in the normal equations: the window is then solved by QR, which takes ten times as
 long, until vision has been available again for the length of the window. In either case a new tree is built from the
 factors of the old one, with the same estimates.
-
-Chained sightings are relinearised about the latest estimates in every frame, and everything else must be linearised
-there with them. A direction that neither motion nor vision observes, such as an exchange of tilt and accelerometer
-bias, is in the null space of both only at the same linearisation point. With points a hundredth of a radian apart, the
-standard deviation of a tilt came out as a sixth of the right one.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import (
     LAST,
@@ -44,22 +38,18 @@ MOST_RECOVERIES = 20
 # How many landmarks with a marginal on them are eliminated in one clique: with fewer, copying from clique to clique
 # costs more; with more, rows have zeros.
 _MOST_AT_ONCE = 12
-# How far an estimate may be from GTSAM's linearisation point, in rad, m and so on. With chained sightings no distance
-# is allowed, except for variables that a marginal fixes.
-RELINEARISE_BEYOND, BESIDE_CHAINED = 0.01, 0.0
-
-# Maps a graph and the values of all its variables to another graph.
-Remake = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.NonlinearFactorGraph]
+# How far an estimate may be from GTSAM's linearisation point, in rad, m and so on.
+RELINEARISE_BEYOND = 0.01
 
 
 class FixedLagTree:
     """Adds factors and values with their stamps; variables older than the lag are marginalised."""
 
-    def __init__(self, lag_ns: int, chained: ChainedWindow) -> None:
-        self._lag_ns, self._chained = lag_ns, chained
+    def __init__(self, lag_ns: int) -> None:
+        self._lag_ns = lag_ns
         self._by_qr_from_ns: int | None = None
         self._isam = self._empty_tree()
-        self._values, self._left = gtsam.Values(), set[int]()
+        self._values = gtsam.Values()
         self._oldest_ns = 0
         self._state_stamps_ns: dict[int, int] = {}
         self._landmark_stamps_ns: dict[int, int] = {}
@@ -69,8 +59,6 @@ class FixedLagTree:
         # The variables of the newest state with their sizes, and the slots of the factors that tie the dummy to them.
         self._newest: dict[int, int] = {}
         self._tie_slots: list[int] = []
-        # The landmarks that are not in the latest tree, because none of their sightings is used any more.
-        self._behind = set[int]()
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Add a packet's factors and values at a time, and solve; return the recoveries.
@@ -82,8 +70,6 @@ class FixedLagTree:
         self._landmark_stamps_ns |= dict.fromkeys(seen, t_ns)
         self._first_seen_ns = dict.fromkeys(seen, t_ns) | self._first_seen_ns
         self._oldest_ns = t_ns - self._lag_ns
-        if extension.chained is not None:
-            self._chained.add(*extension.chained)
         self._newest = {key: extension.values.extract([key]).dim() for key in extension.state_keys}
         added, back = self._solved(extension.factors, extension.values), Recovery([], set())
         # Only after the update: a landmark dropped by the return to Cholesky may be one of the packet's.
@@ -92,10 +78,9 @@ class FixedLagTree:
             back = self.rebuild()
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
-    def rebuild(self, remade: Remake | None = None) -> Recovery:
-        """Rebuild the tree; except for factors remade, its present and later estimates are the same up to rounding."""
-        factors, values = self._emptied()
-        return self._solved(factors if remade is None else remade(factors, values), values)
+    def rebuild(self) -> Recovery:
+        """Rebuild the tree; its present and later estimates are the same up to rounding."""
+        return self._solved(*self._emptied())
 
     def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
         """Rebuild the tree by QR where GTSAM refused a covariance because of rounding; raise any other error again.
@@ -114,7 +99,6 @@ class FixedLagTree:
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Remove landmarks and their sightings in the window; other variables keep older sightings' information."""
-        self._chained.drop(track_ids)
         keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
         slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
         slots = [slot for slot in slots if any(_is_removed_with(key, factors.at(slot)) for key in keys)]
@@ -162,9 +146,7 @@ class FixedLagTree:
                 in_all = f", {len(culprits)} in all" if len(culprits) > 1 else ""
                 log.append(f"{gtsam.Symbol(culprits[0]).string()} was indeterminate {remedy}{in_all}")
             else:
-                behind, self._behind = self._behind, set()
-                log += [f"l{i} was behind every camera that saw it and was dropped" for i in sorted(behind)]
-                return Recovery(log, dropped | behind)
+                return Recovery(log, dropped)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
     def _undetermined(self) -> list[int]:
@@ -199,9 +181,7 @@ class FixedLagTree:
         still_there = [key for key in leaving if self._isam.valueExists(key)]
         if still_there:
             self._isam.marginalizeLeaves(_key_list(still_there))
-        self._chained.forget(self._oldest_ns)
         self._forget(leaving)
-        self._left = set(leaving)
 
     def _add(
         self,
@@ -210,37 +190,10 @@ class FixedLagTree:
         dropped_slots: Iterable[int],
         eliminated_anew: gtsam.KeyList,
     ) -> None:
-        """Add factors and values, remove some factors, and relinearise all chained sightings."""
-        # A copy: what GTSAM returns changes with the tree.
-        before = gtsam.NonlinearFactorGraph(self._isam.getFactorsUnsafe())
-        together, slots = gtsam.NonlinearFactorGraph(factors), [*dropped_slots, *self._chained.slots]
-        together.push_back(self._relinearised(values))
-        try:
-            result = self._isam.update(together, values, slots, self._order(), _key_list(self._fixed), eliminated_anew)
-        except RuntimeError:
-            # The new factors are in the tree by now: in the first free slots, in their order.
-            new_slots = _new_slots(before, slots, self._isam.getFactorsUnsafe())
-            self._chained.placed(new_slots[factors.size() :])
-            raise
-        placed, ours = list(result.getNewFactorsIndices()), factors.size()
-        self._tie_slots = placed[ours - len(self._newest) : ours]
-        self._chained.placed(placed[ours:])
-
-    def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return the factors of chained sightings about the latest estimates, for new variables about ``new``."""
-        if not self._chained.is_used:
-            return gtsam.NonlinearFactorGraph()
-        keys = self._chained.keys()
-        estimates = self._latest(new, keys)
-        fixed = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
-        in_tree = [key for key in fixed if self._isam.valueExists(key)]
-        at = _joined(self._isam.getLinearizationPoint().extract(in_tree), new, fixed)
-        return self._chained.factors(estimates, _joined(at, estimates, keys))
-
-    def _latest(self, new: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
-        """Return the latest estimates of keys, those of ``new`` for keys not in the tree."""
-        known = [key for key in keys if self._values.exists(key) and key not in self._left]
-        return _joined(self._values.extract(known), new, keys)
+        """Add factors and values, and remove some factors."""
+        slots, fixed = list(dropped_slots), _key_list(self._fixed)
+        result = self._isam.update(factors, values, slots, self._order(), fixed, eliminated_anew)
+        self._tie_slots = list(result.getNewFactorsIndices())[-len(self._newest) :]
 
     def _forget(self, leaving: Iterable[int]) -> None:
         for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns, self._first_seen_ns):
@@ -252,23 +205,15 @@ class FixedLagTree:
         """Start a new tree; return all factors and values of the old one, to be added to it.
 
         A landmark that was dropped with all its factors is left out, because in a tree it would be a variable without
-        an elimination index. So is one that the last step moved behind every camera that saw it: none of its sightings
-        is used. GTSAM's marginal factors have no linearisation point: they stay right only while their variables keep
+        an elimination index. GTSAM's marginal factors have no linearisation point: they stay right only while their variables keep
         their linearisation points. The tree that made them fixes those; for the next tree they must be passed on.
         """
-        others, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
-        for slot in self._chained.slots:
-            others.remove(slot)
-        self._chained.placed([])
-        factors, self._tie_slots = _without_ties(without_gaps(others)), []
+        factors, values = _without_ties(without_gaps(self._isam.getFactorsUnsafe())), self._isam.getLinearizationPoint()
+        self._tie_slots = []
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
-        seen = self._chained.keys()
-        known = {*factors.keyVector(), *self._chained.counted_keys(self._latest(values, seen))}
+        known = set(factors.keyVector())
         lost = [key for key in values.keys() if key not in known]  # noqa: SIM118 - not a mapping
-        behind = {gtsam.Symbol(key).index() for key in seen if key in lost}
-        self._chained.drop(behind)
-        self._behind |= behind
         for key in lost:
             values.erase(key)
         self._forget(lost)
@@ -278,7 +223,6 @@ class FixedLagTree:
         self, landmarks: list[int], factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return factors and values without landmarks and their sightings; the prior is marginalised over them."""
-        self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
         for key in landmarks:
             kept = gtsam.NonlinearFactorGraph()
             for factor in (factors.at(i) for i in range(factors.size())):
@@ -295,7 +239,7 @@ class FixedLagTree:
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(BESIDE_CHAINED if self._chained.is_used else RELINEARISE_BEYOND)
+        params.setRelinearizeThreshold(RELINEARISE_BEYOND)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True
         params.setFactorization("CHOLESKY" if self._by_qr_from_ns is None else "QR")
@@ -360,17 +304,3 @@ def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
     for key in keys:
         listed.push_back(key)
     return listed
-
-
-def _new_slots(
-    before: gtsam.NonlinearFactorGraph, removed: Iterable[int], after: gtsam.NonlinearFactorGraph
-) -> list[int]:
-    """Return the slots, ascending, that have a factor now and had none before, or one that was removed."""
-    kept = {slot for slot in range(before.size()) if before.exists(slot)}.difference(removed)
-    return [slot for slot in range(after.size()) if after.exists(slot) and slot not in kept]
-
-
-def _joined(first: gtsam.Values, second: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
-    """Return values of keys: those of the first, and those of the second for keys not in the first."""
-    first.insert(second.extract([key for key in keys if not first.exists(key)]))
-    return first

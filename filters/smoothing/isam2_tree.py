@@ -15,7 +15,6 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
-from filters.smoothing.chained_past import ChainedPast, Places
 from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables, key_list
 from filters.smoothing.indeterminate import (
     LAST,
@@ -29,9 +28,8 @@ from filters.smoothing.indeterminate import (
 from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
-from toolkit.models.factors import L, kind_of
+from toolkit.models.factors import kind_of
 from toolkit.models.motion import MotionModel
-from toolkit.sequence import StereoFrame
 
 # The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings
 # than this: a state costs as much as two landmarks, so a longer track is cheaper in the root than the states it spans.
@@ -50,8 +48,8 @@ MOST_RECOVERIES = 20
 class Isam2Tree:
     """A Bayes tree that adds frames, reads single variables and recovers from an indeterminate system."""
 
-    def __init__(self, motion: MotionModel, baseline_m: float, chained: ChainedPast | None = None) -> None:
-        self._motion, self._chained = motion, chained
+    def __init__(self, motion: MotionModel, baseline_m: float) -> None:
+        self._motion = motion
         self._at_most = state_thresholds(motion, baseline_m)
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
@@ -67,34 +65,19 @@ class Isam2Tree:
         # The landmarks in the tree, and the variables to relinearise next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
-    def add(
-        self,
-        factors: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        state_keys: list[int],
-        seen: tuple[StereoFrame, int] | None = None,
-    ) -> Recovery:
+    def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> Recovery:
         """Add a frame whose new state has the given keys; return the recoveries.
 
-        ``seen`` are its sightings and its number if the tree is to chain them. Raises EstimatorError where the system
-        stays indeterminate after all recoveries.
+        Raises EstimatorError where the system stays indeterminate after all recoveries.
         """
         has_landmarks = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
-        self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
-        if seen is not None and self._chained is not None:
-            self._chained.add(*seen)
+        self._frozen.add_frame(factors.keyVector())
         self._to_relinearise = self._moved()
         cached, moved = self._linearisations(factors, values)
-        factors, stale = with_linearisations(factors, cached), list[int]()
-        if seen is not None and self._chained is not None:
-            renewal = self._chained.renewal(lambda keys: self._places(keys, values), self._slot_count + factors.size())
-            factors.push_back(renewal.factors)
-            for slot, landmark in renewal.replaced.items():
-                self._sightings[landmark].remove(slot)
-            stale = list(renewal.replaced)
+        factors = with_linearisations(factors, cached)
         factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
-        added = self._update(factors, values, cached, moved, [*stale, *old_ties])
+        added = self._update(factors, values, cached, moved, old_ties)
         # Only after the update: a landmark dropped by the return to Cholesky may be one of the frame's.
         back = self._back_to_cholesky(has_landmarks)
         return Recovery(added.log + back.log, added.dropped | back.dropped)
@@ -113,11 +96,11 @@ class Isam2Tree:
         return factors, values, old
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Return all factors except chained sightings; Python factors themselves, not their linearisations."""
+        """Return all factors; Python factors themselves, not their linearisations."""
         factors = self._retired.with_factors_of(self.isam)
         for slot, cached in self._cached.items():
             factors.replace(slot, cached.factor)
-        for slot in [*self._tie_slots, *(self._chained.slots() if self._chained else ())]:
+        for slot in self._tie_slots:
             factors.remove(slot)
         return without_gaps(factors)
 
@@ -160,7 +143,6 @@ class Isam2Tree:
             kept = [key for key in landmarks if self.has(key)]
             again = self.drop(kept) if kept else Recovery([], set())
             return Recovery(recovery.log + again.log, recovery.dropped | again.dropped)
-        self._unchain(landmarks)
         self._landmarks.difference_update(landmarks)
         slots = [slot for key in landmarks for slot in self._sightings.pop(key)]
         return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
@@ -201,8 +183,7 @@ class Isam2Tree:
 
     def _moved(self) -> set[int]:
         """Return the variables to relinearise in this frame; of recent states all or none, so that they agree."""
-        fixed = {*self.isam.getFixedVariables(), *(self._chained.settled if self._chained is not None else ())}
-        may_move = self._frozen.others - fixed
+        may_move = self._frozen.others - set(self.isam.getFixedVariables())
         landmarks = {key for key in self._to_relinearise & may_move if self.has(key)}
         states = [key for key in may_move - self._landmarks if kind_of(key) != "l" and self.has(key)]
         return landmarks.union(states if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else ())
@@ -215,18 +196,18 @@ class Isam2Tree:
         states = self._to_relinearise - self._landmarks
         stale = {slot: old for slot, old in self._cached.items() if not states.isdisjoint(old.keys)} if states else {}
         of_factors = [*(factor.keys() for factor in added.values()), *(old.keys for old in stale.values())]
-        at = self._places(list(set().union(*of_factors)), new).linearised_at if of_factors else new
+        at = self._linearisation_points(list(set().union(*of_factors)), new) if of_factors else new
         return (
             {place: CachedLinearisation(factor, at.extract(factor.keys())) for place, factor in added.items()},
             {slot: CachedLinearisation(old.factor, at.extract(old.keys)) for slot, old in stale.items()},
         )
 
-    def _places(self, keys: list[int], new: gtsam.Values) -> Places:
-        """Return values of states and landmarks, and the tree's linearisation points of them from this frame on."""
+    def _linearisation_points(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
+        """Return the tree's linearisation points of states and landmarks from this frame on."""
         stay = [key for key in keys if not new.exists(key) and key not in self._to_relinearise]
         estimates, at = self._first_values(keys, new), self.isam.getLinearizationPoint().extract(stay)
         at.insert(estimates.extract([key for key in keys if not at.exists(key)]))
-        return Places(estimates, at)
+        return at
 
     def _not_relinearised(self) -> gtsam.KeyList:
         """Return the keys that GTSAM must not relinearise: all except those marked for it."""
@@ -234,10 +215,6 @@ class Isam2Tree:
         for key in (*(self._frozen.others - self._to_relinearise), LAST):
             fixed.push_back(key)
         return fixed
-
-    def _unchain(self, landmarks: list[int]) -> None:
-        if self._chained is not None:
-            self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
 
     def _update(
         self,
@@ -341,7 +318,6 @@ class Isam2Tree:
                     log.append(
                         f"landmark {gtsam.Symbol(culprit).index()} made the system indeterminate and was dropped"
                     )
-                    self._unchain([culprit])
                     for slot in self._sightings.pop(culprit):
                         factors.remove(slot)
             elif self._factorization == "CHOLESKY":
@@ -381,8 +357,6 @@ class Isam2Tree:
         self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
         self._tie_slots = [slot_of[old] for old in self._tie_slots]
-        if self._chained is not None:
-            self._chained.move(slot_of)
         self._frozen.come_back(self._retired.keys)
         self._taken_back = bool(self._retired.keys)
         self._retired, self._landmarks = RetiredVariables(), set(self._sightings)

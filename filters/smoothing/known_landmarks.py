@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import left_only, stereo
-from toolkit.sequence import StereoFrame, StereoRig, is_left_only
+from toolkit.sequence import StereoFrame, StereoRig
 
 
 class KnownLandmarks:
@@ -36,12 +36,8 @@ class KnownLandmarks:
         """Say which of the tracks (N,) have a landmark."""
         return np.array([i in self._points for i in track_ids], dtype=bool)
 
-    def see(self, frame: StereoFrame, placed: Mapping[int, Array], T_world_imu: Array, share: float) -> None:
-        """Add the sightings of a frame from a pose (4, 4), of known landmarks and of those ``placed`` here.
-
-        Each has a weight in (0, 1], ``share``. With a track noise model, errors persist from sighting to sighting, and
-        only the newest sighting in both images predicts how far the next one will be from the landmark.
-        """
+    def see(self, frame: StereoFrame, placed: Mapping[int, Array], T_world_imu: Array) -> None:
+        """Add the sightings of a frame from a pose (4, 4), of known landmarks and of those ``placed`` here."""
         if not frame.track_ids.size:
             return
         ids = frame.track_ids.tolist()
@@ -50,12 +46,8 @@ class KnownLandmarks:
         expected = stereo.predict(np.array(points), T_world_imu, self._rig)
         H = left_only.whitener(frame.uvs_px, self._rig) @ left_only.seen_rows(frame.uvs_px, expected.d_uv_d_point)
         self._points.update(zip(ids, points, strict=True))
-        information = zip(ids, share * (np.swapaxes(H, 1, 2) @ H), strict=True)
-        if self._rig.track_noise is None:
-            self._information.update({i: self._information.get(i, 0.0) + one for i, one in information})
-        else:
-            in_both = ~is_left_only(frame.uvs_px)
-            self._information.update({i: one for (i, one), both in zip(information, in_both, strict=True) if both})
+        information = zip(ids, np.swapaxes(H, 1, 2) @ H, strict=True)
+        self._information.update({i: self._information.get(i, 0.0) + one for i, one in information})
 
     def move(self, points: Mapping[int, Array]) -> None:
         """Update the points of landmarks."""

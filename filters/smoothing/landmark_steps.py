@@ -24,9 +24,6 @@ from toolkit.track_noise import CHANNELS
 _FROM_CHANNELS = np.linalg.inv(CHANNELS)
 # Largest growth of the logarithm of the depth in one step; it keeps disparities positive.
 _MOST_FARTHER = 2.0
-_SMALL_DISPARITY_PX = 1.0
-# px^-2: the least damping of a landmark, for one whose sightings have less information.
-_LEAST_INFORMATION = 1e-6
 
 
 class LandmarksSeen(NamedTuple):
@@ -48,10 +45,6 @@ class LandmarksSeen(NamedTuple):
         seen = stereo.predict(points, _poses(values, first), rig)
         by_pose, by_point = (in_channels(CHANNELS, slope) for slope in (seen.d_uv_d_pose, seen.d_uv_d_point))
         return cls(track_ids, first, seen.uv_px @ CHANNELS.T, by_pose, by_point)
-
-    def moved(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
-        """Return the values after a step whose landmark parts are changes of (c, d, v) px due to the point."""
-        return self._moved_by(_of_landmarks(step, self.track_ids), values, step, rig)
 
     def moved_with_points(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
         """Return the values after a step whose landmark parts are metres in the world, as in a graph's own step.
@@ -78,41 +71,6 @@ class LandmarksSeen(NamedTuple):
         for track_id, point in zip(self.track_ids.tolist(), points, strict=True):
             there.update(L(track_id), point)
         return there
-
-
-@dataclass(frozen=True, eq=False)
-class LandmarkSteps:
-    """The linear system of one step, in poses and landmark images, at some values.
-
-    ``sightings`` are linear in the steps of poses and in the change of each landmark's (c, d, v) px; ``information``
-    (M, 3) px^-2 is their information on each of the three, given all other variables.
-    """
-
-    values: gtsam.Values
-    seen: LandmarksSeen
-    sightings: gtsam.GaussianFactorGraph
-    information: Array
-    rig: StereoRig
-
-    def damping(self, share: float) -> gtsam.GaussianFactorGraph:
-        """Return factors that damp (c, d, v) of each landmark by a share of the information on each of the three.
-
-        A disparity near zero is also damped by its size: for a landmark whose best disparity is negative, beyond
-        infinity, the linear system predicts a decrease that no step achieves.
-        """
-        damped, disparity_px = share * np.maximum(self.information, _LEAST_INFORMATION), np.abs(self.seen.image[:, 1])
-        damped[:, 1] += np.where(disparity_px < _SMALL_DISPARITY_PX, np.square(0.5 / disparity_px), 0.0)
-        roots = np.sqrt(damped)[..., None] * np.eye(3)
-        of_pose = roots @ self.seen.by_pose
-        graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(3)
-        keys = zip(map(L, self.seen.track_ids.tolist()), map(X, self.seen.first.tolist()), strict=True)
-        for row, (landmark, pose) in enumerate(keys):
-            graph.add(gtsam.JacobianFactor(landmark, roots[row], pose, of_pose[row], np.zeros(3), unit))
-        return graph
-
-    def taken(self, step: gtsam.VectorValues) -> gtsam.Values:
-        """Return the values after a step."""
-        return self.seen.moved(self.values, step, self.rig)
 
 
 @dataclass(frozen=True, eq=False)

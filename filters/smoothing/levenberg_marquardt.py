@@ -12,10 +12,6 @@ step is long. A weakly determined direction, such as the drift of a long drive, 
 solve converges slowly or stops far from the minimum (37 m from it, in the mean of the 1010 frames of Dataset 03). From
 the first step on that raises the error, landmarks are therefore moved in images
 (:class:`~filters.smoothing.landmark_steps.FirstImages`), with hardly any damping.
-
-If sightings are evaluated outside the graph, only their landmarks are damped (:mod:`filters.smoothing.landmark_steps`);
-the other variables are damped, in Levenberg's way, only if that is not enough. Such a solve has converged when a step
-gains little although it was neither damped nor shortened much.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,10 +23,9 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.indeterminate import variable_named
-from filters.smoothing.landmark_steps import FirstImages, LandmarkSteps
+from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.errors import EstimatorError
-from toolkit.models.factors import kind_of
 from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
@@ -39,15 +34,8 @@ _DAMPING_IN_IMAGES = 1e-7
 # Least decrease of the error, half a sum of squares in sigma: with exact measurements the error is near zero, and a
 # relative criterion is never met.
 _LEAST_DECREASE = 1e-12
-# Landmarks are damped by these shares of their own information. Beyond the last one, which nearly fixes them, all other
-# variables are damped as well.
-_FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
 # If a step raises the error by less than this share of it, the solve is at a minimum.
 _NEGLIGIBLE_INCREASE = 1e-5
-# A step that achieves less than this share of the decrease predicted by the linear system is shortened.
-_LEAST_GAIN_RATIO = 0.5
-# A step that gains little ends the solve only if it was damped by at most this, and not shortened below this part.
-_FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
 
 @dataclass(frozen=True)
@@ -65,19 +53,6 @@ class Stopping:
     decrease: float = _LEAST_DECREASE
     at_overshoot: bool = False
     enough: float = 0.0
-
-
-class Beside(Protocol):
-    """Measurements outside the graph, evaluated and linearised in Python for all at once."""
-
-    def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares, or the sum of losses."""
-
-    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return linear factors about the values."""
-
-    def landmark_steps(self, values: gtsam.Values) -> LandmarkSteps:
-        """Return the system of a step at some values."""
 
 
 class Solution(NamedTuple):
@@ -99,30 +74,26 @@ def solve(
     stopping: Stopping,
     progress: Progress = SILENT,
     stage: str = "solving",
-    landmarks: Beside | FirstImages | None = None,
+    landmarks: FirstImages | None = None,
     ordering: gtsam.Ordering | None = None,
 ) -> Solution:
     """Minimise the error of a graph from a start; ``progress`` is called at every iteration with the stage's name.
 
-    ``landmarks`` are either sightings outside the graph, or the images in which the graph's own landmarks are moved
-    once a step in metres has raised the error. ``ordering`` is the elimination order if no sightings are outside the
-    graph, by default COLAMD's.
+    ``landmarks`` are the images in which the graph's landmarks are moved once a step in metres has raised the error.
+    ``ordering`` is the elimination order, by default COLAMD's.
 
     If no step, however short, lowers the error, the start is a minimum. Raises EstimatorError if the error at the start
     is not finite: some measurement or initial value is NaN.
     """
-    beside = None if isinstance(landmarks, FirstImages) else landmarks
     mixed = graph if isinstance(graph, MixedGraph) else MixedGraph(graph)
-    error = mixed.error(start) + (0.0 if beside is None else beside.error(start))
+    error = mixed.error(start)
     if not np.isfinite(error):
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
     advance = partial(progress.advance, total=stopping.max_iterations, stage=stage)
-    if beside is not None:
-        return _solved(_LandmarkSolver(mixed, start, beside), start, error, stopping, advance)
     if ordering is None:
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(mixed.whole)
     in_metres = _GraphSolver(mixed, ordering, stopping.at_overshoot)
-    solver = _ImageSolver(in_metres, landmarks) if isinstance(landmarks, FirstImages) else in_metres
+    solver = _ImageSolver(in_metres, landmarks) if landmarks is not None else in_metres
     return _solved(solver, start, error, stopping, advance)._replace(overshot=in_metres.overshot)
 
 
@@ -295,78 +266,6 @@ class _ImageSolver:
         if self._in_metres.overshot:
             return _DampedState(there.values(), there.error, _DAMPING_IN_IMAGES, is_limited=True)
         return there
-
-
-class _LandmarkState(NamedTuple):
-    """The state of a solve: values, error, the damping share of its next step, and whether the last was short."""
-
-    reached: gtsam.Values
-    error: float
-    share: float
-    is_limited: bool
-
-    def values(self) -> gtsam.Values:
-        """Return the values."""
-        return self.reached
-
-
-class _LandmarkSolver:
-    """Takes the steps of a solve with sightings outside the graph, of which only the landmarks are damped."""
-
-    def __init__(self, graph: MixedGraph, start: gtsam.Values, beside: Beside) -> None:
-        self._graph, self._beside = graph, beside
-        self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
-
-    def started(self, values: gtsam.Values, error: float) -> _LandmarkState:
-        """Return the initial state of the solve."""
-        return _LandmarkState(values, error, _FIRST_SHARE, is_limited=False)
-
-    def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
-        return _joined(self._graph.linear(values), steps.sightings)
-
-    def advanced(self, here: _LandmarkState) -> _LandmarkState:
-        """Return the state after the next step that lowers the error; the same state if none does."""
-        steps = self._beside.landmark_steps(here.reached)
-        linear = self._linear(here.reached, steps)
-        share = here.share
-        while share < _MOST_DAMPING:
-            there = self._tried(here, steps, linear, share)
-            if there is not None:
-                return there
-            share *= _DAMPING_FACTOR
-        return here._replace(is_limited=False)
-
-    def _tried(
-        self, here: _LandmarkState, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
-    ) -> _LandmarkState | None:
-        """Return the state after a step damped by a share, taken in full or in part; None if its error is larger."""
-        step = self._step(linear, steps, share)
-        if step is None:
-            return None
-        predicted = here.error - linear.error(step)
-        there = self._at(steps, step, share)
-        if here.error - there.error < _LEAST_GAIN_RATIO * predicted:
-            # The minimum along the step of the parabola with the predicted slope and the error found at its end.
-            part = predicted / (2.0 * predicted - (here.error - there.error))
-            shorter = self._at(steps, step.scale(part), share, is_limited=part < _LEAST_PART)
-            there = shorter if shorter.error < there.error or np.isnan(there.error) else there
-        return there if there.error <= here.error else None
-
-    def _at(
-        self, steps: LandmarkSteps, step: gtsam.VectorValues, share: float, is_limited: bool = False
-    ) -> _LandmarkState:
-        there = steps.taken(step)
-        error = self._graph.error(there) + self._beside.error(there)
-        next_share = max(share / _DAMPING_FACTOR, _LEAST_SHARE)
-        return _LandmarkState(there, error, next_share, is_limited or share > _FREE_SHARE)
-
-    def _step(self, linear: gtsam.GaussianFactorGraph, steps: LandmarkSteps, share: float) -> gtsam.VectorValues | None:
-        """Return the damped step; None if the linear system does not determine it."""
-        damped = _joined(linear, steps.damping(share))
-        if share > _LANDMARKS_ALONE:
-            dims = steps.values.dims()
-            damped.push_back(_damping_factors({key: size for key, size in dims.items() if kind_of(key) != "l"}, share))
-        return _eliminated(damped, self._ordering)
 
 
 def _joined(one: gtsam.GaussianFactorGraph, other: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:

@@ -17,7 +17,6 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.robust_loss import Cauchy
 from toolkit.geometry import Array, BoolArray, se3_exp, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
@@ -35,8 +34,8 @@ _LEAST_STEP = 0.01
 # A landmark that began with an outlier is far from all later sightings: while one sighting alone determines a landmark,
 # that one and the new one both have to be sound.
 _MOST_MISMATCHED_PAIRS = 1.0 - (1.0 - MOST_MISMATCHED) ** 2
-# The loss of batch between its first and its last solve.
-_LOSS = Cauchy(2.0)
+# The scale of the Cauchy loss of batch between its first and its last solve.
+_LOSS_SCALE = 2.0
 
 
 def relative_to_its_map(belief: Belief) -> Belief:
@@ -56,16 +55,14 @@ class OutlierCheck:
     rig: StereoRig
     policy: Outliers
 
-    def placed(
-        self, expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, share: float = 1.0
-    ) -> tuple[Belief, StereoFrame]:
+    def placed(self, expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks) -> tuple[Belief, StereoFrame]:
         """Return the state corrected by a frame, and the frame without its outliers at that state.
 
-        ``expected`` is the predicted state, with the covariance of its motion relative to the map; ``share`` is the
-        weight of sightings. At the corrected state the error of the motion no longer enters the gate.
+        ``expected`` is the predicted state, with the covariance of its motion relative to the map. At the corrected
+        state the error of the motion no longer enters the gate.
         """
         known = _KnownSightings.of(frame, landmarks)
-        there = _aligned(expected, known, self.rig, share)
+        there = _aligned(expected, known, self.rig)
         return there, frame.select(~self._outliers(known, relative_to_its_map(there)))
 
     def outliers(self, frame: StereoFrame, landmarks: KnownLandmarks, expected: Belief) -> BoolArray:
@@ -168,18 +165,12 @@ def _carried(H: Array, cov: Array) -> Array:
     return np.asarray(H @ cov @ np.swapaxes(H, 1, 2))
 
 
-def aligned(
-    expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, rig: StereoRig, share: float = 1.0
-) -> Belief:
-    """Return the belief with its pose corrected by a frame's sightings of known landmarks.
-
-    Each sighting has a weight ``share`` and the noise of the pixels; whether it is an outlier is decided by its full
-    residual. The covariance is not changed.
-    """
-    return _aligned(expected, _KnownSightings.of(frame, landmarks), rig, share)
+def aligned(expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, rig: StereoRig) -> Belief:
+    """Return the belief with its pose corrected by a frame's sightings of known landmarks; its covariance stays."""
+    return _aligned(expected, _KnownSightings.of(frame, landmarks), rig)
 
 
-def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig, share: float) -> Belief:
+def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig) -> Belief:
     if not len(known.points):
         return expected
     uvs_px, landmarks = known.uvs_px, known.points
@@ -188,7 +179,7 @@ def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig, share: fl
     for _ in range(_STEPS):
         predicted = stereo.predict(landmarks, T_world_imu, rig)
         residual = left_only.whitened_residuals(uvs_px, predicted.uv_px, rig)
-        weights = np.where(predicted.depth_m > 0.0, share * _LOSS.weight(np.linalg.norm(residual, axis=1)), 0.0)
+        weights = np.where(predicted.depth_m > 0.0, 1.0 / (1.0 + np.square(residual / _LOSS_SCALE).sum(axis=1)), 0.0)
         H = (whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
         weighed = H * np.repeat(weights, 3)[:, None]
         step = np.linalg.solve(np.eye(6) + cov @ (weighed.T @ H), cov @ (weighed.T @ residual.ravel()) - off)

@@ -7,22 +7,19 @@ removes a sixth of the squared error, and made a simulated drive 1.7 times less 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.discounted_tracks import DiscountedTracks, discounted, seen_often
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph
-from filters.smoothing.robust_loss import Cauchy, Huber, Squares
-from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
-from toolkit.models.factors import SCALE, L, StereoFactors, X, huber_loss, kind_of
+from toolkit.models.factors import L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.stacked_factors import StackedFactors
 from toolkit.progress import Progress
@@ -31,11 +28,6 @@ from toolkit.settings import Outliers
 
 # Huber's loss first brings every landmark near its minimum, mismatched or not; Cauchy's then gives mismatches no
 # weight. The last solve starts from that solution.
-# Solves along the tracks start near the solution. The scale of the world depends on differences of small residuals, so
-# the last of them stops at an absolute decrease of the error, not at a relative one.
-_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 120, decrease=0.01)
-# A scale of disparities under white noise depends on them too, but converges quickly; far landmarks converge slowly.
-_SCALE_STOPPING = Stopping(1e-5, 60)
 # Huber's solve need not converge, it only brings landmarks near; Cauchy's, whose weights converge slowly, only decides
 # what is an outlier. Both thresholds were chosen by looking at recordings that are scored with them.
 _HUBER_STOPPING, _CAUCHY_STOPPING = Stopping(1e-2, 20, at_overshoot=True), Stopping(3e-3, 60)
@@ -48,11 +40,6 @@ class MotionFactors:
 
     graph: gtsam.NonlinearFactorGraph
     stacks: Sequence[StackedFactors] = ()
-
-    @property
-    def mixed(self) -> MixedGraph:
-        """Return the factors in the form a solver takes."""
-        return MixedGraph(self.graph, self.stacks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +57,13 @@ def solve_robustly(
     rig: StereoRig,
     start: gtsam.Values,
     outliers: Outliers,
-    tracks: DiscountedTracks,
     progress: Progress,
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on, because a sighting
     of it has no gradient and would leave it there. The result is that of the last solve, and so is whether it
-    converged. A scale of disparities among the values stays fixed until outliers have been decided. In the last solve
-    tracks have the weight that their residuals give them by then.
+    converged.
     """
     values, order_of, overshot = start, cheaper_order(motion.graph, frames), False
     for robust, stopping, stage in _stages(outliers):
@@ -95,66 +80,12 @@ def solve_robustly(
         for frame, distance, _ in _residuals(frames, values, rig)
     ]
     frames = _placed_by_stereo(frames)
-    if rig.track_noise is not None:
-        return _solve_chained(motion, frames, rig, values, outliers, progress)
-    poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
-    tracks.learn_from_all(frames, poses, points)
-    rig, huber = discounted(rig, outliers.batch_last_huber, tracks.share)
-    if values.exists(SCALE):
-        sightings = ChainedSightings.of(frames, rig)
-        apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
-        return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
-    graph = _with_sightings(motion.graph, frames, StereoFactors(rig, huber_loss(huber)))
+    graph = _with_sightings(motion.graph, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
     values, stage = _only_seen(values, frames), "solving without outliers"
     images = FirstImages.of(frames, rig, at_once=overshot)
     order = order_of(graph, frames)
     last = solve(MixedGraph(graph, motion.stacks), values, _LAST_STOPPING, progress, stage, images, order)
     return Smoothed(last, graph, frames)
-
-
-def _solve_chained(
-    motion: MotionFactors,
-    frames: list[StereoFrame],
-    rig: StereoRig,
-    start: gtsam.Values,
-    outliers: Outliers,
-    progress: Progress,
-) -> Smoothed:
-    """Solve with correlated errors along tracks, starting from the solution with uncorrelated ones.
-
-    The first solve has Cauchy's loss of the innovations, with each track's remaining error Student-t distributed as a
-    whole. The second leaves out implausible innovations: after such a jump the track may have a new error, and its
-    following innovations are still used. In this last solve each track keeps the weight it has at the start, so that
-    the problem, and its covariance, are those of least squares.
-    """
-    values = _only_seen(start, frames)
-    sightings = ChainedSightings.of(frames, rig)
-    robust = ChainedFactors(sightings, rig, Squares())
-    if outliers.batch_cauchy is not None:
-        robust = replace(robust, loss=Cauchy(outliers.batch_cauchy), freedom=FREEDOM_OF_TRACKS)
-    stage = "solving along the tracks"
-    values = solve(motion.mixed, values, _JUMPS_STOPPING, progress, stage, robust).values
-    dof = left_only.degrees_of_freedom(sightings.uv_px)
-    jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers, dof)
-    sightings, frames = without_jumps(sightings, frames, jumped)
-    last = replace(robust, sightings=sightings, loss=Squares()).with_fixed_weights(_only_seen(values, frames))
-    return _solve_last(motion, last, frames, values, CHAIN_STOPPING, progress)
-
-
-def _solve_last(
-    motion: MotionFactors,
-    sightings: ChainedFactors,
-    frames: list[StereoFrame],
-    start: gtsam.Values,
-    stopping: Stopping,
-    progress: Progress,
-) -> Smoothed:
-    values = _only_seen(start, frames)
-    stage = "solving along the tracks, without outliers"
-    solution = solve(motion.mixed, values, stopping, progress, stage, sightings)
-    graph = gtsam.NonlinearFactorGraph(motion.graph)
-    graph.push_back(sightings.linearised(solution.values))
-    return Smoothed(solution, graph, frames)
 
 
 def _cut_bound(outliers: Outliers, dof: int | IntArray) -> Array:

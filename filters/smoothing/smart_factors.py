@@ -6,7 +6,6 @@ for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does the same on
 independent in uL, uR and v; here the rig's full covariance is used, and each sighting has its weight by Huber's loss.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -16,8 +15,7 @@ from scipy.sparse import csc_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
-from toolkit.models.correlated_noise import Chain, channels_of, in_channels
-from toolkit.sequence import StereoRig, is_left_only
+from toolkit.sequence import StereoRig
 
 # Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
 _BEHIND_NORM = 100.0
@@ -42,17 +40,16 @@ class RobustCamera:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """N sightings in the order of time: rows of poses (N,) and points (N,), measurements (N, 3) px, ages (N,)."""
+    """N sightings in the order of time: rows of poses (N,) and points (N,), measurements (N, 3) px."""
 
     pose: IntArray
     point: IntArray
     uv_px: Array
-    ages: IntArray
 
     def of_points(self, points: IntArray) -> "Sightings":
         """Return the sightings of some points (M,); their row numbers stay."""
         rows = np.isin(self.point, points)
-        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows], self.ages[rows])
+        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
 
 
 class PointsInView(NamedTuple):
@@ -105,8 +102,7 @@ class Vision:
     def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
         """Evaluate sightings at poses (K, 4, 4) of the IMU in the world and points (M, 3) m in the world."""
         seen = seen_from(poses, points, sightings, camera.rig)
-        kind = cls if camera.rig.track_noise is None else ChainedVision
-        return kind((len(poses), len(points)), sightings, seen, camera)
+        return cls((len(poses), len(points)), sightings, seen, camera)
 
     @property
     def loss(self) -> float:
@@ -130,9 +126,7 @@ class Vision:
         weights = self._root_weights
         weighted = weights[:, None, None] * left_only.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
-        seen, all_rows = self.sightings, np.arange(weights.size)
-        of_poses = [_PoseJacobians(all_rows, seen.pose, J_pose)]
-        return _eliminated(weights[:, None] * self._residual, of_poses, J_point, seen.point, self.counts)
+        return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
 
     @property
     def _root_weights(self) -> Array:
@@ -157,55 +151,10 @@ class Vision:
         return np.asarray(np.linalg.norm(self._residual, axis=1))
 
 
-class ChainedVision(Vision):
-    """Sightings whose errors are correlated along their tracks: the innovation of each is a residual of two poses.
-
-    Huber's loss is that of the innovations.
-    """
-
-    def reduced(self) -> ReducedVision:
-        """Linearise and eliminate the points, as for independent sightings."""
-        chain, weights, channels = self._chain, self._root_weights[:, None, None], channels_of(self.sightings.uv_px)
-        to_pose, to_point = self._predicted.d_uv_d_pose, self._predicted.d_uv_d_point
-        own = weights * chain.whitened(in_channels(channels, to_pose), np.zeros_like(to_pose))
-        before = weights * chain.whitened(np.zeros_like(to_pose), chain.of_before(channels, to_pose))
-        J_point = weights * chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point))
-        seen, left, of_poses = self.sightings, is_left_only(self.sightings.uv_px), []
-        of_poses.append(_PoseJacobians(np.arange(seen.pose.size), seen.pose, own))
-        # A stereo sighting and a left-only sighting may have the same preceding sighting.
-        for kind in (~left, left) if left.any() else (~left,):
-            follow = np.flatnonzero((chain.before >= 0) & kind)
-            of_poses.append(_PoseJacobians(follow, seen.pose[chain.before[follow]], before[follow]))
-        return _eliminated(weights[..., 0] * self._residual, of_poses, J_point, seen.point, self.counts)
-
-    @cached_property
-    def _chain(self) -> Chain:
-        noise, seen = self.camera.rig.track_noise, self.sightings
-        assert noise is not None
-        return Chain.of(noise, seen.point, seen.ages, is_left_only(seen.uv_px))
-
-    @cached_property
-    def _residual(self) -> Array:
-        """Whitened innovations (N, 3) of measured less predicted."""
-        residuals_px = left_only.residuals_px(self.sightings.uv_px, self._predicted.uv_px)
-        return self._chain.innovations(residuals_px, channels_of(self.sightings.uv_px))
-
-
-class _PoseJacobians(NamedTuple):
-    """Jacobians (n, 3, 6) of some residuals, given by rows (n,), to one pose (n,) that each depends on.
-
-    No two of them share both pose and point.
-    """
-
-    rows: IntArray
-    pose: IntArray
-    J_pose: Array
-
-
 def _eliminated(
-    residual: Array, of_poses: Sequence[_PoseJacobians], J_point: Array, point: IntArray, counts: tuple[int, int]
+    residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]
 ) -> ReducedVision:
-    pose_count, point_count = counts
+    (pose_count, point_count), point, pose = counts, seen.point, seen.pose
     # Small matrix products are several times as fast on contiguous arrays.
     to_point = np.ascontiguousarray(np.swapaxes(J_point, 1, 2))
     per_point = _summation(point, point_count)
@@ -215,27 +164,14 @@ def _eliminated(
     root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
     whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
     coupling, vector = np.zeros((pose_count, 6, point_count, 3)), np.zeros((pose_count, 6))
-    J_whitened = J_point @ root[point]
-    for rows, pose, J_pose in of_poses:
-        to_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2))
-        coupling[pose, :, point[rows], :] += to_pose @ J_whitened[rows]
-        vector += _summation(pose, pose_count) @ (to_pose @ residual[rows, :, None])[..., 0]
+    to_pose, per_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2)), _summation(pose, pose_count)
+    coupling[pose, :, point, :] += to_pose @ (J_point @ root[point])
+    vector += per_pose @ (to_pose @ residual[..., None])[..., 0]
     across = coupling.reshape(6 * pose_count, 3 * point_count)
     information = -(across @ across.T)
-    _add_pose_information(information.reshape(pose_count, 6, pose_count, 6), of_poses)
+    own = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(pose_count, 6, 6)
+    information.reshape(pose_count, 6, pose_count, 6)[np.arange(pose_count), :, np.arange(pose_count)] += own
     return ReducedVision(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
-
-
-def _add_pose_information(information: Array, of_poses: Sequence[_PoseJacobians]) -> None:
-    """Add the residuals' information on their poses to the information (K, 6, K, 6) on all of them."""
-    count = len(information)
-    for one in of_poses:
-        for other in of_poses:
-            both, of_one, of_other = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
-            blocks = np.swapaxes(one.J_pose[of_one], 1, 2) @ other.J_pose[of_other]
-            pairs = count * one.pose[of_one] + other.pose[of_other]
-            summed = (_summation(pairs, count**2) @ blocks.reshape(both.size, 36)).reshape(count, count, 6, 6)
-            information += np.swapaxes(summed, 1, 2)
 
 
 def _summation(groups: IntArray, count: int) -> csc_array:

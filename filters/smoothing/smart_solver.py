@@ -81,7 +81,7 @@ def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> Sma
         for key in keys:
             values.erase(key)
     left = ~np.isin(seen.point, leaving_points)
-    kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left], seen.ages[left])
+    kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
     prior = MarginalPrior(information, vector, values)
     motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
     return SmartWindow(window.keys[count:], values, motion, prior, kept, window.points)
@@ -91,7 +91,7 @@ def _with_points(window: SmartWindow, points: IntArray) -> SmartWindow:
     """Return the window with some points (M,), by their ascending rows, and their sightings."""
     seen = window.sightings.of_points(points)
     rows = np.searchsorted(points, seen.point).astype(np.int64)
-    return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px, seen.ages))
+    return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
 
 
 class _DescentStep(NamedTuple):

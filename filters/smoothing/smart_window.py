@@ -76,7 +76,7 @@ class TrackedWindow:
     def empty(cls) -> "TrackedWindow":
         """Return a window without states."""
         none = np.empty(0, dtype=np.int64)
-        sightings = Sightings(none, none, np.empty((0, 3)), none)
+        sightings = Sightings(none, none, np.empty((0, 3)))
         return cls(SmartWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
 
     def points_by_id(self) -> dict[int, Array]:
@@ -100,7 +100,6 @@ class TrackedWindow:
             np.concatenate([seen.pose, newest]),
             np.concatenate([seen.point, rows]),
             np.concatenate([seen.uv_px, used.uvs_px]),
-            np.concatenate([seen.ages, used.ages]),
         )
         return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
 
@@ -114,7 +113,7 @@ class TrackedWindow:
         """Drop the points without sightings."""
         seen = self.window.sightings
         kept, rows = np.unique(seen.point, return_inverse=True)
-        sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px, seen.ages)
+        sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px)
         return TrackedWindow(
             replace(self.window, points=self.window.points[kept], sightings=sightings), self.track_ids[kept]
         )

@@ -1,10 +1,10 @@
-"""A track's sightings compiled: their images and Jacobians, and the decorrelation of rows with correlated noise."""
+"""A track's sightings compiled: their images and Jacobians."""
 
 import math
 
 import numpy as np
 
-from filters.kalman.kernels.algebra import cholesky, moved, solved_3
+from filters.kalman.kernels.algebra import moved, solved_3
 from filters.kalman.kernels.compiling import compiled
 from filters.kalman.kernels.signatures import Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -102,66 +102,6 @@ def linearise(points: Array, f: int, uvs_px: Array, where: IntArray, window: Arr
 
 
 @compiled
-def noise_roots(ages: IntArray, f: int, where: IntArray, variances: Array, roots: Array) -> None:
-    """Write the Cholesky factors of the covariances of a track's errors to roots (3 m, m), one channel below the other.
-
-    The covariance is ``white [j = k] + walk min(a_j, a_k) + offset`` (``toolkit.track_noise``).
-    """
-    m = where.size
-    one = np.empty((m, m))
-    for channel in range(3):
-        white, walk, offset = variances[0, channel], variances[1, channel], variances[2, channel]
-        for i in range(m):
-            for j in range(i + 1):
-                one[i, j] = one[j, i] = walk * min(ages[f, where[i]], ages[f, where[j]]) + offset
-            one[i, i] += white
-        cholesky(one, m)
-        for i in range(m):
-            for j in range(i + 1):
-                roots[channel * m + i, j] = one[i, j]
-
-
-@compiled
-def decorrelate(roots: Array, m: int, A: Array, columns: int) -> None:
-    """Multiply the first columns of A (3 m, n), rows by sighting and channel, by the inverse of each channel's root."""
-    for row in range(3 * m):
-        i, channel = row // 3, row % 3
-        for j in range(i):
-            factor = roots[channel * m + i, j]
-            for c in range(columns):
-                A[row, c] -= factor * A[3 * j + channel, c]
-        for c in range(columns):
-            A[row, c] /= roots[channel * m + i, i]
-
-
-@compiled
-def decorrelate_transposed(roots: Array, m: int, A: Array, columns: int) -> None:
-    """Multiply the first columns of A (3 m, n) by the transposed inverse of each channel's root."""
-    for row in range(3 * m - 1, -1, -1):
-        i, channel = row // 3, row % 3
-        for j in range(i + 1, m):
-            factor = roots[channel * m + j, i]
-            for c in range(columns):
-                A[row, c] -= factor * A[3 * j + channel, c]
-        for c in range(columns):
-            A[row, c] /= roots[channel * m + i, i]
-
-
-@compiled
-def own_jacobians(H_pose: Array, m: int, roots: Array, correlated: bool, J: Array) -> None:
-    """Write Jacobians (3 m, 6) to each sighting's own pose as Jacobians J (3 m, 6 m) to all poses; decorrelate them."""
-    for i in range(3 * m):
-        for c in range(6 * m):
-            J[i, c] = 0.0
-    for k in range(m):
-        for i in range(3 * k, 3 * k + 3):
-            for c in range(6):
-                J[i, 6 * k + c] = H_pose[i, c]
-    if correlated:
-        decorrelate(roots, m, J, 6 * m)
-
-
-@compiled
 def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
     """Add ``[H r]^T [H r]`` of some rows (., 4) to row ``at`` of N, in the form that ``solved_3`` takes."""
     for row in range(first, end):
@@ -180,11 +120,3 @@ def step(points: Array, f: int, nearest_m: float, N: Array, at: int) -> None:
     points[f, 0] += share * x
     points[f, 1] += share * y
     points[f, 2] += share * z
-
-
-@compiled
-def refine(points: Array, f: int, nearest_m: float, H_point: Array, n: int) -> None:
-    """Move a track's point by one step of ``multiview.refined``: Gauss-Newton on n independent rows ``[H r]``."""
-    N = np.zeros((1, 10))
-    add_products(H_point, 0, n, N, 0)
-    step(points, f, nearest_m, N, 0)

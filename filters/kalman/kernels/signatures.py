@@ -6,9 +6,8 @@ from numba import types
 
 Arrays = tuple[Any, ...]
 ROW, MATRIX, STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
-MASK, COUNTS = types.boolean[:, ::1], types.int64[:, ::1]
+MASK = types.boolean[:, ::1]
 # Poses (W, 4, 4), poses to linearise at (W, 4, 4), covariance of their errors (6 W, 6 W).
 WINDOW = types.Tuple((STACK, STACK, MATRIX))
-# fx, fy, cx, cy px and baseline m (5,); T_imu_cam (1, 4, 4); whitener (3, 3); variances (3, 3) px^2 of white noise,
-# walk and offset, one column per channel, and the channels (3, 3), both (0, 3) where the noise of tracks is white.
-CAMERA = types.Tuple((ROW, STACK, MATRIX, MATRIX, MATRIX))
+# fx, fy, cx, cy px and baseline m (5,); T_imu_cam (1, 4, 4); whitener (3, 3).
+CAMERA = types.Tuple((ROW, STACK, MATRIX))

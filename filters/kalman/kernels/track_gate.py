@@ -21,28 +21,22 @@ from filters.kalman.kernels.algebra import (
     reflect_both_sides,
     reflections,
     solved_3,
-    transpose,
 )
 from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.sightings import (
     add_products,
-    decorrelate,
-    decorrelate_transposed,
     first_guess,
     linearise,
-    noise_roots,
-    own_jacobians,
     project,
-    refine,
     sighted,
 )
-from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, ROW, STACK, WINDOW, Arrays
+from filters.kalman.kernels.signatures import CAMERA, MASK, ROW, STACK, WINDOW, Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
 
-# Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W), their ages (F, W). Then window and camera, the rules
-# numbered below, and bounds (3 W - 2,) of the NIS by degrees of freedom.
-SIGNATURE = (types.Tuple((STACK, MASK, COUNTS)), WINDOW, CAMERA, ROW, ROW)
-ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_DEPTH, REFINEMENTS, MISMATCHED = range(8)
+# Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W). Then window and camera, the rules numbered below, and
+# bounds (3 W - 2,) of the NIS by degrees of freedom.
+SIGNATURE = (types.Tuple((STACK, MASK)), WINDOW, CAMERA, ROW, ROW)
+ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_DEPTH, MISMATCHED = range(7)
 
 
 @compiled
@@ -144,35 +138,17 @@ def carry_cov(where: IntArray, H_pose: Array, P: Array, S: Array) -> None:
 
 
 @compiled
-def innovations(
-    points: Array, f: int, sightings: Arrays, window: Arrays, eye: Arrays, refinements: float, work: Arrays
-) -> None:
-    """Linearise track f, refining its point first if its noise is correlated, and decorrelate its rows.
+def innovations(points: Array, f: int, sightings: Arrays, window: Arrays, eye: Arrays, work: Arrays) -> None:
+    """Linearise track f.
 
-    ``work`` gets the Jacobians to each pose (3 m, 6), not decorrelated; the landmark's Jacobian and the residual (3 m,
-    4), decorrelated by M; the covariance (3 m, 3 m) of the latter without their noise, ``M H_x P H_x^T M^T``; and the
-    roots of the noise, whose inverse is M.
+    ``work`` gets the Jacobians to each pose (3 m, 6); the landmark's Jacobian and the residual (3 m, 4); and the
+    covariance (3 m, 3 m) of the latter without their noise, ``H_x P H_x^T``.
     """
-    uvs_px, ages, where = sightings
-    poses, inverses_now, poses_at, inverses_at, P = window
-    intrinsics, T_cam_imu, rows, variances = eye
-    H_pose, H_point, S, roots = work
-    m, n, here = where.size, 3 * where.size, (intrinsics, T_cam_imu, rows)
-    correlated = variances.shape[0] > 0
-    if correlated:
-        noise_roots(ages, f, where, variances, roots)
-        for _ in range(int(refinements)):
-            latest = (inverses_now, poses, inverses_now)
-            nearest_m = linearise(points, f, uvs_px, where, latest, here, (H_pose, H_point))
-            decorrelate(roots, m, H_point, H_point.shape[1])
-            refine(points, f, nearest_m, H_point, n)
-    linearise(points, f, uvs_px, where, (inverses_now, poses_at, inverses_at), here, (H_pose, H_point))
+    uvs_px, where = sightings
+    inverses_now, poses_at, inverses_at, P = window
+    H_pose, H_point, S = work
+    linearise(points, f, uvs_px, where, (inverses_now, poses_at, inverses_at), eye, (H_pose, H_point))
     carry_cov(where, H_pose, P, S)
-    if correlated:
-        decorrelate(roots, m, H_point, H_point.shape[1])
-        decorrelate(roots, m, S, n)
-        transpose(S, n)
-        decorrelate(roots, m, S, n)
 
 
 @compiled
@@ -197,11 +173,10 @@ def nis_of(S: Array, n: int, residual: Array) -> float:
 
 
 @compiled
-def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array, H: Array, first: int) -> None:
+def constraint_rows(where: IntArray, J: Array, V: Array, tau: Array, H: Array, first: int) -> None:
     """Write all but the first three rows of ``Q^T J`` to H (., 6 W), from row ``first`` on.
 
-    J (3 m, 6 m) are Jacobians to the poses ``where`` (m,), which give the columns of H; unless ``dense``, a row depends
-    on its own pose alone. The product of three reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T. Its
+    J (3 m, 6) are Jacobians to the poses ``where`` (m,), which give the columns of H; a row depends on its own pose. The product of three reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T. Its
     diagonal has their factors; above the diagonal ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989). Q
     itself is not formed.
     """
@@ -215,11 +190,11 @@ def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array
             for i in range(j + 1):
                 T[i, k] -= tau[k] * T[i, j] * overlap
     for i in range(n):
-        begin, end = 0 if dense else 6 * (i // 3), 6 * (i // 3) + 6
+        begin = 6 * (i // 3)
         for a in range(3):
             weight = T[0, a] * V[0, i] + T[1, a] * V[1, i] + T[2, a] * V[2, i]
-            for c in range(begin, end):
-                reached[a, c] += weight * J[i, c]
+            for c in range(6):
+                reached[a, begin + c] += weight * J[i, c]
     for i in range(3, n):
         row, x, y, z = first + i - 3, V[0, i], V[1, i], V[2, i]
         for c in range(H.shape[1]):
@@ -227,15 +202,16 @@ def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array
         for k in range(where.size):
             at, to = np.uint64(6 * k), np.uint64(6 * where[k])
             for c in range(np.uint64(6)):
-                H[row, to + c] = J[i, at + c] - x * reached[0, at + c] - y * reached[1, at + c] - z * reached[2, at + c]
+                own = J[i, c] if i // 3 == k else 0.0
+                H[row, to + c] = own - x * reached[0, at + c] - y * reached[1, at + c] - z * reached[2, at + c]
 
 
 @compiled
-def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array, roots: Array, correlated: bool) -> int:
+def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array) -> int:
     """Return which of a track's m sightings reduces its NIS most when left out: ``track_gate._worst_sighting``.
 
-    S has the Cholesky factor and ``rest`` the residuals that ``nis_of`` leaves. With ``W = Q [0, 0; 0, S^-1] Q^T``,
-    transformed back from the decorrelated rows, and w = W r the NIS falls by ``w_j^T W_jj^-1 w_j``.
+    S has the Cholesky factor and ``rest`` the residuals that ``nis_of`` leaves. With ``W = Q [0, 0; 0, S^-1] Q^T`` and
+    w = W r the NIS falls by ``w_j^T W_jj^-1 w_j``.
     """
     W, w = np.empty((n, n)), np.zeros((n, 1))
     invert(S, n, W)
@@ -251,11 +227,6 @@ def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array, roots: A
             dot += V[k, i] * w[i, 0]
         for i in range(n):
             w[i, 0] -= tau[k] * dot * V[k, i]
-    if correlated:
-        decorrelate_transposed(roots, n // 3, W, n)
-        transpose(W, n)
-        decorrelate_transposed(roots, n // 3, W, n)
-        decorrelate_transposed(roots, n // 3, w, w.shape[1])
     worst, largest, N = 0, -1.0, np.empty((1, 10))
     for j in range(n // 3):
         at = 0
@@ -279,16 +250,15 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
     far above its bound; and the n stacked rows of the tracks below their bounds: H (n, 6 W), residuals (n,), and the
     index of each row's track among the reliable tracks (n,).
     """
-    uvs_px, seen, ages = sightings
+    uvs_px, seen = sightings
     poses, poses_at, P = window
-    intrinsics, T_imu_cam, whitener, variances, channels = camera
-    (count, longest), correlated = seen.shape, variances.shape[0] > 0
+    intrinsics, T_imu_cam, whitener = camera
+    count, longest = seen.shape
     points, nis = np.empty((count + 1, 3)), np.empty(count)
     worst, dof = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     reliable = triangulate((uvs_px, seen), poses, T_imu_cam, (intrinsics, whitener), rules, points)
     inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
-    window_of_all = (poses, inverses_now, poses_at, inverses_at, P)
-    eye = (intrinsics, T_cam_imu, channels if correlated else whitener, variances)
+    window_of_all, eye = (inverses_now, poses_at, inverses_at, P), (intrinsics, T_cam_imu, whitener)
     most, rows = 3 * longest, 0
     for f in range(count):
         dof[f] = 3 * sighted(seen, f).size - 3
@@ -296,15 +266,13 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
     H, residuals, owners = np.empty((rows, 2 * most)), np.empty(rows), np.empty(rows, dtype=np.int64)
     end, owner = 0, -1
     H_pose, H_point = np.empty((most, 6)), np.empty((most, 4))
-    S, roots = np.empty((most, most)), np.empty((most, longest))
-    V, tau, rest, J = np.empty((3, most)), np.empty(3), np.empty(most), np.empty((most, 2 * most))
+    S, V, tau, rest = np.empty((most, most)), np.empty((3, most)), np.empty(3), np.empty(most)
     for f in range(count):
         nis[f], worst[f], where = np.inf, -1, sighted(seen, f)
         n = dof[f] + 3
         owner += reliable[f]
         if reliable[f] and n > 3:
-            work = (H_pose, H_point, S, roots)
-            innovations(points, f, (uvs_px, ages, where), window_of_all, eye, rules[REFINEMENTS], work)
+            innovations(points, f, (uvs_px, where), window_of_all, eye, (H_pose, H_point, S))
             reflections(H_point, n, V, tau)
             for k in range(3):
                 reflect_both_sides(S, V, k, tau[k], n)
@@ -312,13 +280,12 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
                 rest[i] = H_point[i, 3]
             nis[f] = nis_of(S, n, rest)
             if nis[f] < bounds[n - 3]:
-                own_jacobians(H_pose, where.size, roots, correlated, J)
-                constraint_rows(where, J, correlated, V, tau, H, end)
+                constraint_rows(where, H_pose, V, tau, H, end)
                 for i in range(3, n):
                     residuals[end], owners[end] = H_point[i, 3], owner
                     end += 1
             elif nis[f] > rules[MISMATCHED] * bounds[n - 3]:
-                worst[f] = where[worst_sighting(S, n, rest, V, tau, roots, correlated)]
+                worst[f] = where[worst_sighting(S, n, rest, V, tau)]
     return points, reliable, nis, dof, worst, H[:end], residuals[:end], owners[:end]
 
 

@@ -19,20 +19,17 @@ from filters.kalman.kernels.algebra import inverses, products, solved_3
 from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.sightings import (
     add_products,
-    decorrelate,
     first_guess,
     linearise,
-    noise_roots,
-    own_jacobians,
     sighted,
     step,
 )
-from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, MATRIX, ROW, STACK, Arrays
+from filters.kalman.kernels.signatures import CAMERA, MASK, MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, IntArray
 
-# Tracks: (uL, uR, v) (F, W, 3) px, which are used (F, W), their ages (F, W), weights (F, W), points (F, 3). Then poses
+# Tracks: (uL, uR, v) (F, W, 3) px, which are used (F, W), weights (F, W), points (F, 3). Then poses
 # (W, 4, 4), poses to linearise at (W, 4, 4), camera, and the rules numbered below.
-SIGNATURE = (types.Tuple((STACK, MASK, COUNTS, MATRIX, MATRIX)), types.Tuple((STACK, STACK)), CAMERA, ROW)
+SIGNATURE = (types.Tuple((STACK, MASK, MATRIX, MATRIX)), types.Tuple((STACK, STACK)), CAMERA, ROW)
 # What :func:`normals_of_tracks` returns; R (6 W, 6 W), J R of the newest sightings and B R (3 F, 6 W); rules.
 NEWEST_SIGNATURE = (
     types.Tuple((MATRIX, ROW, MATRIX, MATRIX, MATRIX, MATRIX, STACK, ROW)),
@@ -113,43 +110,36 @@ def scale(rows: Arrays, first: int, end: int, columns: int, factor: float) -> No
 
 
 @compiled
-def add_normals(f: int, where: IntArray, rows: Arrays, n: int, dense: bool, sums: Arrays) -> None:
+def add_normals(f: int, where: IntArray, rows: Arrays, n: int, sums: Arrays) -> None:
     """Add n rows of track f to ``[H_f r]^T [H_f r]``, to B, and to ``J^T J`` and ``J^T r`` of all tracks.
 
-    A row of J is the Jacobian to the pose of its sighting alone (3 m, 6) or, if ``dense``, to all poses (3 m, 6 m).
-    ``J^T J`` is (W, 6, 6) or (1, 6 W, 6 W).
+    A row of J (3 m, 6) is the Jacobian to the pose of its sighting; ``J^T J`` is (W, 6, 6).
     """
     A, J = rows
     N, B, D, d = sums
     add_products(A, 0, n, N, f)
     for i in range(0, n, 3):
-        begin, end = (0, where.size) if dense else (i // 3, i // 3 + 1)
-        for k in range(begin, end):
-            block, own, column = 0 if dense else where[k], 6 * (k - begin), 6 * where[k]
-            for a in range(6):
-                x, y, z = J[i, own + a], J[i + 1, own + a], J[i + 2, own + a]
-                d[column + a] = d[column + a] + x * A[i, 3] + y * A[i + 1, 3] + z * A[i + 2, 3]
-                for b in range(3):
-                    mine = 3 * f + b
-                    B[mine, column + a] += A[i, b] * x + A[i + 1, b] * y + A[i + 2, b] * z
-                row = column + a if dense else a
-                for j in range(begin, k + 1):
-                    to, at = np.uint64(6 * where[j] if dense else 0), np.uint64(6 * (j - begin))
-                    for c in range(np.uint64(6)):
-                        more = D[block, row, to + c] + x * J[i, at + c] + y * J[i + 1, at + c]
-                        D[block, row, to + c] = more + z * J[i + 2, at + c]
+        block = where[i // 3]
+        column = 6 * block
+        for a in range(6):
+            x, y, z = J[i, a], J[i + 1, a], J[i + 2, a]
+            d[column + a] = d[column + a] + x * A[i, 3] + y * A[i + 1, 3] + z * A[i + 2, 3]
+            for b in range(3):
+                B[3 * f + b, column + a] += A[i, b] * x + A[i + 1, b] * y + A[i + 2, b] * z
+            for c in range(np.uint64(6)):
+                D[block, a, c] = D[block, a, c] + x * J[i, c] + y * J[i + 1, c] + z * J[i + 2, c]
 
 
 @compiled
-def put_newest(f: int, where: IntArray, rows: Arrays, dense: bool, A_newest: Array, J_newest: Array) -> None:
-    """Copy the last three rows of a track to those of the newest sightings: J (3 F, 6), or (3 F, 6 W) if ``dense``."""
+def put_newest(f: int, where: IntArray, rows: Arrays, A_newest: Array, J_newest: Array) -> None:
+    """Copy the last three rows of a track to those of the newest sightings: J (3 F, 6)."""
     A, J = rows
     for a in range(3):
         i = 3 * where.size - 3 + a
         for c in range(4):
             A_newest[3 * f + a, c] = A[i, c]
-        for c in range(6 * where.size if dense else 6):
-            J_newest[3 * f + a, 6 * where[c // 6] + c % 6 if dense else c] = J[i, c]
+        for c in range(6):
+            J_newest[3 * f + a, c] = J[i, c]
 
 
 @kept(SIGNATURE)
@@ -157,36 +147,30 @@ def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Arr
     """Return the normal equations of F tracks without their newest sightings, and the rows of the newest.
 
     They are, for :func:`information_with_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]`` (F
-    + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the newest
-    pose or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, one block (W, 6, 6)
-    per pose or the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that is behind one of its cameras
+    + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J (3 F, 6) to the newest
+    pose; ``J^T J`` of the others, one block (W, 6, 6) per pose; ``J^T r`` (6 W,). A track that is behind one of its cameras
     adds nothing.
     """
-    uvs_px, counted, ages, weights, points = tracks
+    uvs_px, counted, weights, points = tracks
     poses, poses_at = window
-    intrinsics, T_imu_cam, whitener, variances, channels = camera
-    (count, longest), dense = counted.shape, variances.shape[0] > 0
+    intrinsics, T_imu_cam, whitener = camera
+    count, longest = counted.shape
     inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
-    views, eye = (inverses_now, poses_at, inverses_at), (intrinsics, T_cam_imu, channels if dense else whitener)
-    most, k = 3 * longest, 6 * longest if dense else 6
+    views, eye = (inverses_now, poses_at, inverses_at), (intrinsics, T_cam_imu, whitener)
+    most = 3 * longest
     depths, N, B = np.empty(count), np.zeros((count + 1, 10)), np.zeros((3 * count, 6 * longest))
-    A_newest, J_newest = np.empty((3 * count, 4)), np.zeros((3 * count, k))
-    D, d = np.zeros((1 if dense else longest, k, k)), np.zeros(6 * longest)
-    H_pose, A, roots, J = np.empty((most, 6)), np.empty((most, 4)), np.empty((most, longest)), np.empty((most, k))
+    A_newest, J_newest = np.empty((3 * count, 4)), np.zeros((3 * count, 6))
+    D, d, H_pose, A = np.zeros((longest, 6, 6)), np.zeros(6 * longest), np.empty((most, 6)), np.empty((most, 4))
     for f in range(count):
         where = sighted(counted, f)
-        m, rows = where.size, (A, J if dense else H_pose)
+        m, rows = where.size, (A, H_pose)
         depths[f] = linearise(points, f, uvs_px, where, views, eye, (H_pose, A))
         if depths[f] > rules[LEAST_DEPTH]:
-            if dense:
-                noise_roots(ages, f, where, variances, roots)
-                decorrelate(roots, m, A, A.shape[1])
-                own_jacobians(H_pose, m, roots, dense, J)
             for i in range(m - 1):
                 if weights[f, where[i]] < 1.0:
-                    scale(rows, 3 * i, 3 * i + 3, 6 * m if dense else 6, math.sqrt(weights[f, where[i]]))
-            put_newest(f, where, rows, dense, A_newest, J_newest)
-            add_normals(f, where, rows, 3 * m - 3, dense, (N, B, D, d))
+                    scale(rows, 3 * i, 3 * i + 3, 6, math.sqrt(weights[f, where[i]]))
+            put_newest(f, where, rows, A_newest, J_newest)
+            add_normals(f, where, rows, 3 * m - 3, (N, B, D, d))
     return points, depths, N, B, A_newest, J_newest, D, d
 
 
