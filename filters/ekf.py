@@ -4,13 +4,13 @@ What it approximates: pose and landmarks are kept as if they were independent. A
 landmark, but the filter is overconfident: its covariance does not grow with the distance driven.
 """
 
-from filters.kalman.compiled import decoupled_steps
+from filters.kalman.correction import corrected
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
-from toolkit.models.motion import motion_model
+from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
@@ -28,19 +28,17 @@ class DecoupledEkf(Filter):
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers = setup.rig, setup.settings.outliers
-        model = motion_model(setup.noise, setup.gravity_world)
-        self._belief = model.initial_belief(setup.prior)
-        self._steps = decoupled_steps(model, setup.noise, setup.compilation)
-        self._map = TrackedMap(setup.rig, self._steps.start)
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = self._motion.initial_belief(setup.prior)
+        self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        if packet.motion is not None:
-            self._belief = self._steps.predict(self._belief, packet.motion)
+        self._belief = predicted(self._belief, self._motion, packet.motion)
         seen, uvs_px = self._map.seen_again(packet.frame)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
-            self._belief, seen = self._steps.correct(self._belief, seen, uvs_px, self._rig, gate)
+            self._belief, seen = corrected(self._belief, seen, uvs_px, self._rig, gate)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
 

@@ -16,14 +16,14 @@ import numpy as np
 from filters.kalman.thinning import Thinned
 from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
-from filters.smoothing.smart_factors import RobustCamera
-from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
-from filters.smoothing.smart_window import TrackedWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.motion import motion_model, state_keys
+from toolkit.models.reduced_vision import RobustCamera
+from toolkit.models.stereo_window import TrackedWindow
+from toolkit.models.window_solver import SolvedWindow, solve_window, without_oldest
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 

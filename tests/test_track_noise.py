@@ -1,6 +1,7 @@
 import numpy as np
 
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.models.stereo import CHANNELS
+from toolkit.simulation.track_noise import TrackNoise
 
 
 def test_covariance_is_that_of_drawn_walks_offsets_and_white_noise() -> None:

@@ -20,7 +20,6 @@ from toolkit.models.motion import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
-from toolkit.track_noise import TrackNoise
 
 # A windowed filter corrects by several frames' tracks at once: five times the motion noise of one frame.
 _LUMP_FRAMES = 5
@@ -102,13 +101,11 @@ def _reach_m(t_ns: IntArray, sequence: Sequence) -> Array:
     return np.asarray(_NO_TRAVEL_M + MOST_WAYS * (way_m - way_m[0]))
 
 
-def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = None) -> str | None:
+def gate_collapse(info: Mapping[str, Array]) -> str | None:
     """Return why an estimator with these diagnostics (N,), by name, of N frames has diverged, or None.
 
-    Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error, or the
-    stated noise of tracks is less than their real noise.
+    Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error.
     """
-    doubt = "" if track_noise is None else ", or its tracks have larger errors than it assumes (noise.tracks)"
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])
@@ -121,7 +118,7 @@ def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = No
         if count >= _FEWEST_TESTED and passed < least * count:
             return (
                 f"{100.0 * passed / count:.0f} % of {part_name} passed its own gate: its covariance does not cover its "
-                f"error{doubt} (at least {100.0 * least:.0f} % pass in a run that works)"
+                f"error (at least {100.0 * least:.0f} % pass in a run that works)"
             )
     return None
 

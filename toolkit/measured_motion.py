@@ -180,13 +180,6 @@ def noise_scale_of(motion: TwistMotion | ImuMotion) -> Array:
     return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale
 
 
-def with_noise_scaled(motion: Motion, variance: float) -> Motion:
-    """Return a motion with the variance of its white noise multiplied; an unmeasured motion is returned unchanged."""
-    if variance == 1.0 or isinstance(motion, UnmeasuredMotion):
-        return motion
-    return replace(motion, noise_scale=np.sqrt(variance) * noise_scale_of(motion))
-
-
 MotionKind = Literal["twist", "imu", "none"]
 MOTION_KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (

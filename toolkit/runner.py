@@ -188,7 +188,7 @@ def with_divergence(run: Run, sequence: Sequence) -> Run:
     ``sequence`` is what it read; the truth is not used.
     """
     reasons = [contradiction(trajectory, sequence) for trajectory in _trajectories_to_check(run)] + [
-        gate_collapse(run.info, sequence.rig.track_noise)
+        gate_collapse(run.info)
     ]
     found = [f"the trajectory diverged: {reason}" for reason in dict.fromkeys(reasons) if reason is not None]
     return replace(run, status="diverged", log=(*run.log, *found)) if found else run

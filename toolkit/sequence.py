@@ -35,7 +35,6 @@ from toolkit.measured_motion import (
 )
 from toolkit.resampling import NS_PER_S, Bridges
 from toolkit.track_budget import parts_of_view, within_budget
-from toolkit.track_noise import TrackNoise
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
@@ -70,7 +69,9 @@ class StereoRig:
 
     ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
     ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
-    variance is half of theirs. ``track_noise`` says how the errors of one track are correlated; None is not at all.
+    variance is half of theirs. ``track_weight`` in (0, 1] is the share of its stated information that a sighting
+    carries, because errors along its track and of its neighbours are correlated (:mod:`toolkit.noise`): an update
+    divides the covariance by it. Whether a sighting is an outlier is decided by the stated covariance.
     """
 
     fx_px: float
@@ -80,7 +81,7 @@ class StereoRig:
     baseline_m: float
     T_imu_cam: Array
     cov_uv_px2: Array
-    track_noise: TrackNoise | None = None
+    track_weight: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))
@@ -175,22 +176,17 @@ class Prior:
         freeze_arrays(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
 
 
-# In both, ``noise_scale`` (n, 2) multiplies the noise of linear and angular samples; None where all was measured.
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px, the tracks' ages.
-
-    An age (N,) is the number of the recording's frames since the first sighting of the track.
-    """
+    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px."""
 
     t_ns: int
     track_ids: IntArray
     uvs_px: Array
-    ages: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "StereoFrame":
         """Return the frame with the sightings of a mask (N,) or an index (M,) only."""
-        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows], self.ages[rows])
+        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,21 +263,15 @@ class Sequence:
         """The sightings of the tracks no estimator ever sees."""
         return self.observations.select(is_held_out(self.observations.track_id))
 
-    @property
-    def visible(self) -> Observations:
-        """The sightings the estimators work on."""
-        return self._visible_and_ages[0]
-
     @cached_property
-    def _visible_and_ages(self) -> tuple[Observations, IntArray]:
-        """The sightings (N,) the estimators work on, and the frames since the first of each track, chosen or not."""
+    def visible(self) -> Observations:
+        """The sightings (N,) the estimators work on."""
         seen = self.observations.select(~is_held_out(self.observations.track_id))
-        ages = _ages(seen)
         if self.track_budget is None:
-            return seen, ages
+            return seen
         parts = parts_of_view(seen.uv_px, (self.rig.cx_px, self.rig.cy_px), self.track_budget)
-        given = within_budget(self.track_budget, self._frame_starts(seen), seen.track_id, ages, parts)
-        return seen.select(given), read_only(ages[given], np.int64)
+        given = within_budget(self.track_budget, self._frame_starts(seen), seen.track_id, _ages(seen), parts)
+        return seen.select(given)
 
     def _frame_starts(self, seen: Observations) -> IntArray:
         """Return the row (K + 1,) at which the sightings of each frame begin, and where those of the last end."""
@@ -294,12 +284,12 @@ class Sequence:
         motion samples.
         """
         check_runnable(self)
-        seen, ages = self._visible_and_ages
+        seen = self.visible
         first_row = self._frame_starts(seen)
         motions = motions_between(self.motion, self.frames_t_ns, self.bridges)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
-            frame = StereoFrame(int(self.frames_t_ns[k]), seen.track_id[rows], seen.uv_px[rows], ages[rows])
+            frame = StereoFrame(int(self.frames_t_ns[k]), seen.track_id[rows], seen.uv_px[rows])
             yield Packet(k, next(motions) if k else None, frame)
 
     def truncated(self, max_frames: int) -> Self:

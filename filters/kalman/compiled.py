@@ -12,19 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from filters.kalman import correction, landmark_map, multiview, track_gate, tracks_in_view, triangulation
-from filters.kalman.correction import FrameCorrection
+from filters.kalman import multiview, track_gate, tracks_in_view, triangulation
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
-from filters.kalman.landmark_map import LandmarkMap
 from filters.kalman.linearisation import Integrator
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TestedTracks, TrackTest, WindowPoses
 from filters.kalman.tracks_in_view import FollowedTracks, Information, RootedWindow
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
-from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise, TwistMotion, TwistNoise
-from toolkit.models import left_only
+from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise
 from toolkit.models.gating import (
     FEWEST_SIGHTINGS,
     LEAST_DEPTH_M,
@@ -33,10 +30,10 @@ from toolkit.models.gating import (
     huber_threshold,
 )
 from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
-from toolkit.models.motion import Increment, MotionModel, motion_model, predicted
+from toolkit.models.motion import Increment, MotionModel, motion_model
 from toolkit.models.state import Belief, Prediction
 from toolkit.models.stereo import StereoPrediction
-from toolkit.sequence import StereoRig, is_left_only
+from toolkit.sequence import StereoRig
 
 _GATE_RULES = np.array(
     [
@@ -207,71 +204,6 @@ class _ImuIncrement(NamedTuple):
         return self.by.model.integrate(self.motion, self.bias).factors(k)
 
 
-class DecoupledSteps(NamedTuple):
-    """Functions that predict a belief, correct it and N landmarks by sightings (N, 3) px, and start landmarks."""
-
-    predict: Callable[[Belief, Motion], Belief]
-    correct: Callable[[Belief, LandmarkMap, Array, StereoRig, FrameGate], FrameCorrection]
-    start: Callable[[Array, Array, StereoRig], tuple[Array, Array]]
-
-
-def decoupled_steps(model: MotionModel, noise: MotionNoise, compilation: Compilation) -> DecoupledSteps:
-    """Return the steps of the decoupled filter for a motion model and its noise.
-
-    The definitions are ``motion.predicted``, ``correction.corrected`` and ``landmark_map.started``. Only motion by
-    twists has a kernel; other motion is predicted by the model.
-    """
-    kernel = _kernel(compilation, "decoupled")
-    twists = _kernel(compilation, "twists") if isinstance(noise, TwistNoise) and kernel is not None else None
-    if kernel is None:
-        return DecoupledSteps(_predicted_by(model), correction.corrected, landmark_map.started)
-
-    def corrected(
-        belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
-    ) -> FrameCorrection:
-        """Correct the pose by the landmarks, then the landmarks by the pose, as the definition does."""
-        missing = is_left_only(uvs_px)
-        measured = np.where(np.isnan(uvs_px), 0.0, uvs_px) if missing.any() else uvs_px
-        moved_by, step, cov, points, covs, nis, accepted = kernel.correct(
-            (landmarks.points, landmarks.covs, measured[:, None], missing),
-            (_pose_of(belief), np.array(belief.cov, order="C")),
-            _camera_with_left(rig),
-            _sighting_rules(gate.probability, gate.huber),
-        )
-        gate.count(nis, left_only.degrees_of_freedom(uvs_px), accepted)
-        moved = belief.displaced(moved_by, step[0])
-        belief = Belief(moved.layout, moved.T_world_imu, moved.v_world, moved.bias, cov)
-        return FrameCorrection(belief, LandmarkMap(landmarks.track_ids, points, covs))
-
-    def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
-        """Return the stereo triangulation of N landmarks and its covariances, as the definition does."""
-        points, covs = kernel.start(uvs_px, np.array(T_world_imu[None], order="C"), _camera_with_left(rig))
-        return points, covs
-
-    predict = _predicted_by(model) if twists is None else _predicted_along_twists(noise, twists)
-    return DecoupledSteps(predict, corrected, started)
-
-
-def _predicted_by(model: MotionModel) -> Callable[[Belief, Motion], Belief]:
-    return lambda belief, motion: predicted(belief, model, motion)
-
-
-def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[[Belief, Motion], Belief]:
-    """Return the function that predicts pose and gyro bias over twists of a noise model."""
-    assert isinstance(noise, TwistNoise)
-    densities = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density, noise.gyro_random_walk]) ** 2
-
-    def along_twists(belief: Belief, motion: Motion) -> Belief:
-        assert isinstance(motion, TwistMotion)
-        scale = _EVEN_NOISE if motion.noise_scale is None else np.array(motion.noise_scale)
-        twists = np.array(motion.dt_s), np.array(motion.w_radps), np.array(motion.v_mps), scale
-        state = _pose_of(belief), np.array(belief.bias[3:]), np.array(belief.cov, order="C")
-        T_world_imu, cov = kernel.predict(twists, densities, state)
-        return Belief(belief.layout, T_world_imu[0], belief.v_world, belief.bias, cov)
-
-    return along_twists
-
-
 def _as_kernel_arrays(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
     """Return arrays in the form kernels take."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
@@ -290,16 +222,3 @@ def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:
 def _camera(rig: StereoRig) -> tuple[Array, ...]:
     """Return a rig in the form that the kernels of the windowed filters take."""
     return *_intrinsics(rig), np.array(rig.whitener, order="C")
-
-
-@lru_cache(maxsize=4)
-def _camera_with_left(rig: StereoRig) -> tuple[Array, ...]:
-    """Return a rig in the form that the kernels of the decoupled filter take."""
-    return *_intrinsics(rig), np.stack([rig.cov_uv_px2, left_only.left_noise_px2(rig)])
-
-
-@lru_cache(maxsize=4)
-def _sighting_rules(probability: float | None, huber: float | None) -> Array:
-    """Return bound and Huber threshold (2, 2), in row 0 for sightings in both images, in row 1 for the left alone."""
-    thresholds = np.full(2, np.inf) if huber is None else huber_threshold(_DOF, huber)
-    return np.column_stack([FrameGate(probability).bound(_DOF), thresholds])

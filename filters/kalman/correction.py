@@ -54,20 +54,27 @@ def correct_pose(
     """Correct the pose by sightings (N, 3) px of N landmarks, whose uncertainty is part of the innovation covariance.
 
     A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
-    residual, whitened by the covariance of sighting and landmark.
+    residual, whitened by the covariance of sighting and landmark. Gate and loss use the stated noise, the update the
+    rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
-    own_cov = H_point @ landmarks.covs @ transposed(H_point) + left_only.noise_px2(uvs_px, rig)
+    noise_px2 = left_only.noise_px2(uvs_px, rig)
+    own_cov = H_point @ landmarks.covs @ transposed(H_point) + noise_px2
     nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
     dof = left_only.degrees_of_freedom(uvs_px)
     accepted = gate.accepts(nis, dof, depth_m > 0.0)
     weights = accepted.astype(float)
-    informed = np.linalg.solve(own_cov, np.concatenate([H_pose, residual_px[..., None]], axis=2))
     if gate.huber is not None:
         threshold = gate.huber if isinstance(dof, int) else huber_threshold(dof, gate.huber)
-        weights *= huber_weights(np.einsum("ni,ni->n", residual_px, informed[..., 6]), threshold)
-    weighted = weights[:, None, None] * informed[..., :6]
+        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
+    informed = np.linalg.solve(own_cov + added_noise(noise_px2, rig), H_pose)
+    weighted = weights[:, None, None] * informed
     return PoseCorrection(updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted)
+
+
+def added_noise(noise_px2: Array, rig: StereoRig) -> Array:
+    """Return what an update adds to the stated noise (..., 3, 3) px^2, so that a sighting has the weight of tracks."""
+    return (1.0 / rig.track_weight - 1.0) * noise_px2
 
 
 def _residuals_with_jacobians(
@@ -121,14 +128,15 @@ def correct_landmarks(
     """Correct N landmarks by their sightings (N, 3) px from one pose, each by its own 3x3 EKF (Kang, eqs. 6-10).
 
     ``pose_cov`` (6, 6), zero in the report, is added to the measurement noise, so that an uncertain pose does not make
-    the map overconfident.
+    the map overconfident. The NIS is by the stated noise, the update has the rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = left_only.noise_px2(uvs_px, rig)
     carried = H_point @ landmarks.covs
     innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + noise_px2
+    nis = mahalanobis_squared(residual_px, innovation_cov)
+    innovation_cov = innovation_cov + added_noise(noise_px2, rig)
     weighted = np.linalg.solve(innovation_cov, np.concatenate([carried, residual_px[..., None]], axis=2))
-    nis = np.einsum("ni,ni->n", residual_px, weighted[..., 3])
     update = transposed(carried) @ weighted
     points, covs = landmarks.points + update[..., 3], landmarks.covs - update[..., :3]
     after = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))

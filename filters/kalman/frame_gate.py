@@ -15,7 +15,7 @@ class FrameGate:
     """Accepts innovations below the chi-square quantile of a probability, counts them, and weighs them by Huber's loss.
 
     ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. Every accepted innovation
-    is weighted by ``share``, a factor in (0, 1] on its information.
+    is weighted by ``track_weight``, a factor in (0, 1] on its information: the rig's.
 
     ``nis`` and ``dof`` are sums over the accepted innovations. ``nis_expected`` is the expected sum of NIS if the
     innovations match their covariance; it is less than ``dof``, because the gate has removed the largest ones. Robust
@@ -25,7 +25,7 @@ class FrameGate:
 
     probability: float | None
     huber: float | None = None
-    share: float = 1.0
+    track_weight: float = 1.0
     nis: float = 0.0
     dof: int = 0
     nis_expected: float = 0.0
@@ -70,16 +70,16 @@ class FrameGate:
     @property
     def weighs(self) -> bool:
         """Say whether accepted innovations may have a weight below 1."""
-        return self.huber is not None or self.share != 1.0
+        return self.huber is not None or self.track_weight != 1.0
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
         """Return the weights (N,) of innovations of NIS (N,) and ``dof`` (N,); 0 where not ``accepted`` (N,).
 
-        An accepted innovation has Huber's weight, in (0, 1] and 1 without that loss, times the share.
+        An accepted innovation has Huber's weight, in (0, 1] and 1 without that loss, times the weight of tracks.
         """
         if self.huber is None:
-            return self.share * accepted.astype(float)
-        return np.where(accepted, self.share * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
+            return self.track_weight * accepted.astype(float)
+        return np.where(accepted, self.track_weight * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
 
     def info(self) -> dict[str, float]:
         """Return the counts and sums under the keys of an Estimate's info."""

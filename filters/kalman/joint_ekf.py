@@ -61,7 +61,7 @@ class JointEkf:
         """Take in one packet and return the state at its frame."""
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)

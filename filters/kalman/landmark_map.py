@@ -1,6 +1,5 @@
 """The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that were lost."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -58,10 +57,6 @@ class LandmarkMap:
         )
 
 
-# Triangulates landmarks from stereo, as :func:`started` does.
-Start = Callable[[Array, Array, StereoRig], tuple[Array, Array]]
-
-
 def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Return N landmarks triangulated from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
 
@@ -74,23 +69,21 @@ def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, A
     return points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2)
 
 
-def first_sighting(
-    frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig, start: Start = started
-) -> LandmarkMap:
+def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
     """Start the landmarks of rows (m,) of a frame from its pose (4, 4).
 
     Tracks whose disparity is too small are left for a later frame.
     """
     uvs_px = frame.uvs_px[rows]
     near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
-    return LandmarkMap(frame.track_ids[rows][near], *start(uvs_px[near], T_world_imu, rig))
+    return LandmarkMap(frame.track_ids[rows][near], *started(uvs_px[near], T_world_imu, rig))
 
 
 class TrackedMap:
     """The landmarks in view, updated frame by frame: lost ones move from the state to an archive, new ones start."""
 
-    def __init__(self, rig: StereoRig, start: Start = started) -> None:
-        self._rig, self._start = rig, start
+    def __init__(self, rig: StereoRig) -> None:
+        self._rig = rig
         self._in_view = LandmarkMap.empty()
         self._left: list[LandmarkMap] = []
 
@@ -105,7 +98,7 @@ class TrackedMap:
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
         """Keep the updated landmarks seen again; start the frame's other tracks from its pose (4, 4)."""
         new = np.flatnonzero(~is_among(frame.track_ids, seen.track_ids))
-        self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig, self._start))
+        self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig))
 
     def landmarks(self) -> Landmarks:
         """Return the last estimate of every landmark of the run."""

@@ -60,7 +60,7 @@ class SlidingWindowFilter:
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate, self._images)
         self._tracks.add_frame(_without_landmarks(packet.frame, self._joint))

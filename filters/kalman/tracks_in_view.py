@@ -159,11 +159,8 @@ class TracksInView:
         self._at, self._rig, self._outliers, self._steps = at, rig, outliers, steps
         self._known = FollowedTracks.none()
 
-    def corrected(self, joint: JointBelief, sightings: TrackSightings, share: float = 1.0) -> Belief:
-        """Return the present state given the tracks that the newest of W poses sees and that have not corrected yet.
-
-        ``share`` multiplies the information of each.
-        """
+    def corrected(self, joint: JointBelief, sightings: TrackSightings) -> Belief:
+        """Return the present state given the tracks that the newest of W poses sees and that have not corrected yet."""
         tracks = self._steps.follow(self._known, sightings, joint, self._rig)
         if not len(tracks.points):
             self._known = tracks
@@ -175,8 +172,9 @@ class TracksInView:
         self._known = tracks._replace(points=found.points).select(found.usable)
         if not found.usable.any():
             return joint.core
+        weight = self._rig.track_weight
         return _corrected_by_information(
-            joint, window.root, np.multiply(found.matrix, share, out=found.matrix), share * found.vector
+            joint, window.root, np.multiply(found.matrix, weight, out=found.matrix), weight * found.vector
         )
 
 

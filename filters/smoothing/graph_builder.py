@@ -1,8 +1,8 @@
 """What one packet adds to an incremental smoother's graph: new factors, initial values, and the variables involved.
 
 Sightings of tracks that have jumped to another point are left out. With odometry, the initial value of a new state is
-the pose that best fits its sightings of known landmarks, not the prediction by the measured motion alone. The prediction may be off by many sigmas of a sighting's innovation, and linearised there the
-loss would give every sighting the weight of an outlier.
+the pose that best fits its sightings of known landmarks, not the prediction by the measured motion alone. The
+prediction may be off by many sigmas of a sighting's innovation, and linearised there the loss would give every sighting the weight of an outlier.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, huber_loss
+from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
@@ -39,7 +39,7 @@ class GraphBuilder:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, outliers = setup.rig, setup.settings.outliers
-        self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
+        self._stereo = StereoFactors(setup.rig, outliers.smoother_huber)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         # An IMU's prediction keeps pose and velocity consistent, and is near enough.
         self._begins_there = setup.motion_kind != "imu"

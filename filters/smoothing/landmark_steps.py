@@ -16,10 +16,9 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import stereo
-from toolkit.models.correlated_noise import in_channels
 from toolkit.models.factors import L, X
+from toolkit.models.stereo import CHANNELS
 from toolkit.sequence import StereoFrame, StereoRig
-from toolkit.track_noise import CHANNELS
 
 _FROM_CHANNELS = np.linalg.inv(CHANNELS)
 # Largest growth of the logarithm of the depth in one step; it keeps disparities positive.
@@ -43,7 +42,7 @@ class LandmarksSeen(NamedTuple):
         """Predict the images of landmarks (M,) in the frames (M,) that first saw them, at values."""
         points = np.array([values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
         seen = stereo.predict(points, _poses(values, first), rig)
-        by_pose, by_point = (in_channels(CHANNELS, slope) for slope in (seen.d_uv_d_pose, seen.d_uv_d_point))
+        by_pose, by_point = CHANNELS @ seen.d_uv_d_pose, CHANNELS @ seen.d_uv_d_point
         return cls(track_ids, first, seen.uv_px @ CHANNELS.T, by_pose, by_point)
 
     def moved_with_points(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:

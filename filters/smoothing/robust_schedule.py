@@ -19,7 +19,7 @@ from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
-from toolkit.models.factors import L, StereoFactors, X, huber_loss, kind_of
+from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.stacked_factors import StackedFactors
 from toolkit.progress import Progress
@@ -66,8 +66,8 @@ def solve_robustly(
     converged.
     """
     values, order_of, overshot = start, cheaper_order(motion.graph, frames), False
-    for robust, stopping, stage in _stages(outliers):
-        graph = _with_sightings(motion.graph, frames, StereoFactors(rig, robust))
+    for threshold, loss, stopping, stage in _stages(outliers):
+        graph = _with_sightings(motion.graph, frames, StereoFactors(rig, threshold, loss))
         values = _only_seen(values, frames)
         # Huber's solve need not reach its minimum, which would take twice as long without a gain.
         images = None if stopping is _HUBER_STOPPING else FirstImages.of(frames, rig, at_once=overshot)
@@ -80,7 +80,7 @@ def solve_robustly(
         for frame, distance, _ in _residuals(frames, values, rig)
     ]
     frames = _placed_by_stereo(frames)
-    graph = _with_sightings(motion.graph, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
+    graph = _with_sightings(motion.graph, frames, StereoFactors(rig, outliers.batch_last_huber))
     values, stage = _only_seen(values, frames), "solving without outliers"
     images = FirstImages.of(frames, rig, at_once=overshot)
     order = order_of(graph, frames)
@@ -93,14 +93,12 @@ def _cut_bound(outliers: Outliers, dof: int | IntArray) -> Array:
     return chi2_bound(dof, None if cut is None else 1.0 - cut)
 
 
-def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Base, Stopping, str]]:
-    """Yield the losses before the last solve, with their stopping criteria and stage names."""
-    huber, cauchy = huber_loss(outliers.batch_huber), outliers.batch_cauchy
-    if huber is not None:
-        yield huber, _HUBER_STOPPING, "solving with Huber's loss"
-    if cauchy is not None:
-        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy)
-        yield loss, _CAUCHY_STOPPING, "solving with Cauchy's loss"
+def _stages(outliers: Outliers) -> Iterator[tuple[float, Loss, Stopping, str]]:
+    """Yield the thresholds and losses before the last solve, with their stopping criteria and stage names."""
+    if outliers.batch_huber is not None:
+        yield outliers.batch_huber, HUBER, _HUBER_STOPPING, "solving with Huber's loss"
+    if outliers.batch_cauchy is not None:
+        yield outliers.batch_cauchy, CAUCHY, _CAUCHY_STOPPING, "solving with Cauchy's loss"
 
 
 def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:

@@ -10,7 +10,8 @@ from toolkit.audit.fault import Evidence
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, simulate, track_faults
 from toolkit.simulation.sensors import with_track_noise
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.models.stereo import CHANNELS
+from toolkit.simulation.track_noise import TrackNoise
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ from toolkit.models.noise import twist_noise
 from toolkit.runner import run
 from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES, Noise, Outliers, Settings, TrackUse
-from toolkit.track_noise import CHANNELS
+from toolkit.models.stereo import CHANNELS
 
 SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "smart", "isam2", "batch")

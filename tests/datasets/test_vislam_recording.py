@@ -16,7 +16,7 @@ from toolkit.geometry import Array
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 DATA = Path(__file__).parents[2] / "data"
 

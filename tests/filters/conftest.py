@@ -25,7 +25,8 @@ from toolkit.models.state import Belief
 from toolkit.models.stereo import predict, project, triangulate_world
 from toolkit.sequence import Observations, Sequence, StereoFrame, StereoRig
 from toolkit.simulation import Scenario, simulate
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.models.stereo import CHANNELS
+from toolkit.simulation.track_noise import TrackNoise
 
 SEED = 11
 

@@ -22,7 +22,7 @@ from toolkit.compilation import Compilation
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound
 from toolkit.simulation import FLIGHT
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 WINDOW, TRACKS = 9, 40
 # Both round at 1e-16 of terms that cancel by up to a million, the carried covariance against the noise of a pixel.

@@ -25,7 +25,7 @@ from toolkit.models.twist import TWIST_LAYOUT
 from toolkit.sequence import Prior, Sequence
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 # Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.
 LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1])

@@ -16,7 +16,7 @@ from toolkit.models import stereo
 from toolkit.models.motion import motion_model
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import FLIGHT, simulate
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)
 

@@ -15,7 +15,7 @@ from toolkit.models.state import Belief
 from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, SCENARIOS, simulate
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 RIG, COUNT = DRIVE.rig, 4000
 IDS = np.arange(COUNT)

@@ -17,7 +17,7 @@ from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 NOISE = TrackNoise(np.array([0.03, 0.06, 0.03]), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
 RIG = replace(DRIVE.rig, track_noise=NOISE)

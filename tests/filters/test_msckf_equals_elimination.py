@@ -24,7 +24,7 @@ from toolkit.models.motion import motion_model
 from toolkit.settings import Settings
 from toolkit.settings import Window as WindowSettings
 from toolkit.simulation import DRIVE, FLIGHT
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 CLONES = 6
 SCENARIOS = [replace(DRIVE, duration_s=0.5), replace(FLIGHT, duration_s=0.25)]

@@ -18,7 +18,7 @@ from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import POLICIES, PolicyName, Settings, Window
 from toolkit.simulation import DRIVE, simulate
 from toolkit.simulation.scenarios import noise_free
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 # The frame whose sighting is wrong, and how long before and after it the track must have been seen.
 FRAME, AROUND = 8, 4

@@ -9,9 +9,9 @@ import pytest
 
 from filters.smart import Smart
 from filters.smoothing.robust_loss import Squares
-from filters.smoothing.smart_factors import RobustCamera, Sightings, Vision
-from filters.smoothing.smart_solver import solve_window
-from filters.smoothing.smart_window import Evaluated, MarginalPrior, SmartWindow
+from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
+from toolkit.models.window_solver import solve_window
+from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow
 from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
@@ -21,7 +21,7 @@ from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 RIG, HUBER = FLIGHT.rig, DEFAULTS.outliers.smoother_huber
 CAMERA = RobustCamera(RIG, HUBER)

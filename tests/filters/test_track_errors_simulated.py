@@ -10,7 +10,7 @@ from toolkit.metrics import score_run
 from toolkit.runner import run
 from toolkit.settings import POLICIES, Noise, Settings
 from toolkit.simulation import FLIGHT
-from toolkit.track_noise import TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 # Four times the noise of real tracks: told white, with half a pixel for every sighting, it shows in a few seconds.
 NOISE = TrackNoise(np.array([0.12, 0.24, 0.12]), np.full(3, 0.5), np.array([0.0, 2.8, 0.0]))

@@ -12,9 +12,9 @@ from filters.smart import Smart
 from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
-from filters.smoothing.smart_factors import Sightings
-from filters.smoothing.smart_solver import SolvedWindow, without_oldest
-from filters.smoothing.smart_window import MarginalPrior, SmartWindow
+from toolkit.models.reduced_vision import Sightings
+from toolkit.models.window_solver import SolvedWindow, without_oldest
+from toolkit.models.stereo_window import MarginalPrior, SmartWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.models.motion import motion_model, state_cov, state_keys

@@ -13,7 +13,7 @@ from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.simulation import SCENARIOS, faults, simulate, track_faults
-from toolkit.track_noise import CHANNELS
+from toolkit.models.stereo import CHANNELS
 
 INJECTORS = {
     name: function

@@ -11,7 +11,7 @@ from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import check_runnable
 from toolkit.simulation import DRIVE, DRIVE_IMU, DRIVE_REALISTIC, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
-from toolkit.track_noise import CHANNELS
+from toolkit.models.stereo import CHANNELS
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 

@@ -30,7 +30,6 @@ from toolkit.measured_motion import (
 )
 from toolkit.resampling import ImuPairing, Pairing
 from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth, why_not_sightings
-from toolkit.track_noise import TrackNoise
 
 SCHEMA = "vislam.recording/1"
 _TEXT, _ARRAYS = "recording.json", "recording.npz"
@@ -130,12 +129,11 @@ def _counts(sequence: Sequence) -> dict[str, int]:
 
 
 def _rig_to_text(rig: StereoRig) -> Text:
-    """Return a rig, with the noise of its tracks where it is not white."""
-    stated = {name: x for name, x in _plain(rig).items() if name != "track_noise"}
-    return stated if rig.track_noise is None else {**stated, "track_noise": _plain(rig.track_noise)}
+    """Return a rig, with the weight of its tracks where it is not 1."""
+    return {name: x for name, x in _plain(rig).items() if name != "track_weight" or x != 1.0}
 
 
-def _plain(value: StereoRig | MotionNoise | TrackNoise) -> Text:
+def _plain(value: StereoRig | MotionNoise) -> Text:
     """Return the fields of a value with arrays as nested lists; Python writes floats so that they come back whole."""
     # What a value has worked out of its fields, and keeps, is none of them.
     parts = {field.name: getattr(value, field.name) for field in fields(value)}
@@ -198,10 +196,8 @@ def _sequence(text: Text, arrays: Arrays) -> Sequence:
 
 
 def _rig(fields: Text) -> StereoRig:
-    noise = fields.get("track_noise")
-    track_noise = None if noise is None else TrackNoise(**_arrays_again(noise))
-    rig = _arrays_again({name: x for name, x in fields.items() if name != "track_noise"})
-    return StereoRig(**rig, track_noise=track_noise)
+    # Files of before had a noise of tracks here, which is measured now.
+    return StereoRig(**_arrays_again({name: x for name, x in fields.items() if name != "track_noise"}))
 
 
 def _arrays_again(fields: Text) -> Text:

@@ -21,9 +21,9 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence, check_runnable, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
+from toolkit.simulation.track_noise import TrackNoise
 from toolkit.threads import on_one_thread
 from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, summary_of
-from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
 STARTS: dict[Start, Callable[[Sequence], Prior]] = {

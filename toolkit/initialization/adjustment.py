@@ -96,7 +96,7 @@ class _Problem:
         """Return the graph of some frames' sightings and its solution, found from states and, where known, points."""
         graph = gtsam.NonlinearFactorGraph()
         self._hold(graph)
-        maker = StereoFactors(self.sequence.rig, gtsam.noiseModel.mEstimator.Huber.Create(_HUBER))
+        maker = StereoFactors(self.sequence.rig, _HUBER)
         values = gtsam.Values()
         for k, frame in enumerate(frames):
             pose = start.atPose3(X(k)).matrix()

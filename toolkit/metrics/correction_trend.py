@@ -5,8 +5,7 @@ little that it passes its gate, and the innovations stay near their covariance w
 after frame. The corrections of a consistent estimator are independent from frame to frame, and the covariance of their
 sum over a stretch of time is the sum of their reductions of the state's covariance (:mod:`toolkit.models.corrections`):
 its squared Mahalanobis length is chi-square distributed. A correction is an estimate less the prediction by the
-measured motion from the estimate before, with the noise of the motion that the estimator assumed: the stated one,
-unless the estimator reports ``motion_noise_scale``.
+measured motion from the estimate before, with the noise of the motion that all estimators assume.
 """
 
 from collections.abc import Iterator
@@ -66,7 +65,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
     """Yield the test of the summed corrections of each whole stretch."""
-    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence, _noise_scale(evaluation)))
+    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence))
     cov = _stated_cov(evaluation.estimate, steps)
     total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
     for step in steps:
@@ -77,12 +76,6 @@ def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
         if since_s > _STRETCH_S - 1e-6:
             yield total.test(np.sqrt(sigma2))
             total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
-
-
-def _noise_scale(evaluation: Evaluation) -> Array | None:
-    """Return the factor that the run applied to the stated variance of the motion up to each row (N,)."""
-    scale = evaluation.run.info.get("motion_noise_scale")
-    return None if scale is None else np.nan_to_num(scale, nan=1.0)
 
 
 def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:

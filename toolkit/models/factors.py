@@ -13,8 +13,6 @@ from toolkit.models import left_only
 from toolkit.sequence import StereoFrame, StereoRig
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
-# The scale of all disparities, a vector (1,).
-SCALE: int = gtsam.symbol("s", 0)
 # A key is a character above an index of this many bits (gtsam/inference/Symbol.h); making a Symbol takes several times
 # as long as the arithmetic here.
 _INDEX_BITS = 56
@@ -24,7 +22,7 @@ _MOST_TERMS = 3
 
 
 def kind_of(key: int) -> str:
-    """Return the kind of variable of a key: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
+    """Return the kind of variable of a key: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark."""
     return chr(key >> _INDEX_BITS)
 
 
@@ -52,21 +50,24 @@ def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array
     return dict(zip(ascending, points, strict=True))
 
 
-def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:
-    """Return Huber's loss with a threshold in sigma, or no loss for None."""
-    return None if sigma is None else gtsam.noiseModel.mEstimator.Huber.Create(sigma)
+# Makes a loss from its threshold in standard deviations.
+Loss = Callable[[float], gtsam.noiseModel.mEstimator.Base]
+HUBER: Loss = gtsam.noiseModel.mEstimator.Huber.Create
+CAUCHY: Loss = gtsam.noiseModel.mEstimator.Cauchy.Create
 
 
 class StereoFactors:
     """Makes one projection factor per sighting: the measurement, noise and extrinsic the filters use.
 
     A sighting that lacks the right image has a factor of the left camera, with two rows instead of three and the loss
-    of the others.
+    of the others. The factors have the rig's weight of tracks; ``threshold`` (None for no loss) of the ``loss`` is in
+    standard deviations of the stated noise, as in the filters.
     """
 
-    def __init__(self, rig: StereoRig, robust: gtsam.noiseModel.mEstimator.Base | None = None) -> None:
-        self._noise = _noise(rig.cov_uv_px2, robust)
-        self._left_noise = _noise(left_only.left_cov_px2(rig), robust)
+    def __init__(self, rig: StereoRig, threshold: float | None = None, loss: Loss = HUBER) -> None:
+        robust = None if threshold is None else loss(threshold * float(np.sqrt(rig.track_weight)))
+        self._noise = _noise(rig.cov_uv_px2 / rig.track_weight, robust)
+        self._left_noise = _noise(left_only.left_cov_px2(rig) / rig.track_weight, robust)
         self._calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
         self._left_calibration = gtsam.Cal3_S2(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px)
         self._T_imu_cam = gtsam.Pose3(rig.T_imu_cam)
@@ -79,19 +80,6 @@ class StereoFactors:
                 yield self._by_left(np.array([uv_px[0], uv_px[2]]), pose, L(track_id))
             else:
                 yield self._by_both(gtsam.StereoPoint2(*uv_px), pose, L(track_id))
-
-    def remade(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Return the graph with this noise and loss in its stereo factors, and its other factors unchanged."""
-        made = gtsam.NonlinearFactorGraph()
-        for i in range(graph.size()):
-            factor = graph.at(i)
-            if isinstance(factor, gtsam.GenericStereoFactor3D):
-                made.add(self._by_both(factor.measured(), *factor.keys()))
-            elif isinstance(factor, gtsam.GenericProjectionFactorCal3_S2):
-                made.add(self._by_left(factor.measured(), *factor.keys()))
-            elif factor is not None:
-                made.add(factor)
-        return made
 
     def _by_both(self, measured: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:
         return gtsam.GenericStereoFactor3D(measured, self._noise, pose, landmark, self._calibration, self._T_imu_cam)

@@ -16,7 +16,7 @@ import numpy as np
 
 from toolkit.estimate import Estimate, Trajectory
 from toolkit.geometry import Array
-from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise, with_noise_scaled
+from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
 from toolkit.models.smooth_twist import SmoothTwist
@@ -143,17 +143,10 @@ def layout_of(sequence: Sequence) -> Layout:
     return motion_model(sequence.noise, sequence.gravity_world).layout
 
 
-def predicted_steps(
-    trajectory: Trajectory, sequence: Sequence, noise_scale: Array | None = None
-) -> Iterator[PredictedStep]:
-    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames.
-
-    ``noise_scale`` (N,) is the factor on the stated variance of the motion up to each row.
-    """
+def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
+    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames."""
     model = motion_model(sequence.noise, sequence.gravity_world)
     intervals = list(_intervals(trajectory, sequence))
-    if noise_scale is not None:
-        intervals = [(start, end, with_noise_scaled(motion, noise_scale[end])) for start, end, motion in intervals]
     beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
     increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
     for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):

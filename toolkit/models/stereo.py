@@ -1,6 +1,5 @@
 """The stereo measurement z = K_s pi(T_oi T_iw m), reduced to (uL, uR, v), with its Jacobians (Kang, eqs. 3-7, 11)."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -8,10 +7,11 @@ import numpy as np
 from toolkit.geometry import Array, se3_inverse, skew, transform, transposed
 from toolkit.sequence import StereoRig
 
+# (c, d, v) = CHANNELS @ (uL, uR, v): the mean column, the disparity, the row.
+CHANNELS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+CHANNELS.flags.writeable = False
 # The least depth to divide by.
 _LEAST_DIVISIBLE_M = 1e-3
-# Change of (uL, uR, v) per unit of added disparity: half of it in each image.
-_OF_A_DISPARITY = np.array([0.5, -0.5, 0.0])
 
 
 class StereoPrediction(NamedTuple):
@@ -106,21 +106,3 @@ def disparity_px(uvs_px: Array) -> Array:
     """Return uL - uR (...,) px."""
     disparity: Array = uvs_px[..., 0] - uvs_px[..., 1]
     return disparity
-
-
-def scaled_rig(rig: StereoRig, scale: float) -> StereoRig:
-    """Return the rig whose sightings have disparities larger by a share, which is more than -1.
-
-    d becomes d (1 + scale), the mean column c = (uL + uR) / 2 and the row stay. This is exactly a pair with the
-    baseline b (1 + scale) about the same midpoint: the left camera moves to the left by half of the added length. A
-    wrongly calibrated baseline or focal length has this effect, and so has matching that is biased to one side. A scale
-    about the left camera would also move c by half the change of the disparity.
-    """
-    T_imu_cam = rig.T_imu_cam.copy()
-    T_imu_cam[:3, 3] -= 0.5 * scale * rig.baseline_m * T_imu_cam[:3, 0]
-    return replace(rig, baseline_m=rig.baseline_m * (1.0 + scale), T_imu_cam=T_imu_cam)
-
-
-def d_uv_d_scale(uv_px: Array, scale: float) -> Array:
-    """Return the derivatives (..., 3) of a scaled rig's predictions (..., 3) px by its scale."""
-    return np.asarray(disparity_px(uv_px)[..., None] / (1.0 + scale) * _OF_A_DISPARITY)

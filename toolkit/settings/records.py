@@ -13,7 +13,7 @@ Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
 Arithmetic = Literal["auto", "compiled", "numpy"]
-TrackModel = Literal["white", "correlated", "fitted"]
+Auto = Literal["auto"]
 Scalar = bool | int | float | str
 
 
@@ -143,24 +143,34 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
-    motion_scale: Annotated[
-        float, _setting("factor on the white-noise densities of the motion samples", ge=1e-6, le=1e3)
-    ] = 1.0
-    tracks: Annotated[
-        TrackModel, _setting("errors of a track's sightings: independent, a stated walk and offset, or fitted")
-    ] = "white"
-    track_white_px: Annotated[float, _setting("correlated: white part, in column and row", "px", ge=1e-6, le=100.0)] = (
-        0.03
-    )
-    track_walk_px: Annotated[float, _setting("correlated: walk per root frame", "px", ge=0.0, le=100.0)] = 0.13
-    track_offset_px: Annotated[float, _setting("correlated: offset of a track's disparity", "px", ge=0.0, le=100.0)] = (
-        0.7
-    )
-    track_fit_s: (
+    track_weight: (
         Annotated[
             float,
             _setting(
-                "fitted: length of the beginning that is used, so that later causal answers use the past only",
+                "share of its stated information that a sighting carries, because errors along tracks are correlated; "
+                "auto: measured on the recording",
+                gt=0.0,
+                le=1.0,
+            ),
+        ]
+        | Auto
+    ) = "auto"
+    motion_scale: (
+        Annotated[
+            float,
+            _setting(
+                "factor on the white-noise densities of the motion samples; auto: measured on the recording, 1 or more",
+                ge=1e-6,
+                le=1e3,
+            ),
+        ]
+        | Auto
+    ) = "auto"
+    measured_s: (
+        Annotated[
+            float,
+            _setting(
+                "length of the beginning on which auto is measured, so that later causal answers use the past only",
                 "s",
                 none="all of it",
                 ge=1e-6,
@@ -169,26 +179,8 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
-    disparity_scale: (
-        Annotated[
-            float,
-            _setting(
-                "standard deviation of a scale on all disparities, a state of its own, as 0.01",
-                none="none: no such state",
-                ge=1e-6,
-                le=0.5,
-            ),
-        ]
-        | None
-    ) = None
     bridge_gaps: Annotated[
         bool, _setting("where frames have no track in common, measured twists before and after predict the twist, too")
-    ] = True
-    match_imu: Annotated[
-        bool, _setting("causal estimators assume more noise of an IMU than stated where tracks contradict it")
-    ] = True
-    match_tracks: Annotated[
-        bool, _setting("white noise: tracks have less weight where residuals along them are correlated")
     ] = True
 
 
@@ -207,9 +199,6 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
-    leave_out_moving: Annotated[
-        bool, _setting("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
-    ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):

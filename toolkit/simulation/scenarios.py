@@ -24,9 +24,9 @@ from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, SceneOf, hall, road
 from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
+from toolkit.simulation.track_noise import TrackNoise
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 from toolkit.simulation.world import CameraLimits
-from toolkit.track_noise import TrackNoise
 
 START_NS = 1_600_000_000 * NS_PER_S
 # The measurements of an hour take a gigabyte.

@@ -10,12 +10,12 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionSamples, TwistNoise, TwistSamples
-from toolkit.models.stereo import project
+from toolkit.models.stereo import CHANNELS, project
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, StereoRig
+from toolkit.simulation.track_noise import TrackNoise
 from toolkit.simulation.trajectory import SmoothTrajectory
 from toolkit.simulation.world import CameraLimits, Tracks
-from toolkit.track_noise import CHANNELS, TrackNoise
 
 
 @dataclass(frozen=True, eq=False)

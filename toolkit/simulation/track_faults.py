@@ -10,10 +10,10 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array
-from toolkit.models.stereo import project, triangulate
+from toolkit.models.stereo import CHANNELS, project, triangulate
 from toolkit.sequence import Sequence
 from toolkit.simulation.sensors import with_slips, with_track_noise
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 _NONE = np.zeros(3)
 # Points whose tracks begin within this many seconds are on one vehicle.

@@ -14,12 +14,12 @@ from toolkit.geometry import Array, BoolArray, se3_inverse, se3_log
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import neighbours
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.models.stereo import disparity_px
+from toolkit.models.stereo import CHANNELS, disparity_px
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
+from toolkit.simulation.track_noise import TrackNoise
 from toolkit.track_errors.fit import Fit
 from toolkit.track_errors.tracklets import Tracklets, linearised, middle_of_pair
-from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Sightings between which residuals are compared, at most.
 LAGS = 8

@@ -20,8 +20,9 @@ from scipy.special import gammaln, psi
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, skew
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
+from toolkit.models.stereo import CHANNELS
 from toolkit.sequence import Sequence, StereoRig, is_left_only
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.simulation.track_noise import TrackNoise
 
 # A landmark has as many unknowns as one sighting has coordinates; with three sightings a walk differs from white noise.
 FEWEST_SIGHTINGS = 3

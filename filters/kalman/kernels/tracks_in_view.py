@@ -148,8 +148,8 @@ def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Arr
 
     They are, for :func:`information_with_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]`` (F
     + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J (3 F, 6) to the newest
-    pose; ``J^T J`` of the others, one block (W, 6, 6) per pose; ``J^T r`` (6 W,). A track that is behind one of its cameras
-    adds nothing.
+    pose; ``J^T J`` of the others, one block (W, 6, 6) per pose; ``J^T r`` (6 W,). A track that is behind one of its
+    cameras adds nothing.
     """
     uvs_px, counted, weights, points = tracks
     poses, poses_at = window

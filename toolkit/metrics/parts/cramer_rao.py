@@ -16,7 +16,7 @@ the stated noise. Where a recording has no such truth, the bound that the model 
 states.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import gtsam
@@ -24,20 +24,22 @@ import numpy as np
 
 from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
-from toolkit.metrics.parts.information_filter import InformationFilter, LinearisedProblem
 from toolkit.metrics.parts.scores import Unavailable
-from toolkit.metrics.parts.sound_sightings import SightingNoise, without_mismatches
-from toolkit.models import left_only
-from toolkit.models.factors import L, StereoFactors, X, linear_factor
-from toolkit.models.motion import motion_model
+from toolkit.models import left_only, stereo
+from toolkit.models.factors import L, StereoFactors
+from toolkit.models.gating import chi2_bound
+from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief, Layout
 from toolkit.models.state_covariances import state_covs
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is_left_only
 
+# A sighting whose residual at the truth is this improbable is a mismatch and adds no information.
+_MISMATCH_PROBABILITY = 1e-6
+_POINT_ITERATIONS = 5
 # The chi-square of motion and of sightings at an exact truth, over its degrees of freedom: 1. That of motion is 0.85 to
 # 1.15 for 20 steps of an IMU.
 _EXACT = (0.8, 1.25)
@@ -76,15 +78,32 @@ def claimed_bound(sequence: Sequence, at: Trajectory, output: Output) -> Array:
     return _efficient(_problem_at_estimate(sequence, at), output).covs
 
 
-def _efficient(problem: LinearisedProblem, output: Output) -> Efficient:
+def _efficient(problem: "_Problem", output: Output) -> Efficient:
     try:
         return _causal(problem) if output == "causal" else _final(problem)
     except (np.linalg.LinAlgError, RuntimeError) as error:  # GTSAM's
         raise Unavailable("the measurements do not determine every state, as it is linearised") from error
 
 
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The true states, the packets without mismatches, and the landmarks (M, 3) of tracks (M,), by ascending id."""
+
+    rig: StereoRig
+    model: MotionModel
+    prior: Belief
+    states: tuple[Belief, ...]
+    packets: tuple[Packet, ...]
+    track_ids: IntArray
+    points: Array
+
+    def rows(self, frame: StereoFrame) -> IntArray:
+        """Return the rows (N,) of the landmarks that a frame shows."""
+        return np.searchsorted(self.track_ids, frame.track_ids)
+
+
 @lru_cache(maxsize=1)
-def _problem_at_truth(sequence: Sequence) -> LinearisedProblem:
+def _problem_at_truth(sequence: Sequence) -> _Problem:
     truth = sequence.truth
     if truth is None:
         raise Unavailable("the sequence has no ground truth")
@@ -112,7 +131,7 @@ def _problem_at_truth(sequence: Sequence) -> LinearisedProblem:
 
 
 @lru_cache(maxsize=1)
-def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> LinearisedProblem:
+def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> _Problem:
     rows, there = rows_of(sequence.frames_t_ns, at.t_ns)
     if not there.all():
         raise Unavailable("the estimate lacks the state of a frame")
@@ -126,13 +145,13 @@ def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> LinearisedProble
     return _problem(sequence, None, *states)
 
 
-def _problem(sequence: Sequence, prior: Prior | None, poses: Array, v_world: Array, bias: Array) -> LinearisedProblem:
+def _problem(sequence: Sequence, prior: Prior | None, poses: Array, v_world: Array, bias: Array) -> _Problem:
     """Return the problem about states (K, 4, 4), (K, 3), (K, 6), from the given prior or the measured start."""
     model = motion_model(sequence.noise, sequence.gravity_world)
     start = model.initial_belief(_measured_start(sequence, poses[0]) if prior is None else prior)
     states = tuple(Belief(start.layout, *state, start.cov) for state in zip(poses, v_world, bias, strict=True))
-    sound = without_mismatches(tuple(sequence.packets()), poses, SightingNoise.of(sequence.rig))
-    return LinearisedProblem(model, start, states, *sound)
+    packets, track_ids, points = _without_mismatches(tuple(sequence.packets()), poses, sequence.rig)
+    return _Problem(sequence.rig, model, start, states, packets, track_ids, points)
 
 
 def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
@@ -147,7 +166,7 @@ def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
     return Prior(T_world_imu, v_world, start.bias, start.cov, start.source)
 
 
-def _motion_chi_square(problem: LinearisedProblem) -> float:
+def _motion_chi_square(problem: _Problem) -> float:
     """Return the mean squared distance of the true steps from the measured motion, over its degrees of freedom."""
     distances = []
     for before, packet in zip(problem.states, problem.packets[1:], strict=False):
@@ -158,28 +177,84 @@ def _motion_chi_square(problem: LinearisedProblem) -> float:
     return float(np.mean(distances)) if distances else 1.0
 
 
-def _sighting_chi_square(problem: LinearisedProblem) -> tuple[float, float]:
+def _sighting_chi_square(problem: _Problem) -> tuple[float, float]:
     """Return the mean squared residual of sightings at true poses, and five standard deviations of it by chance.
 
     It is over the degrees of freedom that the landmarks, fitted to them, leave; 1 where there are none.
     """
-    sightings = problem.sightings
-    residuals = sightings.residuals(sightings.predict(problem.points, problem.poses).uv_px)
-    squared = float(np.square(sightings.all_decorrelated(residuals[..., None])).sum())
-    measured = np.broadcast_to(left_only.degrees_of_freedom(sightings.uvs_px), len(residuals))
-    dof = int(measured.sum()) - 3 * sightings.track_ids.size
+    squared, dof = 0.0, -3 * problem.track_ids.size
+    for packet, state in zip(problem.packets, problem.states, strict=True):
+        uvs_px = packet.frame.uvs_px
+        seen = stereo.predict(problem.points[problem.rows(packet.frame)], state.T_world_imu, problem.rig)
+        squared += float(np.square(left_only.whitened_residuals(uvs_px, seen.uv_px, problem.rig)).sum())
+        dof += int(np.broadcast_to(left_only.degrees_of_freedom(uvs_px), len(uvs_px)).sum())
     return (squared / dof, 5.0 * float(np.sqrt(2.0 / dof))) if dof > 0 else (1.0, 0.0)
 
 
-def _causal(problem: LinearisedProblem) -> Efficient:
+def _without_mismatches(
+    packets: tuple[Packet, ...], poses: Array, rig: StereoRig
+) -> tuple[tuple[Packet, ...], IntArray, Array]:
+    """Return the packets without mismatched sightings, and the landmarks (M,), (M, 3) of the rest."""
+    kept = _placed_by_stereo(packets)
+    for _ in range(2):
+        track_ids, points = _landmarks(kept, poses, rig)
+        sound = [_explained(p.frame, track_ids, points, pose, rig) for p, pose in zip(kept, poses, strict=True)]
+        kept = _placed_by_stereo(tuple(Packet(p.index, p.motion, f) for p, f in zip(kept, sound, strict=True)))
+    return kept, *_landmarks(kept, poses, rig)
+
+
+def _placed_by_stereo(packets: tuple[Packet, ...]) -> tuple[Packet, ...]:
+    """Return the packets without left-only sightings of tracks that both images have not shown before."""
+    if not any(is_left_only(packet.frame.uvs_px).any() for packet in packets):
+        return packets
+    placed, kept = np.empty(0, dtype=np.int64), []
+    for packet in packets:
+        frame, left = packet.frame, is_left_only(packet.frame.uvs_px)
+        placed = np.union1d(placed, frame.track_ids[~left])
+        kept.append(replace(packet, frame=frame.select(np.isin(frame.track_ids, placed))))
+    return tuple(kept)
+
+
+def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Array, rig: StereoRig) -> StereoFrame:
+    seen = stereo.predict(points[np.searchsorted(track_ids, frame.track_ids)], pose, rig)
+    whitened = left_only.whitened_residuals(frame.uvs_px, seen.uv_px, rig)
+    bound = chi2_bound(left_only.degrees_of_freedom(frame.uvs_px), 1.0 - _MISMATCH_PROBABILITY)
+    likely = np.square(whitened).sum(axis=1) < bound
+    return frame.select(likely & (seen.depth_m > 0.0))
+
+
+def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tuple[IntArray, Array]:
+    """Return the tracks (M,) and the points (M, 3) that best explain their sightings from the true poses."""
+    frames = [packet.frame for packet in packets]
+    ids, uvs_px = np.concatenate([f.track_ids for f in frames]), np.concatenate([f.uvs_px for f in frames])
+    pose = np.repeat(np.arange(len(frames)), [f.track_ids.size for f in frames])
+    # By track, the sighting with the largest disparity first: it has the most accurate depth.
+    order = np.lexsort((-stereo.disparity_px(uvs_px), ids))
+    uvs_px, seen_from = uvs_px[order], poses[pose[order]]
+    track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
+    points = stereo.triangulate_world(uvs_px[first], seen_from[first], rig)
+    whitener = left_only.whitener(uvs_px, rig)
+    for _ in range(_POINT_ITERATIONS):
+        seen = stereo.predict(points[track], seen_from, rig)
+        H, residuals = whitener @ seen.d_uv_d_point, left_only.whitened_residuals(uvs_px, seen.uv_px, rig)
+        H_transposed = np.swapaxes(H, 1, 2)
+        information = np.add.reduceat(H_transposed @ H, first)
+        score = np.add.reduceat((H_transposed @ residuals[..., None])[..., 0], first)
+        points = points + np.linalg.solve(information, score[..., None])[..., 0]
+    return track_ids, points
+
+
+def _causal(problem: _Problem) -> Efficient:
     """Propagate the information of state and landmarks; a landmark is marginalised after its last sighting."""
-    last_seen = np.zeros(problem.sightings.track_ids.size, dtype=np.int64)
+    last_seen = np.zeros(problem.track_ids.size, dtype=np.int64)
     for packet in problem.packets:
         last_seen[problem.rows(packet.frame)] = packet.index
-    known = InformationFilter(problem)
+    known = _Information(problem)
     covs, errors = [], []
     for packet in problem.packets:
-        known.step(packet)
+        if packet.motion is not None:
+            known.predict(packet)
+        known.update(packet.frame, problem.states[packet.index].T_world_imu)
         cov, mean = known.state()
         covs.append(cov)
         errors.append(-mean)
@@ -187,46 +262,95 @@ def _causal(problem: LinearisedProblem) -> Efficient:
     return Efficient(problem.prior.layout, np.array(covs), np.array(errors))
 
 
-def _final(problem: LinearisedProblem) -> Efficient:
+class _Information:
+    """The information matrix and vector of the state's and the landmarks' offsets from the truth, the state first."""
+
+    def __init__(self, problem: _Problem) -> None:
+        self._problem, self._size = problem, problem.prior.layout.size
+        self._matrix = np.asarray(np.linalg.inv(problem.prior.cov))
+        self._vector: Array = self._matrix @ problem.states[0].error_to(problem.prior)
+        self._landmarks = np.empty(0, dtype=np.int64)  # rows of the problem's landmarks
+
+    def predict(self, packet: Packet) -> None:
+        """Add the next state by the measured motion, and marginalise the one before it."""
+        problem, d, k = self._problem, self._size, packet.index
+        assert packet.motion is not None
+        before, now = problem.states[k - 1], problem.states[k]
+        increment = problem.model.integrate(packet.motion, before.bias)
+        prediction = increment.predict(before)
+        # Linearised at the true end, not at the predicted one, so that unobservable directions gain no information.
+        at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
+        transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
+        # By the measured motion the next state's offset is F x + r plus noise.
+        r = now.error_to(before.predicted(prediction))
+        weighted = transition.T @ precision
+        to_next = np.concatenate([-weighted, self._matrix[:d, d:]], axis=1)
+        score = self._vector[:d] - weighted @ r
+        gain = np.linalg.solve(self._matrix[:d, :d] + weighted @ transition, np.column_stack([to_next, score]))
+        self._matrix[:d], self._matrix[:, :d], self._matrix[:d, :d] = 0.0, 0.0, precision
+        self._matrix -= to_next.T @ gain[:, :-1]
+        self._vector = np.concatenate([precision @ r, self._vector[d:]]) - to_next.T @ gain[:, -1]
+
+    def update(self, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Add the sightings of a frame; landmarks seen for the first time are added to the state."""
+        problem, rows = self._problem, self._problem.rows(frame)
+        self._join(rows[~np.isin(rows, self._landmarks)])
+        seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
+        whitener = left_only.whitener(frame.uvs_px, problem.rig)
+        root = float(np.sqrt(problem.rig.track_weight))
+        H = root * np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
+        residuals = root * left_only.whitened_residuals(frame.uvs_px, seen.uv_px, problem.rig)
+        place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]
+        own = self._size + 3 * place[:, None] + np.arange(3)
+        columns = np.concatenate([np.broadcast_to(np.arange(6), (len(rows), 6)), own], axis=1)
+        H_transposed = np.swapaxes(H, 1, 2)
+        np.add.at(self._matrix, (columns[:, :, None], columns[:, None, :]), H_transposed @ H)
+        np.add.at(self._vector, columns, (H_transposed @ residuals[..., None])[..., 0])
+
+    def state(self) -> tuple[Array, Array]:
+        """Return the covariance (d, d) and the mean (d,) of the state's offset."""
+        d = self._size
+        inner = np.linalg.solve(self._matrix[d:, d:], np.column_stack([self._matrix[d:, :d], self._vector[d:]]))
+        cov = np.linalg.inv(self._matrix[:d, :d] - self._matrix[:d, d:] @ inner[:, :d])
+        return 0.5 * (cov + cov.T), cov @ (self._vector[:d] - self._matrix[:d, d:] @ inner[:, d])
+
+    def forget(self, gone: BoolArray) -> None:
+        """Marginalise landmarks that are not seen again: ``gone`` (M,) masks the problem's landmarks."""
+        leaving = gone[self._landmarks]
+        if not leaving.any():
+            return
+        out = np.concatenate([np.zeros(self._size, dtype=bool), np.repeat(leaving, 3)])
+        across = self._matrix[np.ix_(out, ~out)]
+        gain = np.linalg.solve(self._matrix[np.ix_(out, out)], np.column_stack([across, self._vector[out]]))
+        self._matrix = self._matrix[np.ix_(~out, ~out)] - across.T @ gain[:, :-1]
+        self._vector = self._vector[~out] - across.T @ gain[:, -1]
+        self._landmarks = self._landmarks[~leaving]
+
+    def _join(self, rows: IntArray) -> None:
+        full_size = len(self._matrix) + 3 * len(rows)
+        matrix, vector = np.zeros((full_size, full_size)), np.zeros(full_size)
+        matrix[: len(self._matrix), : len(self._matrix)], vector[: len(self._vector)] = self._matrix, self._vector
+        self._matrix, self._vector = matrix, vector
+        self._landmarks = np.concatenate([self._landmarks, rows])
+
+
+def _final(problem: _Problem) -> Efficient:
     """Solve the whole graph linearised at the truth."""
     model, values = problem.model, gtsam.Values()
     graph = model.hold(problem.prior, 0)
+    maker = StereoFactors(problem.rig)
     for packet, state in zip(problem.packets, problem.states, strict=True):
         model.insert(values, state.estimate(packet.frame.t_ns), packet.index)
         if packet.motion is not None:
             bias = problem.states[packet.index - 1].bias
             graph.push_back(model.integrate(packet.motion, bias).factors(packet.index))
-    for track_id, point in zip(problem.sightings.track_ids.tolist(), problem.points, strict=True):
+        for factor in maker.of(packet.frame, packet.index):
+            graph.add(factor)
+    for track_id, point in zip(problem.track_ids.tolist(), problem.points, strict=True):
         values.insert(L(track_id), point)
-    correlated = problem.sightings.noise.of_tracks is not None
-    if not correlated:
-        _add_sightings(graph, problem)
     linear = graph.linearize(values)
-    if correlated:
-        _add_tracks(linear, problem)
-    covs = state_covs(linear, model, problem.poses)
+    poses = np.stack([state.T_world_imu for state in problem.states])
+    covs = state_covs(linear, model, poses)
     moved = values.retract(linear.optimize())
     errors = [state.at(model.read(moved, k, 0)).error_to(state) for k, state in enumerate(problem.states)]
     return Efficient(problem.prior.layout, covs, np.array(errors))
-
-
-def _add_sightings(graph: gtsam.NonlinearFactorGraph, problem: LinearisedProblem) -> None:
-    """Add a factor of each sighting, whose errors are independent."""
-    maker = StereoFactors(problem.sightings.noise.rig)
-    for packet in problem.packets:
-        for factor in maker.of(packet.frame, packet.index):
-            graph.add(factor)
-
-
-def _add_tracks(linear: gtsam.GaussianFactorGraph, problem: LinearisedProblem) -> None:
-    """Add a factor of each track, whose errors are correlated, on its landmark and all poses that see it."""
-    sightings = problem.sightings
-    seen = sightings.predict(problem.points, problem.poses)
-    by_pose, by_point = sightings.jacobian(seen.d_uv_d_pose), sightings.jacobian(seen.d_uv_d_point)
-    residuals = sightings.residuals(seen.uv_px)
-    for track, rows in enumerate(sightings.of_each_track):
-        root = sightings.decorrelated(track, np.eye(residuals[rows].size))
-        poses = zip(sightings.frame[rows].tolist(), np.hsplit(root, len(residuals[rows])), by_pose[rows], strict=True)
-        terms = [(X(k), own @ jacobian) for k, own, jacobian in poses]
-        landmark = L(int(sightings.track_ids[track])), root @ by_point[rows].reshape(-1, 3)
-        linear.add(linear_factor([landmark, *terms], root @ residuals[rows].ravel()))

@@ -12,10 +12,6 @@ import numpy as np
 from toolkit.arrays import freeze_arrays
 from toolkit.geometry import Array
 
-# (c, d, v) = CHANNELS @ (uL, uR, v): the mean column, the disparity, the row. Their errors are taken as independent.
-CHANNELS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
-CHANNELS.flags.writeable = False
-
 
 @dataclass(frozen=True, eq=False)
 class TrackNoise:

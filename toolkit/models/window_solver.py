@@ -11,10 +11,10 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from filters.smoothing.smart_factors import RobustCamera, Sightings, Vision
-from filters.smoothing.smart_window import Evaluated, MarginalPrior, SmartWindow, System
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
+from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
+from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow, System
 
 MOST_ITERATIONS = 5
 # Newton's method converges quadratically: after a step shorter than this, in sigmas of all states together, the next is
@@ -45,7 +45,7 @@ class SolvedWindow:
         return np.asarray(half.T @ half)
 
 
-def solve_window(window: SmartWindow, camera: RobustCamera) -> SolvedWindow:
+def solve_window(window: SmartWindow, camera: RobustCamera, iterations: int = MOST_ITERATIONS) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -53,7 +53,7 @@ def solve_window(window: SmartWindow, camera: RobustCamera) -> SolvedWindow:
     here, damping = Evaluated.of(window, camera), 0.0
     if not np.isfinite(here.error):
         raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(iterations):
         system = here.linearised()
         step = _descent(here, system, damping, camera)
         decrease, here = here.error - step.there.error, step.there

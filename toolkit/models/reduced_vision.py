@@ -106,7 +106,7 @@ class Vision:
 
     @property
     def loss(self) -> float:
-        """The sum of Huber's losses of the whitened residuals, half a square each where small."""
+        """The sum of Huber's losses of the whitened residuals, half a square each where small, by tracks' weight."""
         return float(self._losses.sum())
 
     @property
@@ -119,20 +119,20 @@ class Vision:
         norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
         huber = self.camera.huber
         beyond = huber * (norm - huber / 2)
-        return np.where(norm <= huber, 0.5 * norm**2, beyond)
+        return self.camera.rig.track_weight * np.where(norm <= huber, 0.5 * norm**2, beyond)
 
     def reduced(self) -> ReducedVision:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
         weights = self._root_weights
         weighted = weights[:, None, None] * left_only.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
-        return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
+        return _eliminated(weights[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts)
 
     @property
     def _root_weights(self) -> Array:
-        """The roots of Huber's weights (N,); 0 behind the camera."""
-        huber = self.camera.huber
-        return np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
+        """The roots of Huber's weights (N,) times the weight of tracks; 0 behind the camera."""
+        huber, weight = self.camera.huber, self.camera.rig.track_weight
+        return np.where(self.seen.in_front, np.sqrt(weight * huber / np.maximum(self._norm, huber)), 0.0)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
@@ -141,14 +141,20 @@ class Vision:
         points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
         return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
 
+    @property
+    def H_pose(self) -> Array:  # noqa: N802 - the mathematics' own name
+        """The whitened Jacobians (N, 3, 6) to the pose of each sighting."""
+        whitener = left_only.whitener(self.sightings.uv_px, self.camera.rig)
+        return np.asarray(whitener @ left_only.seen_rows(self.sightings.uv_px, self._predicted.d_uv_d_pose))
+
     @cached_property
-    def _residual(self) -> Array:
-        """Measured less predicted, whitened (N, 3)."""
+    def whitened(self) -> Array:
+        """Measured less predicted, whitened by the stated noise (N, 3)."""
         return left_only.whitened_residuals(self.sightings.uv_px, self._predicted.uv_px, self.camera.rig)
 
     @cached_property
     def _norm(self) -> Array:
-        return np.asarray(np.linalg.norm(self._residual, axis=1))
+        return np.asarray(np.linalg.norm(self.whitened, axis=1))
 
 
 def _eliminated(

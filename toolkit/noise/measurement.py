@@ -1,0 +1,82 @@
+"""Measures the noise of a recording on stretches of it, and keeps what was measured under the recording's hash."""
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+
+import msgspec
+import numpy as np
+
+from toolkit.errors import EstimatorError, OutputError
+from toolkit.files.writing import replaced_file
+from toolkit.frontend.cache import folder
+from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight, track_weight
+from toolkit.noise.motion import MotionScale, motion_scale
+from toolkit.noise.stretches import Adjusted, MotionFit, Stretch, stretches
+from toolkit.sequence import Sequence
+
+# Raised with every change of the measurement that changes what it finds.
+_MEASUREMENT = 1
+# The weight of tracks is measured with the motion's noise so many times as large as stated: a motion that errs more
+# than stated would otherwise pull the poses, and with them all residuals of an image.
+_LOOSE = 10.0
+# With fewer frames a stretch shows no correlation along tracks.
+_FEWEST_FRAMES = 2 * FEWEST_SIGHTINGS
+
+
+@dataclass(frozen=True)
+class MeasuredNoise:
+    """What was measured on a recording; ``why_not`` says why nothing was, and both are then as stated."""
+
+    tracks: TrackWeight = TrackWeight()
+    motion: MotionScale = MotionScale()
+    why_not: str = ""
+
+
+def measured_noise(sequence: Sequence) -> MeasuredNoise:
+    """Return the weight of tracks and the factor on the motion's noise of a recording.
+
+    Only the visible tracks and the motion samples are used. White errors as stated give exactly 1 and 1. What was
+    measured is kept on disk, so that it is measured once. Raises DataError where the recording cannot be run.
+    """
+    made_by = f"{_MEASUREMENT}-{version('gtsam')}-{version('numpy')}"
+    path = folder() / "noise" / f"{sequence.content_hash()}-{made_by}.json"
+    with suppress(OSError, msgspec.DecodeError):
+        return msgspec.json.decode(path.read_bytes(), type=MeasuredNoise)
+    found = _measured(sequence)
+    with suppress(OSError, OutputError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced_file(path) as partial:
+            partial.write_bytes(msgspec.json.encode(found))
+    return found
+
+
+def _measured(sequence: Sequence) -> MeasuredNoise:
+    if sequence.frame_count < _FEWEST_FRAMES:
+        return MeasuredNoise(why_not=f"{sequence.frame_count} frames are too few")
+    if not len(sequence.visible):
+        return MeasuredNoise(why_not="there are no tracks")
+    at_hand = [(stretch, adjusted) for stretch in stretches(sequence) if (adjusted := _vision_alone(stretch, sequence))]
+    if not at_hand:
+        return MeasuredNoise(why_not="the tracks do not determine the motion in any part of it")
+    weight = track_weight((one.residuals(FEWEST_SIGHTINGS), stretch.used) for stretch, one in at_hand)
+    if sequence.motion_kind == "none":
+        return MeasuredNoise(weight)
+    rig, now = replace(sequence.rig, track_weight=weight.value), dict(enumerate(at_hand))
+
+    def fit(scale: float) -> MotionFit:
+        for i, (stretch, before) in list(now.items()):
+            with suppress(EstimatorError):
+                now[i] = stretch, stretch.adjusted_again(before, rig, sequence.noise.scaled(scale))
+        return MotionFit(*np.sum([one.motion_fit() for _, one in now.values()], axis=0).tolist())
+
+    return MeasuredNoise(weight, motion_scale(fit))
+
+
+def _vision_alone(stretch: Stretch, sequence: Sequence) -> Adjusted | None:
+    """Return a stretch adjusted with hardly any weight of the motion samples, or None where that has no solution."""
+    noise = sequence.noise.scaled(_LOOSE)
+    try:
+        return stretch.adjusted_again(stretch.adjusted(sequence.rig, noise), sequence.rig, noise)
+    except EstimatorError:
+        return None
