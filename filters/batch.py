@@ -76,7 +76,7 @@ class Batch:
         increments = {k: self._motion.integrate(motion, best_bias) for k, motion in moved.items()}
         for k, increment in increments.items():
             graph.push_back(increment.factors(k))
-        return MotionFactors(graph, stacked(increments, {}))
+        return MotionFactors(graph, stacked(increments))
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()

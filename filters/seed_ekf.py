@@ -59,7 +59,8 @@ class SeedEkf(Filter):
         predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
         residual_px = left_only.residuals_px(uvs_px, predicted.uv_px)
         H_pose = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
-        weighted = self._rig.track_weight * np.linalg.solve(left_only.noise_px2(uvs_px, self._rig), H_pose)
+        noise_px2 = left_only.noise_px2(uvs_px, self._rig) / self._rig.track_weight
+        weighted = np.asarray(np.linalg.solve(noise_px2, H_pose))
         self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, weighted)
 
     def landmarks(self) -> Landmarks:

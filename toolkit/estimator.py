@@ -29,15 +29,10 @@ ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
 LADDER = "ladder"
 # Settings that are meant for all estimators, and whether an estimator obeys them by default, when its module has no
-# entry for them: the outlier policy, the window, the stated noise of tracks, and parts of the noise model that not all
-# estimators have.
+# entry for them: the outlier policy and the window.
 RULES = {
     "outliers": True,
     "window": True,
-    "tracks": True,
-    "disparity_scale": False,
-    "bridge_gaps": False,
-    "match_tracks": False,
 }
 
 

@@ -199,15 +199,53 @@ def are_of_one_kind(samples: MotionSamples, noise: MotionNoise) -> bool:
     return any(isinstance(samples, one) and isinstance(noise, other) for one, other, _ in _KINDS)
 
 
-def motions_between(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None) -> Iterator[Motion]:
-    """Yield the motion of each interval between frames (K,) ns, cut and interpolated at the frame times."""
+@dataclass(frozen=True, eq=False)
+class GapTwists:
+    """Twists of G intervals between frames, with stamps (G,) of both, that hold in the place of the samples there.
+
+    ``v_mps`` (G, 3) and ``w_radps`` (G, 3) in the IMU frame; ``noise_scale`` (G, 2) multiplies the standard deviation
+    of the stated white noise of velocity and turn rate.
+    """
+
+    begin_t_ns: IntArray
+    end_t_ns: IntArray
+    v_mps: Array
+    w_radps: Array
+    noise_scale: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(
+            self, begin_t_ns=(None,), end_t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3), noise_scale=(None, 2)
+        )
+
+    def over(self, begin_ns: int, end_ns: int) -> TwistMotion | None:
+        """Return the motion of an interval between two stamps, or None where the samples hold."""
+        rows = np.flatnonzero((self.begin_t_ns == begin_ns) & (self.end_t_ns == end_ns))
+        if not rows.size:
+            return None
+        dt_s = read_only([(end_ns - begin_ns) / NS_PER_S])
+        return TwistMotion(dt_s, self.v_mps[rows], self.w_radps[rows], self.noise_scale[rows])
+
+
+def motions_between(
+    samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None, gaps: GapTwists | None = None
+) -> Iterator[Motion]:
+    """Yield the motion of each interval between frames (K,) ns, cut and interpolated at the frame times.
+
+    Where ``gaps`` have a twist for an interval, it holds in the place of the samples.
+    """
     if isinstance(samples, NoSamples):
         for dt_s in np.diff(frames_t_ns) / NS_PER_S:
             yield UnmeasuredMotion(read_only([dt_s]))
         return
     twist = isinstance(samples, TwistSamples)
     pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, samples.pairing)
-    for begin_ns, (dt_s, rows) in zip(frames_t_ns[:-1].tolist(), pieces, strict=True):
+    ends = frames_t_ns.tolist()
+    for begin_ns, end_ns, (dt_s, rows) in zip(ends[:-1], ends[1:], pieces, strict=True):
+        improved = None if gaps is None else gaps.over(begin_ns, end_ns)
+        if improved is not None:
+            yield improved
+            continue
         scale = None if bridges is None else bridges.scale_over(begin_ns, dt_s)
         part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]), scale)
         yield TwistMotion(*part) if twist else ImuMotion(*part)

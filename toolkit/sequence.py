@@ -25,6 +25,7 @@ from toolkit.geometry import (
     se3_inverse,
 )
 from toolkit.measured_motion import (
+    GapTwists,
     Motion,
     MotionKind,
     MotionNoise,
@@ -213,6 +214,7 @@ class Sequence:
 
     A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only :meth:`packets` insists on finite
     values and increasing time. ``gravity_world`` (3,) m/s^2; ``bridges``: where motion samples are interpolated;
+    ``gap_twists``: the motion of intervals that no track leads across, where it is better known than by the samples;
     ``track_budget``: the most tracks a frame that estimators are given, None for all.
     """
 
@@ -227,6 +229,7 @@ class Sequence:
     prior: Prior | None = None
     truth: Truth | None = None
     bridges: Bridges | None = None
+    gap_twists: GapTwists | None = None
     track_budget: int | None = None
 
     def __post_init__(self) -> None:
@@ -286,7 +289,7 @@ class Sequence:
         check_runnable(self)
         seen = self.visible
         first_row = self._frame_starts(seen)
-        motions = motions_between(self.motion, self.frames_t_ns, self.bridges)
+        motions = motions_between(self.motion, self.frames_t_ns, self.bridges, self.gap_twists)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
             frame = StereoFrame(int(self.frames_t_ns[k]), seen.track_id[rows], seen.uv_px[rows])
@@ -307,7 +310,7 @@ class Sequence:
         With ``digits``, of the same rounded (:func:`toolkit.arrays.content_digest`).
         """
         seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
-        further = filter(None, (self.bridges, self.track_budget))
+        further = filter(None, (self.bridges, self.gap_twists, self.track_budget))
         return content_digest((*seen, self.truth, self.prior, *further), digits)
 
 

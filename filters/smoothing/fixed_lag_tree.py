@@ -206,7 +206,8 @@ class FixedLagTree:
 
         A landmark that was dropped with all its factors is left out, because in a tree it would be a variable without
         an elimination index. GTSAM's marginal factors have no linearisation point: they stay right only while their
-        variables keep their linearisation points. The tree that made them fixes those; for the next tree they must be passed on.
+        variables keep their linearisation points. The tree that made them fixes those; for the next tree they must
+        be passed on.
         """
         factors, values = _without_ties(without_gaps(self._isam.getFactorsUnsafe())), self._isam.getLinearizationPoint()
         self._tie_slots = []

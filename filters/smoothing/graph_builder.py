@@ -2,7 +2,8 @@
 
 Sightings of tracks that have jumped to another point are left out. With odometry, the initial value of a new state is
 the pose that best fits its sightings of known landmarks, not the prediction by the measured motion alone. The
-prediction may be off by many sigmas of a sighting's innovation, and linearised there the loss would give every sighting the weight of an outlier.
+prediction may be off by many sigmas of a sighting's innovation, and linearised there the loss would give every sighting
+the weight of an outlier.
 """
 
 from collections.abc import Mapping

@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from toolkit.audit import Finding
     from toolkit.estimate import Output, Run, Status
     from toolkit.geometry import Array
+    from toolkit.noise import Card, MeasuredNoise
     from toolkit.sequence import Prior
     from toolkit.sequence import Sequence as Recorded
-    from toolkit.track_errors import Card
 
 Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"]
 NEES, NIS = "nees_pose_mean", "nis_mean"
@@ -252,10 +252,9 @@ class Comparison:
 
     ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
-    changes against the rung before; ``white`` which estimators treat the stated noise of tracks as white, and why;
-    ``lacking`` which estimators lack an optional part of the noise model that the settings ask for, by part.
-    ``undecided`` has the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks,
-    where asked for.
+    changes against the rung before; ``measured`` is the noise that was measured on the recording under the first seed,
+    None where the settings state it. ``undecided`` has the faults that the audit could not judge, and why; ``card`` is
+    that of the recording's tracks, where asked for.
     """
 
     source: str
@@ -265,8 +264,7 @@ class Comparison:
     seeds: tuple[int, ...]
     outcomes: tuple[Outcome, ...]
     changes: Mapping[str, str] = field(default_factory=dict)
-    white: Mapping[str, str] = field(default_factory=dict)
-    lacking: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    measured: MeasuredNoise | None = None
     settings: Settings = DEFAULTS
     workers: int = 1
     undecided: Mapping[str, str] = field(default_factory=dict)

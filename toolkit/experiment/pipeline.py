@@ -6,8 +6,6 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
@@ -23,7 +21,7 @@ from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_pre
 from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
-from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
+from toolkit.settings import DEFAULTS, Settings, SettingsError
 from toolkit.threads import MOST_WORKERS
 
 
@@ -283,49 +281,12 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        white={} if sequence.rig.track_noise is None else _assuming_white(entries),
-        lacking=lacking(entries, plan.settings.noise, case.prepared),
+        measured=case.prepared.measured,
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
         card=case.prepared.card,
     )
-
-
-def _assuming_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
-    """Return which estimators treat the noise of tracks as white whatever the rig states, and why."""
-    return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
-
-
-def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, prepared: Prepared) -> dict[str, tuple[str, ...]]:
-    """Return, for each optional part of the noise model that is requested and matters, the estimators without it."""
-    motion_kind, decisive = prepared.sequence.motion_kind, decisive_parts(prepared)
-    requested = {
-        "disparity_scale": noise.disparity_scale is not None,
-        "bridge_gaps": noise.bridge_gaps,
-        "match_tracks": noise.match_tracks,
-    }
-    in_question = [part for part, is_requested in requested.items() if is_requested and part in decisive]
-    parts = {
-        part: tuple(name for name, entry in entries.items() if not entry.obeys(part, motion_kind))
-        for part in in_question
-    }
-    return {part: names for part, names in parts.items() if names}
-
-
-def decisive_parts(prepared: Prepared) -> frozenset[str]:
-    """Return the optional parts of the noise model that can change estimates on a recording."""
-    correlated = any(finding.fault == "correlated-tracks" for finding in prepared.findings)
-    known = {"disparity_scale": True, "bridge_gaps": to_bridge(prepared.sequence), "match_tracks": correlated}
-    return frozenset(part for part, decides in known.items() if decides)
-
-
-def to_bridge(sequence: Recorded) -> bool:
-    """Say whether a sequence has measured twists and an interval without a common track, which a bridge needs."""
-    seen, count = sequence.visible, sequence.frame_count
-    key = seen.track_id * (count + 1) + seen.frame
-    tied = np.unique(seen.frame[np.isin(key + 1, key)])
-    return sequence.motion_kind == "twist" and bool(tied.size < count - 1)
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:

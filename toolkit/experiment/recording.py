@@ -15,15 +15,13 @@ from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
-from toolkit.models.moving_tracks import without_moving_tracks
+from toolkit.noise import Card, MeasuredNoise, card_of, measured_noise, with_gap_twists
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence, check_runnable, why_not_sightings
+from toolkit.sequence import Prior, Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
-from toolkit.simulation.track_noise import TrackNoise
 from toolkit.threads import on_one_thread
-from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, summary_of
 
 Start = Literal["measurements", "truth"]
 STARTS: dict[Start, Callable[[Sequence], Prior]] = {
@@ -69,7 +67,7 @@ class Recording:
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
     reports and leaves as they are. ``part`` selects the frames that are used, ``max_frames`` the first of these;
     ``duration_s`` cuts the recording before that, and a simulation is made that long. ``vary`` says which parts of a
-    simulation the seed draws; ``card`` requests the card of its tracks, which a fitted noise always includes.
+    simulation the seed draws; ``card`` requests the card of its tracks.
     """
 
     source: str | Sequence
@@ -92,7 +90,7 @@ class Prepared:
     """A recording as the estimators read it, the findings of the audit in it before, and the state they start from.
 
     ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why;
-    ``card`` is that of the tracks the noise was fitted to.
+    ``measured`` is what was measured of its noise, None where the settings state it.
     """
 
     sequence: Sequence
@@ -100,6 +98,7 @@ class Prepared:
     prior: Prior
     whole: Sequence
     undecided: Mapping[str, str] = field(default_factory=dict)
+    measured: MeasuredNoise | None = None
     card: Card | None = None
 
 
@@ -110,25 +109,19 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     """
     with on_one_thread():
         audited = audited_recording(recording, progress)
-        whole = _with_noise(audited.sequence, recording.noise)
-        if recording.noise.pixel_sigma_px is not None and recording.noise.tracks == "white":
+        whole = _with_pixel_noise(audited.sequence, recording.noise.pixel_sigma_px)
+        if whole is not audited.sequence:
             audited = _audited_with_its_noise(audited, _cut(whole, recording))
+        whole, measured = _with_measured_noise(whole, recording.noise)
         card = None
-        if recording.noise.tracks == "fitted":
-            whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
-        elif recording.noise.tracks == "correlated":
-            whole = _with_contradiction(whole, _cut(whole, recording))
-        if recording.card and card is None:
+        if recording.card:
             whole, card = _with_card(whole, _cut(whole, recording))
-        used, budget = _cut(whole, recording), recording.tracks.budget
-        sequence = _within_budget(used, budget)
+        used = _cut(whole, recording)
+        used = with_gap_twists(used) if recording.noise.bridge_gaps else used
+        sequence = _within_budget(used, recording.tracks.budget)
         prior = STARTS[recording.start](sequence)
-        if recording.tracks.leave_out_moving:
-            at_rest, left_out = _without_moving_tracks(used, prior)
-            sequence = _within_budget(at_rest, budget)
-            card = None if card is None else replace(card, left_out=left_out)
         findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
-        return Prepared(sequence, findings, prior, whole, audited.undecided, card)
+        return Prepared(sequence, findings, prior, whole, audited.undecided, measured, card)
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:
@@ -170,7 +163,7 @@ def recording_card(recording: Recording, progress: Progress = SILENT) -> tuple[S
     """
     with on_one_thread():
         sequence = _cut(audited_recording(recording, progress).sequence, recording)
-        return sequence, card_of(sequence, fit_track_noise(sequence))
+        return sequence, card_of(sequence)
 
 
 @lru_cache(maxsize=1)
@@ -253,15 +246,32 @@ def _with_truth_at_frames(sequence: Sequence) -> Sequence:
     return replace(sequence, truth=thinned)
 
 
-def _with_noise(sequence: Sequence, requested: Noise) -> Sequence:
-    """Return the sequence with the noise that the settings ask for."""
+def _with_pixel_noise(sequence: Sequence, sigma_px: float | None) -> Sequence:
+    """Return the sequence with the standard deviation of a column (px) that the settings state, if they do."""
+    if sigma_px is None:
+        return sequence
     rig = sequence.rig
-    if requested.pixel_sigma_px is not None:
-        rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (requested.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
-    if requested.tracks == "correlated":
-        rig = replace(rig, track_noise=_stated_track_noise(requested))
-    noise = sequence.noise if requested.motion_scale == 1.0 else sequence.noise.scaled(requested.motion_scale)
-    return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
+    return replace(sequence, rig=replace(rig, cov_uv_px2=rig.cov_uv_px2 * (sigma_px**2 / rig.cov_uv_px2[0, 0])))
+
+
+def _with_measured_noise(sequence: Sequence, requested: Noise) -> tuple[Sequence, MeasuredNoise | None]:
+    """Return the sequence with the weight of tracks and the motion's noise that are stated or measured on it.
+
+    Raises DataError where the beginning that is to be measured has no two frames.
+    """
+    weight, scale, measured = requested.track_weight, requested.motion_scale, None
+    if weight == "auto" or scale == "auto":
+        beginning = sequence if requested.measured_s is None else _first_seconds(sequence, requested.measured_s)
+        if beginning.frame_count < 2:
+            raise DataError(
+                f"{sequence.name}: no two frames are in the first {requested.measured_s:g} s "
+                "(noise.measured_s); give it more seconds"
+            )
+        measured = measured_noise(replace(beginning, rig=replace(sequence.rig, track_weight=1.0)))
+        weight = measured.tracks.value if weight == "auto" else weight
+        scale = measured.motion.value if scale == "auto" else scale
+    noise = sequence.noise if scale == 1.0 else sequence.noise.scaled(scale)
+    return replace(sequence, rig=replace(sequence.rig, track_weight=weight), noise=noise), measured
 
 
 def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
@@ -275,66 +285,15 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
     return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
 
 
-def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, float]:
-    """Return the sequence without the sightings that move against the rest, recorded in the facts, and their share."""
-    at_rest, counts = without_moving_tracks(sequence, prior)
-    share = counts.sightings / max(counts.of_sightings, 1)
-    fact = (
-        f"not given to estimators, because they contradict the motion and most other tracks (tracks.leave_out_moving): "
-        f"{share:.1%} of the sightings, of {counts.tracks} of {counts.of_tracks} tracks"
-    )
-    if counts.undecided_frames:
-        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to decide"
-    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
-    return replace(at_rest, provenance=provenance), share
-
-
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
     """Return the audit's findings, with the tracks tested against the noise that the settings state instead."""
     return checked_again(audited, "track-scatter", used)
 
 
-def _stated_track_noise(requested: Noise) -> TrackNoise:
-    """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
-    white, walk, offset = requested.track_white_px, requested.track_walk_px, requested.track_offset_px
-    return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
-
-
-def _with_contradiction(whole: Sequence, used: Sequence) -> Sequence:
-    """Return the whole recording, with a fact where the tracks that are used contradict the stated noise."""
-    assert used.rig.track_noise is not None
-    contradiction = contradicted(used.rig.track_noise, used)
-    if contradiction is None:
-        return whole
-    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, contradiction)))
-
-
-def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> tuple[Sequence, Card]:
-    """Return the whole recording with the noise of the tracks that are used, or of their first seconds, and their card.
-
-    Where they turn out white the noise stays the recording's own. Raises DataError where it cannot be fitted.
-    """
-    used = used if fit_s is None else _first_seconds(used, fit_s)
-    if fit_s is not None and used.frame_count < 2:
-        raise DataError(f"{used.name}: no two frames are in its first {fit_s:g} s; give noise.track_fit_s more")
-    check_runnable(used)
-    try:
-        fitted = fit_track_noise(used)
-    except DataError as error:
-        raise DataError(f"{error}; state it with noise.tracks=correlated, or leave it white") from error
-    basis = "all that is used of the recording, so that causal answers use it too early"
-    if fit_s is not None:
-        basis = f"the first {fit_s:g} s, which causal answers of that time use too early"
-    fact = f"noise of tracks, fitted to {basis}: {summary_of(fitted, whole.rig.cov_uv_px2)}"
-    provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
-    rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
-    return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)
-
-
 def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:
     """Return the whole recording and the card of the tracks that are used, or a fact that says why there is none."""
     try:
-        return whole, card_of(used, fit_track_noise(used))
+        return whole, card_of(used)
     except DataError as error:
         fact = f"no card of its tracks: {str(error).removeprefix(f'{used.name}: ')}"
     return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, fact))), None

@@ -142,10 +142,15 @@ class Vision:
         return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
 
     @property
-    def H_pose(self) -> Array:  # noqa: N802 - the mathematics' own name
+    def H_pose(self) -> Array:
         """The whitened Jacobians (N, 3, 6) to the pose of each sighting."""
         whitener = left_only.whitener(self.sightings.uv_px, self.camera.rig)
         return np.asarray(whitener @ left_only.seen_rows(self.sightings.uv_px, self._predicted.d_uv_d_pose))
+
+    @property
+    def residual_px(self) -> Array:
+        """Measured less predicted (N, 3) px, zero where uR is missing."""
+        return left_only.residuals_px(self.sightings.uv_px, self._predicted.uv_px)
 
     @cached_property
     def whitened(self) -> Array:

@@ -2,7 +2,7 @@
 
 GTSAM calls each Python factor separately: a thousand twist factors then take as long as the thirty thousand stereo
 factors of the same graph. Residuals, noise and derivatives here are those of the factors one by one
-(:func:`~toolkit.models.twist.twist_factor`, :func:`~toolkit.models.gap_bridge.kept_twist`), on arrays.
+(:func:`~toolkit.models.twist.twist_factor`), on arrays.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +14,6 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian
 from toolkit.models.factors import B, X, linear_factor
-from toolkit.models.gap_bridge import KeptTwist
 from toolkit.models.motion import Increment
 from toolkit.models.twist import TwistIncrement
 
@@ -49,15 +48,10 @@ def linear_factors(stack: StackedFactors, values: gtsam.Values) -> Iterator[gtsa
         yield linear_factor([(key, of[row]) for key, of in zip(keys, derivatives, strict=True)], -residuals[row])
 
 
-def stacked(increments: Mapping[int, Increment], over: Mapping[int, KeptTwist]) -> list[StackedFactors]:
-    """Return stacks of the steps and bridges whose factors are in Python, given by the index of their last state."""
+def stacked(increments: Mapping[int, Increment]) -> list[StackedFactors]:
+    """Return the stack of the steps whose factors are in Python, given by the index of their last state; or none."""
     steps = {k: increment for k, increment in increments.items() if isinstance(increment, TwistIncrement)}
-    stacks = list[StackedFactors]()
-    if steps:
-        stacks.append(StackedSteps.of(steps))
-    if over:
-        stacks.append(StackedBridges.of(over))
-    return stacks
+    return [StackedSteps.of(steps)] if steps else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,55 +104,6 @@ class StackedSteps:
         step_now = self.T_start_end @ se3_exp(correction)
         moved = se3_inverse(_poses(values, self.k - 1)) @ _poses(values, self.k)
         return step_now, se3_inverse(step_now) @ moved
-
-
-@dataclass(frozen=True, eq=False)
-class StackedBridges:
-    """N bridges: two intervals with durations (N, 2) s, which end in states ``k`` (N,), have the same twist.
-
-    ``sigmas`` (N, 6) are the standard deviations of the change.
-    """
-
-    k: IntArray
-    lasting_s: Array
-    sigmas: Array
-
-    @classmethod
-    def of(cls, bridges: Mapping[int, KeptTwist]) -> "StackedBridges":
-        """Return the bridges by the index of their last state."""
-        kept = list(bridges.values())
-        return cls(
-            np.array(list(bridges), dtype=np.int64),
-            np.array([(one.before_s, one.after_s) for one in kept]),
-            np.array([one.sigmas for one in kept]),
-        )
-
-    @property
-    def keys(self) -> Sequence[Keys]:
-        """Return the keys of the three poses, in a factor's order."""
-        return [(X(k - 2), X(k - 1), X(k)) for k in self.k.tolist()]
-
-    def residuals(self, values: gtsam.Values) -> Array:
-        """Return the whitened residuals (N, 6)."""
-        return self._change(se3_log(self._steps(values)))
-
-    def linearised(self, values: gtsam.Values) -> LinearisedStack:
-        """Return residuals and derivatives about some values."""
-        steps = self._steps(values)
-        logs = se3_log(steps)
-        ends = np.linalg.inv(se3_right_jacobian(logs)) / self.lasting_s[..., None, None] / self.sigmas[:, None, :, None]
-        starts = -ends @ se3_adjoint(se3_inverse(steps))
-        by_poses = (-starts[:, 0], starts[:, 1] - ends[:, 0], ends[:, 1])
-        return LinearisedStack(self._change(logs), by_poses)
-
-    def _steps(self, values: gtsam.Values) -> Array:
-        """Return the motions (N, 2, 4, 4) over the two intervals."""
-        poses = np.stack([_poses(values, self.k - before) for before in (2, 1, 0)], axis=1)
-        return np.asarray(se3_inverse(poses[:, :2]) @ poses[:, 1:])
-
-    def _change(self, logs: Array) -> Array:
-        twists = logs / self.lasting_s[..., None]
-        return np.asarray((twists[:, 1] - twists[:, 0]) / self.sigmas)
 
 
 def _whitened(whitening: Array, residuals: Array) -> Array:

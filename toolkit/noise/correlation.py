@@ -114,8 +114,9 @@ def _neighbours(frame: IntArray, uv_px: Array, freed: Array, count: int) -> tupl
     one, other = KDTree(places).query_pairs(_RADII_PX[-1], output_type="ndarray").T
     ring = np.searchsorted(_RADII_PX[:-1], np.linalg.norm(places[one] - places[other], axis=1))
     cell, cells = frame[one] * _RINGS + ring, count * _RINGS
-    products = np.bincount(cell, (freed[one] * freed[other]).sum(axis=1), cells)
-    return products.reshape(count, _RINGS), 3.0 * np.bincount(cell, minlength=cells).reshape(count, _RINGS)
+    values = (freed[one] * freed[other]).sum(axis=1), np.full(cell.size, 3.0)
+    products, numbers = (np.asarray(np.bincount(cell, each, cells), dtype=float) for each in values)
+    return products.reshape(count, _RINGS), numbers.reshape(count, _RINGS)
 
 
 def _freed_of_poses(frame: IntArray, whitened: Array, H_pose: Array, count: int) -> Array:

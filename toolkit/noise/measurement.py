@@ -1,7 +1,8 @@
 """Measures the noise of a recording on stretches of it, and keeps what was measured under the recording's hash."""
 
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
 import msgspec
@@ -28,8 +29,8 @@ _FEWEST_FRAMES = 2 * FEWEST_SIGHTINGS
 class MeasuredNoise:
     """What was measured on a recording; ``why_not`` says why nothing was, and both are then as stated."""
 
-    tracks: TrackWeight = TrackWeight()
-    motion: MotionScale = MotionScale()
+    tracks: TrackWeight = field(default_factory=TrackWeight)
+    motion: MotionScale = field(default_factory=MotionScale)
     why_not: str = ""
 
 
@@ -56,7 +57,11 @@ def _measured(sequence: Sequence) -> MeasuredNoise:
         return MeasuredNoise(why_not=f"{sequence.frame_count} frames are too few")
     if not len(sequence.visible):
         return MeasuredNoise(why_not="there are no tracks")
-    at_hand = [(stretch, adjusted) for stretch in stretches(sequence) if (adjusted := _vision_alone(stretch, sequence))]
+    noise = sequence.noise.scaled(_LOOSE)
+    at_hand = [
+        (stretch, stretch.adjusted_again(adjusted, sequence.rig, noise))
+        for stretch, adjusted in adjusted_stretches(sequence)
+    ]
     if not at_hand:
         return MeasuredNoise(why_not="the tracks do not determine the motion in any part of it")
     weight = track_weight((one.residuals(FEWEST_SIGHTINGS), stretch.used) for stretch, one in at_hand)
@@ -73,10 +78,8 @@ def _measured(sequence: Sequence) -> MeasuredNoise:
     return MeasuredNoise(weight, motion_scale(fit))
 
 
-def _vision_alone(stretch: Stretch, sequence: Sequence) -> Adjusted | None:
-    """Return a stretch adjusted with hardly any weight of the motion samples, or None where that has no solution."""
-    noise = sequence.noise.scaled(_LOOSE)
-    try:
-        return stretch.adjusted_again(stretch.adjusted(sequence.rig, noise), sequence.rig, noise)
-    except EstimatorError:
-        return None
+def adjusted_stretches(sequence: Sequence) -> Iterator[tuple[Stretch, Adjusted]]:
+    """Yield stretches of a recording, adjusted with hardly any weight of the motion samples, where that is solvable."""
+    for stretch in stretches(sequence):
+        with suppress(EstimatorError):
+            yield stretch, stretch.adjusted(sequence.rig, sequence.noise.scaled(_LOOSE))

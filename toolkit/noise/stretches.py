@@ -21,7 +21,7 @@ from toolkit.models import left_only
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model, state_keys
-from toolkit.models.reduced_vision import RobustCamera, Sightings
+from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
 from toolkit.models.state import Belief
 from toolkit.models.stereo_window import Evaluated, SmartWindow, TrackedWindow
 from toolkit.models.window_solver import solve_window
@@ -169,18 +169,25 @@ class Adjusted:
     def _evaluated(self) -> Evaluated:
         return Evaluated.of(self.window, self.camera)
 
+    @property
+    def vision(self) -> Vision:
+        """The sightings evaluated at the minimum."""
+        return self._evaluated.vision
+
     def by_sound_sightings(self) -> SmartWindow:
         """Return the window with the sightings that are plausible by the stated noise, and the points they see."""
-        vision, seen = self._evaluated.vision, self.window.sightings
+        vision, seen = self.vision, self.window.sightings
         bound = chi2_bound(left_only.degrees_of_freedom(seen.uv_px), SOUND)
         sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.seen.in_front
         kept = Sightings(seen.pose[sound], seen.point[sound], seen.uv_px[sound])
-        return TrackedWindow(replace(self.window, sightings=kept), np.arange(len(self.window.points))).compacted().window
+        return (
+            TrackedWindow(replace(self.window, sightings=kept), np.arange(len(self.window.points))).compacted().window
+        )
 
     def residuals(self, fewest_sightings: int) -> SoundResiduals:
         """Return the residuals of the plausible sightings of tracks with so many or more of them."""
         sound = replace(self, window=self.by_sound_sightings())
-        vision, seen = sound._evaluated.vision, sound.window.sightings
+        vision, seen = sound.vision, sound.window.sightings
         often = np.bincount(seen.point, minlength=len(sound.window.points))[seen.point] >= fewest_sightings
         H_pose = vision.H_pose
         return SoundResiduals(
@@ -201,7 +208,7 @@ class Adjusted:
                 row[:, np.concatenate(own)] = jacobian
                 rows.append(row)
                 right.append(offset)
+        squares = np.square(np.concatenate(right))
         half = solve_triangular(self._evaluated.linearised().root, np.concatenate(rows).T, lower=True)
-        cov = np.eye(half.shape[1]) - half.T @ half
-        squares = np.square(np.concatenate(right)).sum()
-        return MotionFit(float(squares), float(np.trace(cov)), float(np.square(cov).sum()))
+        cov = np.eye(len(squares)) - half.T @ half
+        return MotionFit(float(squares.sum()), float(np.trace(cov)), float(np.square(cov).sum()))

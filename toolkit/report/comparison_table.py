@@ -7,12 +7,15 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
+from toolkit.noise import MotionScale, TrackWeight
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import MISSING, Table, cell, heading, number
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Window, outlier_summary
+from toolkit.settings import Window, outlier_summary
 
 # The metric whose mean over seeds is compared with its band, in a column after that of the mean.
 _BANDED = "nees_pose_mean"
@@ -173,6 +176,8 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
     if shared:
         yield f"scored: {shared}"
     yield rules_line(comparison)
+    if len(comparison.sequence.observations):
+        yield noise_line(comparison)
     warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
     if warnings:
         yield f"read every result, whatever its status, with the findings of the audit: {', '.join(warnings)}"
@@ -189,25 +194,46 @@ def rules_line(comparison: Comparison) -> str:
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outlier_summary(settings.outliers)}"
-        f"{_track_noise(settings.noise)}{_optional_parts(settings.noise)}"
+        f"{'' if settings.noise.bridge_gaps else '; gaps between tracks not bridged'}"
     )
 
 
-def _track_noise(noise: Noise) -> str:
-    """Say which model of track errors is used, where it is not white noise."""
-    if noise.tracks == "white":
-        return ""
-    if noise.tracks == "correlated":
-        return "; noise of tracks: correlated, as stated"
-    basis = "the whole recording" if noise.track_fit_s is None else f"the first {noise.track_fit_s:g} s"
-    return f"; noise of tracks: fitted to {basis}, which causal answers use too early"
+_MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
 
 
-def _optional_parts(noise: Noise) -> str:
-    """Say which optional parts of the noise model are used, where this differs from the default."""
-    sigma = noise.disparity_scale
-    scale = "" if sigma is None else f"; disparities scaled by 0 +- {100.0 * sigma:g} %, a state"
-    return f"{scale}{'' if noise.bridge_gaps else '; gaps between tracks not bridged'}"
+def noise_line(comparison: Comparison) -> str:
+    """Return the noise that every estimator assumed: of sightings and motion, as stated or as measured."""
+    rig, settings, measured = comparison.sequence.rig, comparison.settings.noise, comparison.measured
+    tracks, motion = (
+        ("", "") if measured is None else (_tracks_measured(measured.tracks), _scale_measured(measured.motion))
+    )
+    if settings.track_weight != "auto":
+        tracks = f"tracks count {rig.track_weight:.2g}, as set"
+    if settings.motion_scale != "auto":
+        motion = f"{settings.motion_scale:.3g} times as noisy as stated, as set"
+    line = (
+        f"noise: sightings {float(np.sqrt(rig.cov_uv_px2[0, 0])):.2g} px, {tracks}; "
+        f"{_MOTION_NOISE[comparison.sequence.motion_kind]} {motion}"
+    )
+    if measured is None:
+        return line
+    if measured.why_not:
+        return f"{line} (not measured: {measured.why_not})"
+    basis = "whole recording" if settings.measured_s is None else f"first {settings.measured_s:g} s"
+    return f"{line}; measured on the {basis}"
+
+
+def _tracks_measured(weight: TrackWeight) -> str:
+    if not weight.correlation:
+        return "white along tracks"
+    along = f"errors along tracks correlated, {weight.correlation:.2f} from frame to frame"
+    if weight.value == 1.0:
+        return f"tracks count in full ({along}, but smaller than stated)"
+    return f"tracks count {weight.value:.2g} +- {weight.error:.1g} ({along})"
+
+
+def _scale_measured(scale: MotionScale) -> str:
+    return "as stated" if scale.value == 1.0 else f"{scale.value:.2g} +- {scale.error:.1g} times as noisy as stated"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:

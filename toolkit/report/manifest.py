@@ -21,6 +21,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
+from toolkit.noise import MeasuredNoise
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
 from toolkit.threads import THREAD_VARIABLES
@@ -58,6 +59,10 @@ class Manifest(Struct, frozen=True, kw_only=True):
     git_revision: Annotated[str | None, Meta(description="-dirty where edited; null outside a checkout")]
     sequence: RecordingRecord
     start: Annotated[str, Meta(description="where every run started")]
+    noise: (
+        Annotated[MeasuredNoise, Meta(description="that was measured on the recording; absent where it is set")]
+        | UnsetType
+    ) = UNSET
     estimators: Annotated[tuple[str, ...], Meta(description="that ran here")]
     references: (
         Annotated[tuple[str, ...], Meta(description="that were read from files; not over seeds")] | UnsetType
@@ -97,6 +102,7 @@ def manifest_document(comparison: Comparison, command: str, requested: Configura
         git_revision=_git_revision(),
         sequence=_recording(comparison.sequence),
         start=comparison.prior.source,
+        noise=UNSET if comparison.measured is None else comparison.measured,
         estimators=here,
         references=tuple(name for name in comparison.estimators if name not in here),
         seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),

@@ -76,22 +76,11 @@ def outcome(finding: Finding) -> str:
     return "warning" if finding.warning else "for information"
 
 
-_PARTS = {
-    "disparity_scale": "a scale of the disparities",
-    "bridge_gaps": "a bridge where no track leads on",
-    "match_tracks": "a smaller weight for tracks whose errors are correlated",
-}
-
-
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
     """Yield what must be known before a table is believed: how runs ended, remarks on errors, what is missing."""
     if not len(comparison.sequence.observations):
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
-    for name, why in comparison.white.items():
-        yield f"{name} assumes white noise of tracks: {why}"
-    for part, names in comparison.lacking.items():
-        yield f"{', '.join(names)}: without {_PARTS[part]} (noise.{part})"
     yield from _marks(comparison)
     yield from _refusals(comparison)
     yield from _harm_by_vision(comparison)

@@ -14,7 +14,7 @@ from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import card_record
-from toolkit.report.comparison_table import header_lines, sequence_line
+from toolkit.report.comparison_table import header_lines, noise_line, sequence_line
 from toolkit.report.curves import (
     ErrorCurves,
     Errors,
@@ -123,7 +123,7 @@ def _same_line(row: Row, other: Row) -> bool:
 
 def _messages(comparison: Comparison) -> Messages:
     return Messages(
-        sequence=sequence_line(comparison.sequence),
+        sequence=f"{sequence_line(comparison.sequence)}; {noise_line(comparison)}",
         notes=tuple(note_lines(comparison)),
         remarks=tuple(remark_lines(comparison)),
         start=comparison.prior.source,

@@ -20,6 +20,18 @@ from toolkit.files.reading import read_text_input
 from toolkit.settings.records import POLICIES, Settings, SettingsError
 
 _POLICY = "outliers.policy"
+_MEASURED = "the noise of tracks is measured once for all estimators; noise.track_weight sets it"
+# Keys of earlier versions, and what is to be used now.
+_GONE = {
+    **dict.fromkeys(
+        [f"noise.{key}" for key in ("tracks", "track_white_px", "track_walk_px", "track_offset_px", "match_tracks")],
+        _MEASURED,
+    ),
+    "noise.match_imu": "the IMU's noise is measured once for all estimators; noise.motion_scale sets it",
+    "noise.track_fit_s": "noise.measured_s is the length of the beginning on which noise is measured",
+    "noise.disparity_scale": "no estimator has such a state any more; the audit's vision-scale reports a scale",
+    "tracks.leave_out_moving": "no tracks are left out any more; the outlier policy weighs them",
+}
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -129,7 +141,10 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
                     f"{place}: {key!r} is one key here; write {{{section!r}: {{{name!r}: ...}}}}, or in TOML {key} "
                     "without quotes"
                 )
-            raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
+            now = _GONE.get(f"{prefix}{key}")
+            raise SettingsError(
+                f"{place}: there is no setting {prefix}{key}{f': {now}' if now else did_you_mean(prefix + key, known)}"
+            )
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
 

@@ -176,9 +176,9 @@ def nis_of(S: Array, n: int, residual: Array) -> float:
 def constraint_rows(where: IntArray, J: Array, V: Array, tau: Array, H: Array, first: int) -> None:
     """Write all but the first three rows of ``Q^T J`` to H (., 6 W), from row ``first`` on.
 
-    J (3 m, 6) are Jacobians to the poses ``where`` (m,), which give the columns of H; a row depends on its own pose. The
-    product of three reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T. Its diagonal has their factors;
-    above it ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989). Q itself is not formed.
+    J (3 m, 6) are Jacobians to the poses ``where`` (m,), which give the columns of H; a row depends on its own pose.
+    The product of three reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T. Its diagonal has their
+    factors; above it ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989). Q itself is not formed.
     """
     n, T, reached = 3 * where.size, np.zeros((3, 3)), np.zeros((3, 6 * where.size))
     for k in range(3):

@@ -3,7 +3,7 @@
 Three sightings of a track give two one-step residuals about the camera's own motion. If the errors of sightings are
 independent, the error of the second sighting is in both residuals with opposite signs, and their correlation is -1/2.
 If the errors are a random walk, the residuals are independent and the correlation is 0. A wrong disparity gives a wrong
-depth and residuals of the same sign. Estimators assume white noise unless a setting or the recording says otherwise.
+depth and residuals of the same sign.
 """
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
@@ -13,8 +13,7 @@ from toolkit.audit.parts.one_step import CORRELATION_SIGMAS, MOST_CORRELATION
 
 def check(evidence: Evidence) -> Symptom | None:
     """Report the correlation of neighbouring one-step residuals where it is not that of independent errors."""
-    sequence = evidence.sequence
-    if evidence.spoilt_by or sequence.rig.track_noise is not None:
+    if evidence.spoilt_by:
         return None
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
@@ -28,15 +27,15 @@ def check(evidence: Evidence) -> Symptom | None:
         count=1,
         detail=(
             f"the errors of a track's sightings are correlated: from one step to the next by {value:+.2f} "
-            f"+- {error:.2f}, where independent errors have -0.5; to assume white noise is overconfident"
+            f"+- {error:.2f}, where independent errors have -0.5"
         ),
-        treatment="'vislam card' shows the correlation, noise.tracks=fitted models it",
+        treatment="measured, so that tracks count for less (noise.track_weight); 'vislam card' shows the correlation",
     )
 
 
 FAULT = Fault(
     "correlated-tracks",
-    "tracks whose sightings have correlated errors, where estimators assume independent ones unless set otherwise",
+    "tracks whose sightings have correlated errors",
     check,
     after=("track-scatter",),
 )

@@ -1,0 +1,163 @@
+"""The card of a recording: statistics of its tracks, and the scale of vision over the measured motion, without truth.
+
+Residuals are those of the adjusted stretches on which the noise is measured, of all sightings, outliers too.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.arrays import rows_of
+from toolkit.audit.parts.intervals import interval_means
+from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, slope
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measured_motion import TwistSamples
+from toolkit.models.camera_motion import camera_motion, neighbours
+from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.stereo import CHANNELS, disparity_px
+from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight
+from toolkit.noise.measurement import adjusted_stretches, measured_noise
+from toolkit.noise.stretches import Adjusted
+from toolkit.sequence import Sequence, check_runnable, is_left_only
+
+# Sightings between which residuals are compared, at most.
+LAGS = 8
+# A residual beyond this many robust standard deviations is in the tails; a track with this many times the usual
+# residual contradicts the motion.
+_TAIL, _ODDS = 4.0, 4.0
+# A lag with fewer pairs has no statistic; with fewer residuals there is no card.
+_FEWEST_PAIRS, _FEWEST_RESIDUALS = 30, 300
+# Intervals with fewer common tracks are not used for the scale; a scale from fewer intervals, or with a larger standard
+# error, is not given.
+_FEWEST_COMMON, _FEWEST_INTERVALS, _SCALE_ERROR = 8, 30, 0.05
+QUANTILES = (0.1, 0.5, 0.9)
+
+
+@dataclass(frozen=True, eq=False)
+class Card:
+    """Statistics of the visible tracks of a recording.
+
+    ``tracks`` is the number of those in the adjusted stretches; ``a_frame`` their sightings in a frame; ``seen_frames``
+    and ``depth_m`` (3,) are the 10, 50 and 90 % quantiles of sightings a track and of depth; ``blind_intervals`` is the
+    number of intervals without a common track, of ``intervals``. ``weight`` is that of the tracks. ``correlation``
+    (L, 3) is the autocorrelation of residuals along a track at lags of 1 to L frames, by mean column, disparity and
+    row; ``left_right`` that of residuals in uL and uR; ``tails`` the share of residuals beyond four robust sigmas,
+    ``at_odds`` the share of tracks whose residuals are four times the usual and more. ``scale`` is vision's translation
+    over the measured one, None where that is not known.
+    """
+
+    tracks: int
+    a_frame: float
+    seen_frames: Array
+    depth_m: Array
+    intervals: int
+    blind_intervals: int
+    weight: TrackWeight
+    correlation: Array
+    left_right: float
+    tails: float
+    at_odds: float
+    scale: Scalar | None
+
+    @property
+    def correlated(self) -> bool:
+        """Say whether the errors of a track are correlated."""
+        return self.weight.correlation > 0.0
+
+
+def card_of(sequence: Sequence) -> Card:
+    """Return the card of a sequence; raises DataError where it cannot be run or its tracks are too few."""
+    check_runnable(sequence)
+    seen, rig = sequence.visible, sequence.rig
+    here = _Residuals(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    for _, adjusted in adjusted_stretches(sequence):
+        more = _Residuals.of(adjusted, int(here.track.max(initial=-1)) + 1)
+        here = _Residuals(*(np.concatenate(pair) for pair in zip(here, more, strict=True)))
+    if here.px.size < _FEWEST_RESIDUALS:
+        raise DataError(
+            f"{sequence.name}: the tracks seen {FEWEST_SIGHTINGS} times and more are too few to say what they are like"
+        )
+    spread_px = np.maximum(MAD_TO_SIGMA * np.median(np.abs(here.px), axis=0), 1e-9)
+    size = np.sqrt(_mean_of_each(here.track, np.square(here.px / spread_px).mean(axis=1)))
+    sound = size < _ODDS * np.median(size)
+    common = np.bincount(neighbours(seen).interval, minlength=max(sequence.frame_count - 1, 0))
+    disparity = disparity_px(seen.uv_px)
+    depth_m = rig.fx_px * rig.baseline_m / disparity[disparity > LEAST_DISPARITY_PX]
+    of_sound = _Residuals(*(values[sound[here.track]] for values in here))
+    return Card(
+        tracks=size.size,
+        a_frame=len(seen) / sequence.frame_count,
+        seen_frames=np.quantile(np.unique(seen.track_id, return_counts=True)[1], QUANTILES),
+        depth_m=np.quantile(depth_m, QUANTILES),
+        intervals=common.size,
+        blind_intervals=int((common == 0).sum()),
+        weight=measured_noise(sequence).tracks,
+        correlation=np.stack([_correlation(of_sound, lag) for lag in range(1, LAGS + 1)]),
+        left_right=_left_right(of_sound.px),
+        tails=float((np.abs(here.px) > _TAIL * spread_px).mean()),
+        at_odds=1.0 - float(sound.mean()),
+        scale=_scale(sequence, common >= _FEWEST_COMMON),
+    )
+
+
+class _Residuals(NamedTuple):
+    """N residuals (N, 3) px in mean column, disparity and row, of tracks (N,) in frames (N,)."""
+
+    track: IntArray
+    frame: IntArray
+    px: Array
+
+    @classmethod
+    def of(cls, adjusted: Adjusted, begin: int) -> "_Residuals":
+        """Return those of a stretch, by both images, of tracks seen often enough, numbered from ``begin`` on."""
+        vision, seen = adjusted.vision, adjusted.window.sightings
+        both = vision.seen.in_front & ~is_left_only(seen.uv_px)
+        often = (
+            both
+            & (np.bincount(seen.point[both], minlength=len(adjusted.window.points)) >= FEWEST_SIGHTINGS)[seen.point]
+        )
+        _, track = np.unique(seen.point[often], return_inverse=True)
+        return cls(begin + track, seen.pose[often], vision.residual_px[often] @ CHANNELS.T)
+
+
+def _mean_of_each(track: IntArray, values: Array) -> Array:
+    return np.asarray(np.bincount(track, values) / np.bincount(track))
+
+
+def _correlation(here: _Residuals, lag: int) -> Array:
+    """Return the autocorrelation (3,) of residuals along a track, NaN where too few are seen that long."""
+    key = here.track * (here.frame.max(initial=0) + lag + 1) + here.frame
+    order = np.argsort(key)
+    then, found = rows_of(key + lag, key[order])
+    first, second = here.px[found], here.px[order[then[found]]]
+    if len(first) < _FEWEST_PAIRS:
+        return np.full(3, np.nan)
+    return np.asarray((first * second).mean(axis=0) / np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0)))
+
+
+def _left_right(px: Array) -> float:
+    left_px, right_px = px[:, 0] + 0.5 * px[:, 1], px[:, 0] - 0.5 * px[:, 1]
+    return float((left_px * right_px).mean() / np.sqrt((left_px**2).mean() * (right_px**2).mean()))
+
+
+def _scale(sequence: Sequence, known: BoolArray) -> Scalar | None:
+    """Return the ratio of vision's velocities to the measured ones, with neighbouring intervals as instruments."""
+    motion = sequence.motion
+    if not isinstance(motion, TwistSamples):
+        return None
+    moved = camera_motion(replace(sequence, observations=sequence.visible, track_budget=None))
+    known = known & moved.known
+    R_imu_cam, arm = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
+    w_radps = moved.w_radps @ R_imu_cam.T
+    seen_mps = moved.v_mps @ R_imu_cam.T - np.cross(w_radps, arm)
+    measured_mps = interval_means(motion.t_ns, motion.values, sequence.frames_t_ns)[:, :3]
+    middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:])
+    if middle.size < _FEWEST_INTERVALS:
+        return None
+    around_mps = 0.5 * (seen_mps[middle - 1] + seen_mps[middle + 1])
+    # Only along the axis of most motion: across it there is only noise, which is correlated in neighbouring intervals.
+    along = np.linalg.eigh(around_mps.T @ around_mps)[1][:, -1:]
+    scale = slope(around_mps @ along, measured_mps[middle] @ along, seen_mps[middle] @ along)
+    return scale if scale.error < _SCALE_ERROR else None
