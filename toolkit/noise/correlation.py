@@ -68,11 +68,11 @@ def track_weight(parts: Iterable[tuple[SoundResiduals, float]]) -> TrackWeight:
 
 
 def _weight_of(sums: Array) -> TrackWeight:
-    products, squares, pairs, all_squares, numbers, *rings = sums.sum(axis=0)
+    products, squares, pairs, all_squares, numbers, *rings = sums.sum(axis=0).tolist()
     if not pairs:
         return TrackWeight()
-    rho, variance = min(products / max(squares, np.finfo(float).tiny), _MOST_CORRELATED), squares / pairs
-    if rho < _STANDARD_ERRORS / np.sqrt(pairs):
+    rho, variance = min(products / max(squares, 1e-300), _MOST_CORRELATED), squares / pairs
+    if rho < _STANDARD_ERRORS / float(np.sqrt(pairs)):
         return TrackWeight(variance=variance, pairs=int(pairs) // 3)
     repeated = (1.0 + rho**2) / (1.0 - rho**2)
     together = 2.0 * np.cumsum(rings[:_RINGS]) / all_squares
@@ -80,7 +80,7 @@ def _weight_of(sums: Array) -> TrackWeight:
     neighbours = 1.0 + float(np.max(together, where=together > _NEIGHBOUR_ERRORS * by_chance, initial=0.0))
     along = variance * (1.0 + rho) / (1.0 - rho)
     value = 1.0 if along <= 1.0 else 1.0 / (along * neighbours)
-    return TrackWeight(value, 0.0, rho, variance, neighbours, int(pairs) // 3)
+    return TrackWeight(value, 0.0, float(rho), variance, neighbours, int(pairs) // 3)
 
 
 def _sums_by_frame(residuals: SoundResiduals, used: float) -> Array:

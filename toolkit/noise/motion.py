@@ -45,7 +45,7 @@ def motion_scale(fit: Callable[[float], MotionFit]) -> MotionScale:
     for _ in range(_MOST_STEPS):
         step = float(np.clip(1.0 + (squares - expected) / spread, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
         variance = float(np.clip(variance * step, 1.0, _MOST**2))
-        squares, expected, spread = fit(float(np.sqrt(variance)))
+        squares, expected, spread = fit(variance**0.5)
         if abs(squares - expected) < _SMALL * np.sqrt(2.0 * spread):
             break
     error = variance * float(np.sqrt(2.0 / spread))
