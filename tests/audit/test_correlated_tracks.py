@@ -7,10 +7,10 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
+from toolkit.models.stereo import CHANNELS
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, simulate, track_faults
 from toolkit.simulation.sensors import with_track_noise
-from toolkit.models.stereo import CHANNELS
 from toolkit.simulation.track_noise import TrackNoise
 
 

@@ -22,10 +22,9 @@ from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.models.stereo import predict, project, triangulate_world
+from toolkit.models.stereo import CHANNELS, predict, project, triangulate_world
 from toolkit.sequence import Observations, Sequence, StereoFrame, StereoRig
 from toolkit.simulation import Scenario, simulate
-from toolkit.models.stereo import CHANNELS
 from toolkit.simulation.track_noise import TrackNoise
 
 SEED = 11

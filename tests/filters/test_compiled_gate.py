@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from filters.kalman.residual_correlation import ResidualCorrelation
 
 from filters.kalman import compiled as compiled_parts
 from filters.kalman import multiview, track_gate, tracks_in_view
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_gate import WindowPoses
 from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow
 from filters.kalman.triangulation import nearest_view

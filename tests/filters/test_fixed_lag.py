@@ -6,10 +6,10 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from filters.smoothing.chained_window import ChainedWindow
 
 from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
-from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphExtension
 from toolkit.estimate import Estimate

@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from filters.smoothing.discounted_tracks import DiscountedTracks
 
 from filters import isam2
 from filters.isam2 import Isam2
@@ -18,7 +19,6 @@ from filters.smoothing.cached_linearisation import (
     python_factors,
     with_linearisations,
 )
-from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.frozen_variables import FrozenVariables
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, QR_FRAMES, Isam2Tree
 from filters.smoothing.landmark_steps import FirstImages

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from filters.kalman.track_error_states import TrackErrorBelief, implausible_errors
 
 from filters import iekf
 from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.track_error_states import TrackErrorBelief, implausible_errors
 from toolkit.geometry import Array, transform
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model

@@ -5,13 +5,13 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from filters.smoothing.robust_loss import Squares
+from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 
 from filters.smoothing import levenberg_marquardt
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph
-from filters.smoothing.robust_loss import Squares
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 from toolkit.geometry import Array, se3_exp, transform
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X

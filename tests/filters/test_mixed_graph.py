@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from toolkit.models.gap_bridge import KeptTwist, bridged
 
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph
@@ -12,7 +13,6 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.measured_motion import TwistChangeNoise
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.gap_bridge import KeptTwist, bridged
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, stacked
 from toolkit.models.stereo import triangulate_world

@@ -6,17 +6,17 @@ import gtsam
 import gtsam_unstable
 import numpy as np
 import pytest
+from filters.smoothing.robust_loss import Squares
+from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 
 from filters.smart import Smart
-from filters.smoothing.robust_loss import Squares
-from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
-from toolkit.models.window_solver import solve_window
-from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
+from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow
+from toolkit.models.window_solver import solve_window
 from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
 from toolkit.settings import DEFAULTS

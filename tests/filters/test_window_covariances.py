@@ -5,19 +5,19 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from filters.smoothing.discounted_tracks import DiscountedTracks
 
 from filters import smart
 from filters.fixed_lag import FixedLag
 from filters.smart import Smart
-from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
-from toolkit.models.reduced_vision import Sightings
-from toolkit.models.window_solver import SolvedWindow, without_oldest
-from toolkit.models.stereo_window import MarginalPrior, SmartWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.models.motion import motion_model, state_cov, state_keys
+from toolkit.models.reduced_vision import Sightings
+from toolkit.models.stereo_window import MarginalPrior, SmartWindow
+from toolkit.models.window_solver import SolvedWindow, without_oldest
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate

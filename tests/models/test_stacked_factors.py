@@ -5,11 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from toolkit.models.gap_bridge import KeptTwist, bridged
 
 from toolkit.geometry import se3_exp
 from toolkit.measured_motion import TwistChangeNoise, TwistMotion, TwistNoise
 from toolkit.models.factors import B, X
-from toolkit.models.gap_bridge import KeptTwist, bridged
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, linear_factors, stacked
 from toolkit.models.twist import TwistIncrement, TwistModel, twist_factor

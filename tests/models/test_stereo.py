@@ -21,11 +21,10 @@ from toolkit.initialization import start_from_measurements
 from toolkit.models import stereo
 from toolkit.models.camera_motion import triangulation_jacobian
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.stereo import d_uv_d_scale, scaled_rig
+from toolkit.models.stereo import CHANNELS, d_uv_d_scale, scaled_rig
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.simulation.track_faults import disparity_scale
-from toolkit.models.stereo import CHANNELS
 
 # Pixels are of the order of 1e3 and Jacobian entries of 1e4 (px / rad at 40 m): 1e-9 of the largest entry of a
 # sighting is a thousand times what double precision costs and a millionth of what any modelling slip would show.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toolkit.track_errors import Fit, card_of, fit_track_noise
 
 from toolkit.cli import main
 from toolkit.errors import DataError
@@ -21,7 +22,6 @@ from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.sequence import Sequence
 from toolkit.settings import settings_of
 from toolkit.simulation.track_faults import disparity_scale, persistent_mismatch
-from toolkit.track_errors import Fit, card_of, fit_track_noise
 
 
 def test_errors_that_walk_are_correlated_and_drift_apart_as_fitted(walking: Sequence, walking_fit: Fit) -> None:

@@ -9,11 +9,10 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, so3_exp
-from toolkit.models.stereo import triangulate
+from toolkit.models.stereo import CHANNELS, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.simulation import SCENARIOS, faults, simulate, track_faults
-from toolkit.models.stereo import CHANNELS
 
 INJECTORS = {
     name: function

@@ -8,10 +8,9 @@ import pytest
 
 from toolkit.datasets import simulated
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.models.stereo import disparity_px
+from toolkit.models.stereo import CHANNELS, disparity_px
 from toolkit.sequence import check_runnable
 from toolkit.simulation import DRIVE, DRIVE_IMU, DRIVE_REALISTIC, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
-from toolkit.models.stereo import CHANNELS
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 
