@@ -60,13 +60,15 @@ class LandmarkMap:
 def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Return N landmarks triangulated from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
 
-    The covariance is that of the measurements (N, 3) px, propagated through the triangulation.
+    The covariance is that of the measurements (N, 3) px by the rig's weight of tracks, propagated through the
+    triangulation.
     """
     points_cam = stereo.triangulate(uvs_px, rig)
     T_world_cam = T_world_imu @ rig.T_imu_cam
     d_point_d_uv = T_world_cam[:3, :3] @ np.linalg.inv(stereo.projection_jacobian(points_cam, rig))
     points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-    return points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2)
+    cov_px2 = rig.cov_uv_px2 / rig.track_weight
+    return points, d_point_d_uv @ cov_px2 @ np.swapaxes(d_point_d_uv, 1, 2)
 
 
 def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
