@@ -112,7 +112,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         whole = _with_pixel_noise(audited.sequence, recording.noise.pixel_sigma_px)
         if whole is not audited.sequence:
             audited = _audited_with_its_noise(audited, _cut(whole, recording))
-        whole, measured = _with_measured_noise(whole, recording.noise)
+        whole, measured = _with_measured_noise(whole, recording)
         card = None
         if recording.card:
             whole, card = _with_card(whole, _cut(whole, recording))
@@ -254,14 +254,17 @@ def _with_pixel_noise(sequence: Sequence, sigma_px: float | None) -> Sequence:
     return replace(sequence, rig=replace(rig, cov_uv_px2=rig.cov_uv_px2 * (sigma_px**2 / rig.cov_uv_px2[0, 0])))
 
 
-def _with_measured_noise(sequence: Sequence, requested: Noise) -> tuple[Sequence, MeasuredNoise | None]:
+def _with_measured_noise(sequence: Sequence, recording: Recording) -> tuple[Sequence, MeasuredNoise | None]:
     """Return the sequence with the weight of tracks and the motion's noise that are stated or measured on it.
 
     Raises DataError where the beginning that is to be measured has no two frames.
     """
-    weight, scale, measured = requested.track_weight, requested.motion_scale, None
+    requested, measured = recording.noise, None
+    weight, scale = requested.track_weight, requested.motion_scale
     if weight == "auto" or scale == "auto":
-        beginning = sequence if requested.measured_s is None else _first_seconds(sequence, requested.measured_s)
+        beginning = _to_audit(sequence, recording)
+        if requested.measured_s is not None:
+            beginning = _first_seconds(beginning, requested.measured_s)
         if beginning.frame_count < 2:
             raise DataError(
                 f"{sequence.name}: no two frames are in the first {requested.measured_s:g} s "

@@ -1,6 +1,6 @@
 """Measures the noise of a recording on stretches of it, and keeps what was measured under the recording's hash."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -11,10 +11,11 @@ import numpy as np
 from toolkit.errors import EstimatorError, OutputError
 from toolkit.files.writing import replaced_file
 from toolkit.frontend.cache import folder
+from toolkit.measured_motion import MotionNoise
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight, track_weight
 from toolkit.noise.motion import MotionScale, motion_scale
 from toolkit.noise.stretches import Adjusted, MotionFit, Stretch, stretches
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, StereoRig
 
 # Raised with every change of the measurement that changes what it finds.
 _MEASUREMENT = 1
@@ -57,23 +58,19 @@ def _measured(sequence: Sequence) -> MeasuredNoise:
         return MeasuredNoise(why_not=f"{sequence.frame_count} frames are too few")
     if not len(sequence.visible):
         return MeasuredNoise(why_not="there are no tracks")
-    noise = sequence.noise.scaled(_LOOSE)
-    at_hand = [
-        (stretch, stretch.adjusted_again(adjusted, sequence.rig, noise))
-        for stretch, adjusted in adjusted_stretches(sequence)
-    ]
+    at_hand = list(_adjusted_again(adjusted_stretches(sequence), sequence.rig, sequence.noise.scaled(_LOOSE)))
     if not at_hand:
         return MeasuredNoise(why_not="the tracks do not determine the motion in any part of it")
     weight = track_weight((one.residuals(FEWEST_SIGHTINGS), stretch.used) for stretch, one in at_hand)
     if sequence.motion_kind == "none":
         return MeasuredNoise(weight)
-    rig, now = replace(sequence.rig, track_weight=weight.value), dict(enumerate(at_hand))
+    rig = replace(sequence.rig, track_weight=weight.value)
 
     def fit(scale: float) -> MotionFit:
-        for i, (stretch, before) in list(now.items()):
-            with suppress(EstimatorError):
-                now[i] = stretch, stretch.adjusted_again(before, rig, sequence.noise.scaled(scale))
-        return MotionFit(*np.sum([one.motion_fit() for _, one in now.values()], axis=0).tolist())
+        now = list(_adjusted_again(at_hand, rig, sequence.noise.scaled(scale)))
+        at_hand[:] = now or at_hand
+        fits = [(0.0, 0.0, 0.0), *(one.motion_fit() for _, one in now)]
+        return MotionFit(*np.sum(fits, axis=0).tolist())
 
     return MeasuredNoise(weight, motion_scale(fit))
 
@@ -81,5 +78,13 @@ def _measured(sequence: Sequence) -> MeasuredNoise:
 def adjusted_stretches(sequence: Sequence) -> Iterator[tuple[Stretch, Adjusted]]:
     """Yield stretches of a recording, adjusted with hardly any weight of the motion samples, where that is solvable."""
     for stretch in stretches(sequence):
-        with suppress(EstimatorError):
+        with suppress(EstimatorError, np.linalg.LinAlgError):
             yield stretch, stretch.adjusted(sequence.rig, sequence.noise.scaled(_LOOSE))
+
+
+def _adjusted_again(
+    before: Iterable[tuple[Stretch, Adjusted]], rig: StereoRig, noise: MotionNoise
+) -> Iterator[tuple[Stretch, Adjusted]]:
+    for stretch, adjusted in before:
+        with suppress(EstimatorError, np.linalg.LinAlgError):
+            yield stretch, stretch.adjusted_again(adjusted, rig, noise)

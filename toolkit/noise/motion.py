@@ -39,7 +39,7 @@ def motion_scale(fit: Callable[[float], MotionFit]) -> MotionScale:
     """Return the factor by the fit of the motion samples under the stated noise times a factor."""
     squares, expected, spread = fit(1.0)
     ratio = squares / expected if expected > 0.0 else 1.0
-    if squares - expected < _STANDARD_ERRORS * np.sqrt(2.0 * spread):
+    if squares - expected <= _STANDARD_ERRORS * np.sqrt(2.0 * spread):
         return MotionScale(ratio=ratio)
     variance = 1.0
     for _ in range(_MOST_STEPS):

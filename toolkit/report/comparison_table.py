@@ -219,7 +219,7 @@ def noise_line(comparison: Comparison) -> str:
         return line
     if measured.why_not:
         return f"{line} (not measured: {measured.why_not})"
-    basis = "whole recording" if settings.measured_s is None else f"first {settings.measured_s:g} s"
+    basis = "recording" if settings.measured_s is None else f"first {settings.measured_s:g} s"
     return f"{line}; measured on the {basis}"
 
 
