@@ -143,8 +143,15 @@ def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], a
     read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
     hashes = tuple(read[seed].outcome.sequence_hash if seed in read else "" for seed in case.seeds)
     prints = tuple(read[seed].fingerprint if seed in read else "" for seed in case.seeds)
-    runs = {name: _series([by_run[name, seed] for seed in case.seeds], metrics) for name in case.estimators}
+    runs = {
+        name: _series([by_run.get((name, seed)) or _not_run(name, seed) for seed in case.seeds], metrics)
+        for name in case.estimators
+    }
     return Measured(hashes, prints, runs, absent)
+
+
+def _not_run(estimator: str, seed: int) -> TimedOutcome:
+    return TimedOutcome(Outcome(seed, estimator, "failed", log=("it was not run",)))
 
 
 def _why_absent(name: str) -> str:
