@@ -172,7 +172,7 @@ def _cases(options: argparse.Namespace) -> list[Case]:
 
     if not options.sequences:
         raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")
-    estimators = tuple(find_all(options.estimators or defaults()))
+    estimators = tuple(entry.word for entry in find_all(options.estimators or defaults()).values())
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
     cases = []
     for given in options.sequences:

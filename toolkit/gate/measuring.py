@@ -97,7 +97,12 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
     recordings = recordings_of(present, settings)
-    units = [Unit(recording, recording.seed, name, settings) for recording in recordings for name in present.estimators]
+    entries = {name: find(name) for name in present.estimators}
+    units = [
+        Unit(recording, recording.seed, name, settings, entry=entry)
+        for recording in recordings
+        for name, entry in entries.items()
+    ]
     try:
         if units:
             prepare(recordings[0])
