@@ -64,14 +64,13 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
 ) -> "Result":
     """Audit a recording, run estimators on it from the same start, and score them.
 
-    ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "ladder" for
-    every rung, "my_filter.py" for a file of your own, by default those of the command line; ``own`` further functions
-    ``build(setup)`` by name. ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, ``keep``
-    names faults that the audit reports and leaves alone. ``seeds`` repeats a simulated source over so many, from
-    ``seed`` on. ``settings`` is a record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers``
-    is the number of processes, one a processor by default; ``scheduler`` the address of a Dask cluster in their place.
-    ``resume`` is a run directory in which every run over seeds is kept as it ends, and found by the next comparison
-    that asks for it.
+    ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "mine.py" a
+    file, "ladder" every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name.
+    ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit
+    reports and leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a
+    record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes,
+    one a processor by default; ``scheduler`` the address of a Dask cluster in their place. ``resume`` is a run
+    directory in which every run over seeds is kept as it ends, and found by the next comparison of it.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
     trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
