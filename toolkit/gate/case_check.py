@@ -85,10 +85,10 @@ def check_case(
             if terms.speed:
                 collected.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
                 collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
-    if terms.speed and len(case.seeds) < FEWEST_TIMED:
-        collected.notes.append(
-            f"{case.source}: time is not checked with {len(case.seeds)} runs, {FEWEST_TIMED} are needed"
-        )
+    few = [name for name, was in before.runs.items() if _timed(was).size < FEWEST_TIMED]
+    if terms.speed and few:
+        of = f"{case.source}: the time of {', '.join(few)}"
+        collected.notes.append(f"{of} is not checked: fewer than {FEWEST_TIMED} timed runs in the baseline")
     return collected
 
 
@@ -276,7 +276,7 @@ def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
 
 def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
     """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
-    was, is_ = (np.array([x for x in series.speed if x is not None]) for series in (before, now))
+    was, is_ = _timed(before), _timed(now)
     if was.size < FEWEST_TIMED:
         return
     lost = sum(old is not None and new is None for old, new in zip(before.speed, now.speed, strict=True))
@@ -296,6 +296,10 @@ def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
     }.get(finding, "")
     allowed = 100.0 * (bounds.speed_ratio - 1.0)
     yield Verdict(case.source, estimator, "", SPEED, finding, message, old, new, 100.0 * (new / old - 1.0), allowed)
+
+
+def _timed(series: Series) -> Array:
+    return np.array([x for x in series.speed if x is not None])
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:
