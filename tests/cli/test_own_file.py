@@ -83,6 +83,14 @@ def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter: Path, capsys) 
     assert "my_filter.py: there is no such file" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter: Path, capsys) -> None:
+    assert main(["compare", "drive", "--estimators", "my_filter.py", *SHORT, "--workers", "1", "--out", "run"]) == 0
+    assert main(["export", "run", "--bundle", "run.zip"]) == main(["reproduce", "run.zip", "--workers", "1"]) == 0
+    my_filter.unlink()
+    assert main(["reproduce", "run.zip", "--workers", "1"]) == 5
+    assert "my_filter.py: there is no such file" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("estimators", "text", "told"),
     [

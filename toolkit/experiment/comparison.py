@@ -255,7 +255,7 @@ class Comparison:
     changes against the rung before; ``white`` which estimators treat the stated noise of tracks as white, and why;
     ``lacking`` which estimators lack an optional part of the noise model that the settings ask for, by part.
     ``undecided`` has the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks,
-    where asked for.
+    where asked for. ``own_files`` has the path of each estimator that is a file of the user's own.
     """
 
     source: str
@@ -271,6 +271,7 @@ class Comparison:
     workers: int = 1
     undecided: Mapping[str, str] = field(default_factory=dict)
     card: Card | None = None
+    own_files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def over_seeds(self) -> bool:

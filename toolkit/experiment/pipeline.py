@@ -295,6 +295,7 @@ def _comparison(
         workers=workers,
         undecided=case.prepared.undecided,
         card=case.prepared.card,
+        own_files={name: entry.word for name, entry in entries.items() if entry.own_digest},
     )
 
 
