@@ -75,7 +75,7 @@ def test_once_a_step_has_raised_the_error_landmarks_move_in_images_from_the_star
 
 def frame_of(sightings: dict[int, float]) -> StereoFrame:
     uvs_px = np.array([[400.0, 400.0 - disparity, 150.0] for disparity in sightings.values()]).reshape(-1, 3)
-    return StereoFrame(0, np.array(list(sightings), dtype=np.int64), uvs_px, np.zeros(len(sightings), dtype=np.int64))
+    return StereoFrame(0, np.array(list(sightings), dtype=np.int64), uvs_px)
 
 
 def test_only_known_landmarks_seen_twice_and_near_once_are_smoothed():
