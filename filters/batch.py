@@ -24,7 +24,7 @@ from toolkit.models.stacked_factors import stacked
 from toolkit.sequence import Packet
 
 CITES = ("dellaert2017factor", "gtsam")
-RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut; IMU as stated"
+RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"
 RULES = {"window": "it keeps every state"}
 DEFAULT = True
 
