@@ -70,7 +70,9 @@ class Card:
 def card_of(sequence: Sequence) -> Card:
     """Return the card of a sequence; raises DataError where it cannot be run or its tracks are too few."""
     check_runnable(sequence)
-    seen, rig = sequence.visible, sequence.rig
+    seen, rig, measured = sequence.visible, sequence.rig, measured_noise(sequence)
+    if measured.why_not:
+        raise DataError(f"{sequence.name}: what its tracks are like cannot be measured: {measured.why_not}")
     here = _Residuals(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
     for _, adjusted in adjusted_stretches(sequence):
         more = _Residuals.of(adjusted, int(here.track.max(initial=-1)) + 1)
@@ -93,7 +95,7 @@ def card_of(sequence: Sequence) -> Card:
         depth_m=np.quantile(depth_m, QUANTILES),
         intervals=common.size,
         blind_intervals=int((common == 0).sum()),
-        weight=measured_noise(sequence).tracks,
+        weight=measured.tracks,
         correlation=np.stack([_correlation(of_sound, lag) for lag in range(1, LAGS + 1)]),
         left_right=_left_right(of_sound.px),
         tails=float((np.abs(here.px) > _TAIL * spread_px).mean()),

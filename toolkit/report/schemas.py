@@ -28,7 +28,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "baseline-1": BaselineRecord,
     "trajectory-baseline-1": TrajectoryBaselineRecord,
     "check-2": CheckDocument,
-    "card-1": CardRecord,
+    "card-2": CardRecord,
     "evaluation-1": EvaluationRecord,
     "verification-1": VerificationRecord,
     "diff-1": DiffRecord,
