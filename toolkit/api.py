@@ -22,7 +22,7 @@ import numpy as np
 
 from toolkit.errors import VislamError, did_you_mean, type_of
 from toolkit.estimate import Output, Run
-from toolkit.estimator import Build, defaults
+from toolkit.estimator import Build, defaults, find_all
 from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
@@ -64,13 +64,13 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
 ) -> "Result":
     """Audit a recording, run estimators on it from the same start, and score them.
 
-    ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "ladder" for
-    every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name. ``truth`` is a
-    TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit reports and
-    leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a record or
-    nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes, one a
-    processor by default; ``scheduler`` the address of a Dask cluster in their place. ``resume`` is a run directory in
-    which every run over seeds is kept as it ends, and found by the next comparison that asks for it.
+    ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "mine.py" a
+    file, "ladder" every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name.
+    ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit
+    reports and leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a
+    record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes,
+    one a processor by default; ``scheduler`` the address of a Dask cluster in their place. ``resume`` is a run
+    directory in which every run over seeds is kept as it ends, and found by the next comparison of it.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
     trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
@@ -100,7 +100,7 @@ def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapp
     for name, build in own.items():
         if not name or not callable(build):
             raise SettingsError(f"own has {name!r}: {type_of(build)}; give functions build(setup), each by a name")
-    both = sorted(set(named) & set(own))
+    both = sorted(set(find_all(named)) & set(own))
     if both:
         raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
     return own

@@ -8,17 +8,25 @@ named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` lists the c
 from the default: True where it obeys a rule, the kinds of motion beside which it does, as ``("imu",)``, or the reason
 why it does not; ``CITES`` is what ``vislam cite`` prints for it,
 keys of toolkit/report/references.bib or BibTeX itself.
+
+Where a name is expected, ``my_filter.py`` names a file of one's own, which no package needs to announce.
 """
 
 import ast
+import hashlib
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
 from typing import Protocol, cast
 
 from toolkit.compilation import Compilation, check_possible
-from toolkit.discovery import FoundModule, MissingDependency, announced
-from toolkit.errors import EstimatorError, no_such
+from toolkit.discovery import FoundModule, MissingDependency, announced, shown_name
+from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimate import Estimate, Finished
+from toolkit.files.reading import read_input
 from toolkit.geometry import Array
 from toolkit.measured_motion import MOTION_KINDS, MotionKind, MotionNoise
 from toolkit.progress import SILENT, Progress
@@ -69,11 +77,66 @@ Build = Callable[[Setup], Estimator]
 
 
 @dataclass(frozen=True)
+class OwnFile(FoundModule):
+    """A file that no package announces. Its content is read once, and every process runs what was read."""
+
+    content: bytes
+
+    def tree(self) -> ast.Module:
+        """Return the syntax tree of the content; raises EstimatorError where it is no Python."""
+        try:
+            return ast.parse(self.content, str(self.path))
+        except (SyntaxError, ValueError) as error:
+            raise cannot_import(str(self.path), error) from error
+
+    def load(self) -> ModuleType:
+        """Return the module, which may import what stands beside the file.
+
+        Raises EstimatorError where it cannot be imported, for whatever reason.
+        """
+        return _imported(self)
+
+
+@lru_cache(maxsize=16)
+def _imported(file: OwnFile) -> ModuleType:
+    module = ModuleType(file.module)
+    module.__file__ = str(file.path)
+    folder = str(file.path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    # As an import does, because dataclasses look up their module there.
+    sys.modules.setdefault(file.module, module)
+    try:
+        exec(compile(file.tree(), str(file.path), "exec"), vars(module))
+    except EstimatorError:
+        raise
+    except (Exception, SystemExit) as error:  # a script may end where it is imported
+        raise cannot_import(str(file.path), error) from error
+    return module
+
+
+def cannot_import(word: str, error: BaseException) -> EstimatorError:
+    """Return the error for a file or module that cannot be imported, with the line where it is no Python."""
+    where = f", line {error.lineno}" if isinstance(error, SyntaxError) and error.lineno else ""
+    return EstimatorError(f"{word}{where}: it cannot be imported ({type(error).__name__}: {error})")
+
+
+@dataclass(frozen=True)
 class EstimatorEntry:
-    """One discovered estimator: its name and the module it lives in."""
+    """One estimator: its name and the module it lives in."""
 
     name: str
     found: FoundModule
+
+    @property
+    def own_digest(self) -> str:
+        """Return the SHA-256 of a file of one's own; empty for an announced estimator, which is code of a package."""
+        return hashlib.sha256(self.found.content).hexdigest() if isinstance(self.found, OwnFile) else ""
+
+    @property
+    def word(self) -> str:
+        """Return what finds this estimator again: its name, or the path of a file of one's own."""
+        return str(self.found.path) if isinstance(self.found, OwnFile) else self.name
 
     def summary(self) -> str:
         """Return the first line of the module's docstring, without importing the module."""
@@ -186,17 +249,41 @@ def check_options(settings: Settings, own: Collection[str] = ()) -> None:
 
 
 def find_all(names: Iterable[str]) -> dict[str, EstimatorEntry]:
-    """Return the estimators of the names, each once and in their order; LADDER stands for all of its rungs."""
+    """Return the estimators of the names, each once and in their order; LADDER stands for all of its rungs.
+
+    Raises EstimatorError as :func:`find` does, and for a file whose name another estimator has.
+    """
     found: dict[str, EstimatorEntry] = {}
     for name in names:
         for entry in ladder() if name == LADDER else (find(name),):
-            found.setdefault(entry.name, entry)
+            other = found.setdefault(entry.name, entry)
+            if entry.own_digest:
+                other = discover().get(entry.name, other)
+            if other != entry:
+                taken = f"{entry.name} is the name of {other.found.path} as well"
+                raise EstimatorError(f"{entry.found.path}: {taken}; give the file another name")
     return found
 
 
 def find(name: str) -> EstimatorEntry:
-    """Return the estimator of that name, or raise EstimatorError with the names there are."""
+    """Return the estimator of that name, or of a file that ends in .py.
+
+    Raises EstimatorError for a name that no estimator has, with the names there are, and for a file that cannot be
+    read. What is in a file is looked at when the estimator is loaded.
+    """
+    if name.endswith(".py"):
+        return _own(Path(name))
     known = discover()
     if name not in known:
-        raise EstimatorError(no_such("estimator", name, known))
+        own = "an estimator of your own is given as its file, as in my_filter.py"
+        raise EstimatorError(f"{no_such('estimator', name, known)}; {own}")
     return known[name]
+
+
+def _own(path: Path) -> EstimatorEntry:
+    if not path.exists():
+        raise EstimatorError(f"{path}: there is no such file")
+    try:
+        return EstimatorEntry(printable(shown_name(path.stem)), OwnFile(path.stem, path, read_input(path)))
+    except DataError as error:
+        raise EstimatorError(str(error)) from error

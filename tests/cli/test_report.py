@@ -41,8 +41,13 @@ def test_several_runs_make_one_page_beside_them(vislam: Vislam) -> None:
     assert vislam("report", "all/drive", "all/drive-imu", "all/drive") == 0
     titles = [case["title"] for case in payload_of(Path("report.html"))["cases"]]
     assert titles == ["drive (all/drive)", "drive-imu", "drive (all/drive)"]
+    assert vislam("report", "all") == 0
+    assert [case["title"] for case in payload_of(Path("all/report.html"))["cases"]] == ["drive", "drive-imu"]
+    assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "all") == 0  # the page is in nobody's way
     assert vislam("report", "all/drive", "--out", "pages/one.html") == 0
     assert Path("pages/one.html").is_file()
+    (Path("all/drive") / "manifest.json").unlink()  # nothing is left out in silence
+    assert vislam("report", "all") == 3
 
 
 def test_a_comparison_over_seeds_has_a_page(vislam: Vislam, short_run: Path) -> None:

@@ -28,7 +28,8 @@ def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
     assert {v.finding for v in check.verdicts} == {"same"}
     assert {v.change_percent for v in check.verdicts} <= {0.0, None}
     assert {v.p for v in check.verdicts} == {1.0, None}
-    assert check.notes == ()
+    (note,) = check.notes
+    assert note.startswith("data/drive_small: the time of one, two, three is not checked")
 
 
 @pytest.mark.parametrize("metric", ["ate_se3_m", "ate_yaw_m", "heldout_reproj_median_px"])
@@ -244,7 +245,7 @@ def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline, gate):
     assert findings(gate.checked(of_then, [simulated, recorded])) == [("flight", "two", "status", "moved")]
     check = gate.checked(of_then, [simulated, recorded], accept_better=True)
     assert check.passed
-    assert check.notes == ("flight: two ends better in 1 runs than before",)
+    assert "flight: two ends better in 1 runs than before" in check.notes
 
 
 def test_frames_that_got_lost_fail_however_good_the_rest(baseline, gate):
@@ -281,7 +282,7 @@ def test_other_arithmetic_than_the_baselines_is_noted_where_both_sides_say_their
     assert reported.startswith("flight: two ran compiled for the baseline and runs in NumPy here")
     assert not gate.checked(written, [now, recorded[1]], speed=False).notes
     for before, after in ((written, compiled), (baseline, now)):
-        assert not gate.checked(before, [after, recorded[1]]).notes
+        assert not [note for note in gate.checked(before, [after, recorded[1]]).notes if "NumPy" in note]
 
 
 @pytest.mark.parametrize(("factor", "finding"), [(1.25, "same"), (1.4, "regressed"), (0.6, "better")])

@@ -3,12 +3,14 @@
 import os
 import subprocess
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from toolkit.cli import main
+from toolkit.gate import interleaved
 from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series, installed_releases
 from toolkit.gate.baseline_file import to_text
 from toolkit.gate.interleaved import (
@@ -114,6 +116,41 @@ def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path):
     assert -85.0 < speed.change_percent < -60.0
     assert "processor time of" in speed.words
     assert speeds.notes == ()
+
+
+class Side:
+    """A version of the code that has some estimators, of which some end well."""
+
+    def __init__(self, version, there, ok):
+        self.version, self.there, self.ok = version, there, ok
+
+    def request(self, do, **requested):
+        if do == "where":
+            there = {name: "file" if name in self.there else None for name in requested["estimators"]}
+            return {"toolkit": self.version, "files": there}
+        if do == "run":
+            return {"status": "ok" if requested["estimator"] in self.ok else "failed", "cpu_s": 0.1}
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ((["ekf"], ["ekf"]), (["ekf"], ["ekf"]), "same"),
+        ((["ekf"], ["ekf"]), (["ekf"], []), "missing"),
+        ((["ekf"], ["ekf"]), ([], []), "missing"),
+        ((["ekf"], []), (["ekf"], []), "noted"),
+        (([], []), (["ekf"], ["ekf"]), "noted"),
+    ],
+)
+def test_what_the_other_code_can_be_timed_on_and_this_one_cannot_is_missing(monkeypatch, old, new, found):
+    monkeypatch.setattr(interleaved, "unpacked", lambda _: nullcontext(()))
+    monkeypatch.setattr(interleaved, "timers", lambda *_: nullcontext((Side("old", *old), Side("new", *new))))
+    case = Case("drive", True, (0,), ("ekf",), 1.0)
+    measured = Measured(("hash",), ("print",), {"ekf": Series(("ok",), (1.0,), {"causal": {}})})
+    speeds = compare_speed(Baseline(installed_releases(), ((case, measured),)), "v1", 0.05, silent)
+    assert [verdict.finding for verdict in speeds.verdicts] == ([] if found == "noted" else [found])
+    assert bool(speeds.notes) is (found == "noted")
 
 
 def test_what_is_timed_is_read_as_what_is_measured(monkeypatch):

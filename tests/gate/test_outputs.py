@@ -1,6 +1,7 @@
 """What a check writes is well-formed, complete and says the same everywhere."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -62,17 +63,39 @@ def test_json_has_every_verdict_and_no_number_that_is_none(check, tmp_path):
     assert document["tests"] == sum(v["p"] is not None for v in document["verdicts"])
 
 
-def test_the_table_is_no_wider_than_100_columns_and_says_every_name_whole(failed):
-    sequence, metric = "a-recording-of-a-long-name/part.2", "heldout_over_motion_error"
-    long = {"sequence": sequence, "metric": metric, "estimator": "msckf"}
-    verdicts = [replace(v, **long, output="causal", before=0.00012345, after=123456.7) for v in failed.verdicts]
-    text = gate_text(replace(failed, verdicts=tuple(verdicts)))
-    table = text.split("\n\n")[0].splitlines()
+def test_the_table_has_what_fails_and_all_with_verbose(check):
+    for verbose, shown in ((False, check.failures), (True, check.verdicts)):
+        table = gate_text(check, verbose=verbose).split("\n\n")[0].splitlines()
+        found = [line.split()[0] for line in table if line.startswith("  ") and not line.startswith("  ---")]
+        assert found[2:] == [verdict.metric for verdict in shown] if shown else table[0].startswith("notes")
+
+
+def test_no_name_in_the_table_is_folded_nor_wider_than_100_columns(failed):
+    names = {"sequence": "a-recording-of-a-long-name/part.2", "metric": "heldout_reproj_median_px"}
+    verdicts = [replace(v, **names, output="causal", before=0.00012345, after=123456.7) for v in failed.verdicts]
+    table = gate_text(replace(failed, verdicts=tuple(verdicts)), verbose=True).split("\n\n")[0].splitlines()
+    assert sum(names["metric"] in line for line in table) == len(verdicts)
+    assert {line for line in table if names["sequence"] in line} == {
+        f"{names['sequence']}, {v.estimator} causal" for v in failed.verdicts
+    }
     assert max(map(len, table)) <= 100
-    rows = table[1 + next(i for i, line in enumerate(table) if line.startswith("---")) :]
-    for name, column, following in ((sequence, "sequence", "estimator"), (metric, "metric", "finding")):
-        cells = slice(table[0].index(column), table[0].index(following))
-        assert "".join(line[cells].strip() for line in rows) == name * len(verdicts)
+
+
+@pytest.mark.parametrize(
+    ("metric", "before", "after", "shown"),
+    [
+        ("ate_se3_m", 0.0110863, 0.0109871, ["11.086 mm", "10.987 mm"]),
+        ("ate_se3_m", 0.00383, 0.00371, ["3.83 mm", "3.71 mm"]),
+        ("ate_yaw_m", 23.04, 31.5, ["23.0 m", "31.5 m"]),
+        ("nis_mean", 1.0, 1.0004, ["1.00000", "1.00040"]),
+        ("speed", 4.928, 6.9, ["4.93", "6.90"]),
+        ("ate_se3_m", 0.0, 1.0, ["0 m", "1.00 m"]),
+    ],
+)
+def test_values_have_digits_enough_to_show_what_differs_and_a_unit(passed, metric, before, after, shown):
+    verdict = replace(passed.verdicts[0], metric=metric, before=before, after=after, finding="regressed")
+    row = next(line for line in gate_text(replace(passed, verdicts=(verdict,))).splitlines() if metric in line)
+    assert re.split(r"\s{2,}", row.strip())[2:4] == shown
 
 
 def test_markdown_tables_are_well_formed(check):

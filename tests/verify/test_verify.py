@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from toolkit.estimate import COV_SIZES, Estimate
 from toolkit.verify import verification
 from toolkit.verify.promises import covariance_fault, inconsistency
 
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 # An estimator of some thirty lines, as somebody writes who has read docs/extending.md and nothing else.
 NEWCOMER = '''
 """Integrates what is measured and says how sure it is."""
@@ -179,6 +182,97 @@ def test_who_dies_of_a_fault_is_reported_with_that_fault(newcomer, monkeypatch) 
     assert "AssertionError: no sightings" in found["2 s without sightings (drive)"]
 
 
+def test_a_cause_of_many_faults_is_told_once_with_how_many(newcomer, monkeypatch) -> None:
+    monkeypatch.setattr(verification, "ends_by_fault", lambda *_: dict(ENDS))
+    checked = verification._faults("my-filter", lambda _: None)
+    assert checked.result == "failed"
+    assert checked.found == (
+        "a camera 20 ms late (drive) and 2 more: failed after 3 estimates: no inverse; one track a frame (drive): other"
+    )
+
+
+ENDS = {
+    "a camera 20 ms late (drive)": "failed after 3 estimates: no inverse",
+    "a clock that jumps back (drive)": "failed after 41 estimates: no inverse",
+    "one track a frame (drive)": "other",
+    "a camera 20 ms late (flight)": "failed after 0 estimates: no inverse",
+}
+FOR_TWISTS = "assert packet.motion is None or packet.motion.v_mps is not None"
+DECLINES = """
+        if setup.motion_kind != "twist":
+            raise EstimatorError("it needs measured velocities")
+        self.model = motion_model("""
+
+
+@pytest.fixture
+def for_twists_alone(newcomer) -> Path:
+    """An estimator that says in ``build`` that it needs velocities."""
+    path = newcomer(FOR_TWISTS)
+    text = path.read_text().replace("\n        self.model = motion_model(", DECLINES)
+    path.write_text(
+        text.replace("import numpy as np\n", "import numpy as np\nfrom toolkit.errors import EstimatorError\n")
+    )
+    return path
+
+
+def test_an_input_that_an_estimator_is_not_made_for_breaks_no_promise(for_twists_alone, capsys, monkeypatch) -> None:
+    some = ("2 s without sightings",)
+    monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
+    monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
+    assert main(["verify", str(for_twists_alone), "--json"]) == 0
+    checks = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks[RUNS]["found"] == "not applicable to drive-imu, flight: it needs measured velocities"
+
+
+@pytest.mark.usefixtures("only_runs")
+def test_one_that_takes_no_input_at_all_does_not_run(for_twists_alone, capsys) -> None:
+    for_twists_alone.write_text(for_twists_alone.read_text().replace('!= "twist"', '!= "none"'))
+    assert main(["verify", str(for_twists_alone), "--json"]) == 1
+    assert "it needs measured velocities" in failed(capsys)[RUNS]["found"]
+
+
+@pytest.mark.parametrize("plant", ["1 / (k - 1)", "assert not packet.index", "T = None"])
+@pytest.mark.usefixtures("only_runs")
+def test_any_other_error_at_the_first_motion_is_a_broken_promise(newcomer, capsys, plant: str) -> None:
+    assert main(["verify", str(newcomer(plant)), "--json"]) == 1
+    assert RUNS in failed(capsys)
+
+
+@pytest.mark.parametrize("refusal", ["no process", "no import"])
+def test_a_process_that_cannot_start_breaks_no_promise(monkeypatch, refusal: str) -> None:
+    def run(*_given, **_named):
+        if refusal == "no process":
+            raise BlockingIOError(11, "Resource temporarily unavailable")
+        return subprocess.CompletedProcess([], 1, "", "ModuleNotFoundError: No module named 'toolkit'\n")
+
+    monkeypatch.setattr("toolkit.verify.threads.subprocess.run", run)
+    checked = verification._threads("ekf")
+    assert checked.result == "not applicable"
+    assert "not checked" in checked.found
+
+
+def test_a_process_that_the_estimator_ends_breaks_the_promise(newcomer) -> None:
+    path = newcomer("import os; k == 3 and os._exit(9)")
+    assert verification._threads(str(path)).result == "failed"
+
+
+def test_the_filter_of_the_notebook_keeps_every_promise(tmp_path, monkeypatch, capsys) -> None:
+    source = (NOTEBOOKS / "04_your_own_estimator.py").read_text()
+    (imports,) = re.findall(r"IMPORTS = '''(.*?)'''", source, re.DOTALL)
+    cell = next(part for part in source.split("# %%\n") if part.startswith("class TwoView")).partition("# %% [")[0]
+    monkeypatch.chdir(tmp_path)
+    Path("two_view.py").write_text(imports + cell)
+    assert main(["verify", "two_view.py"]) == 0
+    assert "two-view keeps every promise" in capsys.readouterr().out
+
+
+def test_a_covariance_may_round_but_not_differ_from_its_transpose() -> None:
+    cov = np.diag([1e-12, 1e-12, 1e-12, 1e6, 1e6, 1e6])
+    for off, fault in ((0.9e-9, False), (1.1e-9, True)):
+        cov[0, 3] = off * 1e-3  # of the geometric mean of their variances
+        assert ("not symmetric" in covariance_fault(cov, COV_SIZES)) is fault
+
+
 def test_too_sure_and_too_timid_are_distinguished_from_honest() -> None:
     rng = np.random.default_rng(0)
     # Poses of a run share one error in the worst case: a chi-square of 6 over 6 each, over eight runs.
@@ -201,7 +295,7 @@ def test_a_covariance_with_units_far_apart_is_sound() -> None:
         ("nowhere.py", None, "nowhere.py: there is no such file"),
         ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported (SyntaxError"),
         ("mine.py", "import nothing_of_the_kind\n", "No module named 'nothing_of_the_kind'"),
-        ("mine.py", "x = 1\n", "mine.py: it defines no function build(setup)"),
+        ("mine.py", "x = 1\n", "mine.py defines no function build(setup)"),
         ("mine.py", "import sys\nsys.exit(3)\n", "mine.py: it cannot be imported (SystemExit: 3)"),
         ("mine.py", "\0", "mine.py: it cannot be imported (SyntaxError"),
         ("ekff", None, "no estimator is called ekff (did you mean ekf?)"),

@@ -224,7 +224,10 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
 def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the names of estimators, with what they are named for."""
     parser.add_argument(
-        "--estimators", metavar="NAME,...", type=names, help=f"{what} (default: those that 'vislam list' marks)"
+        "--estimators",
+        metavar="NAME,...",
+        type=names,
+        help=f"{what}; my_filter.py is a file of your own (default: those that 'vislam list' marks)",
     )
 
 

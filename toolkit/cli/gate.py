@@ -172,7 +172,7 @@ def _cases(options: argparse.Namespace) -> list[Case]:
 
     if not options.sequences:
         raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")
-    estimators = tuple(find_all(options.estimators or defaults()))
+    estimators = tuple(entry.word for entry in find_all(options.estimators or defaults()).values())
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
     cases = []
     for given in options.sequences:
@@ -258,6 +258,9 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="compare although GTSAM or NumPy is another release than the baseline's",
     )
+    parser.add_argument(
+        "--verbose", action="store_true", help="print every comparison, not only those that fail; files have them all"
+    )
 
 
 @command(
@@ -283,7 +286,7 @@ def check(options: argparse.Namespace) -> int:
         check_writable(path, BEGINNINGS[name])
     checked = _check_of_estimators(options) if options.trajectories is None else _check_of_trajectories(options)
     write_check(checked, files)
-    print(gate_text(checked, width_of_output()))
+    print(gate_text(checked, width_of_output(), verbose=options.verbose))
     return 0 if checked.passed else 1
 
 

@@ -42,14 +42,15 @@ def _report_arguments(parser: argparse.ArgumentParser) -> None:
 def report(options: argparse.Namespace) -> int:
     """Write one HTML file that opens from disk, with all it needs inside: the table, the trajectories from above
     and in three dimensions, errors, consistency, time, and what to know in words. Several run directories are laid
-    side by side.
+    side by side; a folder of run directories stands for all of them.
     """
     from toolkit.report.html import write_html
+    from toolkit.report.run_directory import runs_in
 
     target = options.out
     if target is None:
         target = options.runs[0] / _PAGE if len(options.runs) == 1 else Path(_PAGE)
-    write_html(options.runs, target)
+    write_html([run for folder in options.runs for run in runs_in(folder)], target)
     print(printable(f"report: {target}"))
     return 0
 

@@ -254,7 +254,8 @@ class Comparison:
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
     changes against the rung before; ``measured`` is the noise that was measured on the recording under the first seed,
     None where the settings state it. ``undecided`` has the faults that the audit could not judge, and why; ``card`` is
-    that of the recording's tracks, where asked for.
+    that of the recording's tracks, where asked for. ``own_files`` has the path of each estimator that is a file of the
+    user's own.
     """
 
     source: str
@@ -269,6 +270,7 @@ class Comparison:
     workers: int = 1
     undecided: Mapping[str, str] = field(default_factory=dict)
     card: Card | None = None
+    own_files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def over_seeds(self) -> bool:

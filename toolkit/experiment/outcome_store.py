@@ -8,7 +8,7 @@ one outcome, exactly, and all that it depends on (docs/scaling.md).
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, Protocol
 
@@ -212,10 +212,14 @@ NOWHERE = Nowhere()
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the units of a case share: the ``data``, as the hash of the recording under seed 0, and what is kept."""
+    """What the units of a case share: the ``data``, as the hash of the recording under seed 0, and what is kept.
+
+    ``own`` are the SHA-256 of estimators in files of the user's own, by name.
+    """
 
     data: str
     keep: frozenset[str] = frozenset()
+    own: Mapping[str, str] = field(default_factory=dict)
 
     def key(self, unit: Unit) -> UnitKey:
         """Return everything that the outcome of a unit depends on."""
@@ -225,14 +229,19 @@ class Conditions:
             estimator=unit.estimator,
             settings=_settings_of_a_run(unit.settings, unit.estimator),
             keep=tuple(sorted(self.keep)),
-            code=code_digest(),
+            code=_code("" if unit.entry is None else unit.entry.own_digest),
             versions=numeric_versions(),
         )
 
     def fit(self, key: UnitKey) -> bool:
         """Say whether a key can be that of a unit of this case, with some seed, estimator and settings."""
-        ours = (self.data, tuple(sorted(self.keep)), code_digest(), numeric_versions())
+        ours = (self.data, tuple(sorted(self.keep)), _code(self.own.get(key.estimator, "")), numeric_versions())
         return (key.data, key.keep, key.code, key.versions) == ours
+
+
+def _code(own: str) -> str:
+    """Return the SHA-256 of all code that runs for an estimator, which may be ``own``, the SHA-256 of a user's file."""
+    return hashlib.sha256(f"{code_digest()}{own}".encode()).hexdigest() if own else code_digest()
 
 
 def _settings_of_a_run(settings: Settings, estimator: str) -> dict[str, object]:

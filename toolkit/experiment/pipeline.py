@@ -29,14 +29,13 @@ from toolkit.threads import MOST_WORKERS
 class Plan:
     """What to compare.
 
-    ``sources`` are paths, built-in names or sequences; ``estimators`` are names, or the word for the whole ladder;
-    ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is a TUM file and ``trajectories``
-    are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
-    leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
-    writes those of every seed; of a single one they always are. ``scheduler`` is the address of a Dask cluster that
-    does the work instead. ``part`` is what is used of each source, ``max_frames`` the first frames of that. Raises
-    SettingsError where nothing would be compared, or with nothing.
-    """
+    ``sources`` are paths, built-in names or sequences; ``estimators`` are names, files of one's own (``my_filter.py``),
+    or the word for the whole ladder; ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is
+    a TUM file and ``trajectories`` are files of other systems by name, both for a single source. ``keep`` names the
+    faults that the audit reports but leaves as they are. ``workers`` is the number of processes, one a processor where
+    it is None. ``keep_trajectories`` writes those of every seed; of a single one they always are. ``scheduler`` is the
+    address of a Dask cluster that does the work instead. ``part`` is what is used of each source, ``max_frames`` the
+    first frames of that. Raises SettingsError where nothing would be compared, or with nothing."""
 
     sources: tuple[str | Recorded, ...]
     estimators: tuple[str, ...]
@@ -128,8 +127,9 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
     trajectory that cannot, or for a recording without a seed that is to be repeated over seeds.
     """
-    check_options(plan.settings, plan.own)
-    for entry in find_all(plan.estimators).values():
+    entries = find_all(plan.estimators)
+    check_options(plan.settings, {*plan.own, *_own_digests(entries)})
+    for entry in entries.values():
         entry.check_usable(plan.settings)
     files = {name: read_poses(path) for name, path in plan.trajectories.items()}
     for source in plan.sources:
@@ -175,8 +175,14 @@ def stores_of(plan: Plan, cases: Sequence[PreparedCase], directories: Sequence[P
     """
     if len(plan.seeds) == 1:
         return []
-    conditions = [Conditions(_hash_under_seed_0(plan, case), plan.keep) for case in cases]
+    own = _own_digests(find_all(plan.estimators))
+    conditions = [Conditions(_hash_under_seed_0(plan, case), plan.keep, own) for case in cases]
     return [OutcomeStore(directory, one) for directory, one in zip(directories, conditions, strict=True)]
+
+
+def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
+    """Return the SHA-256 of each estimator that is a file of the user's own, by name."""
+    return {name: entry.own_digest for name, entry in entries.items() if entry.own_digest}
 
 
 def _hash_under_seed_0(plan: Plan, case: PreparedCase) -> str:
@@ -250,7 +256,7 @@ def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]
         recording = case.prepared if is_ready else plan.recording(source, seed)
         for name in names:
             build, keep_trajectories = plan.own.get(name), plan.keep_trajectories and not single
-            yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories)
+            yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories, entry=entries.get(name))
 
 
 def _located(source: str | Recorded) -> str | Recorded:
@@ -286,6 +292,7 @@ def _comparison(
         workers=workers,
         undecided=case.prepared.undecided,
         card=case.prepared.card,
+        own_files={name: entry.word for name, entry in entries.items() if entry.own_digest},
     )
 
 

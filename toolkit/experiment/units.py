@@ -9,7 +9,7 @@ from toolkit import runner
 from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Arithmetic, ArithmeticOfRuns, Output, Run, Status
-from toolkit.estimator import Build, find
+from toolkit.estimator import Build, EstimatorEntry, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, repeated, score_run
@@ -24,11 +24,11 @@ OUTPUTS: tuple[Output, ...] = ("causal", "final")
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """What to run. ``recording`` may be prepared already; ``build`` is an estimator that cannot be found by its name.
+    """What to run. ``recording`` may be prepared already; ``entry`` is the estimator where it is not found by its name.
 
-    ``keep_run`` asks for the run itself with its trajectories and landmarks, not for its scores alone;
-    ``keep_trajectories`` for the trajectories as the texts of files.
-    """
+    ``build`` is a function in the place of an estimator that can be found. ``keep_run`` asks for the run itself with
+    its trajectories and landmarks, not for its scores alone; ``keep_trajectories`` for the trajectories as the texts of
+    files."""
 
     recording: Recording | Prepared
     seed: int
@@ -37,6 +37,7 @@ class Unit:
     build: Build | None = None
     keep_run: bool = False
     keep_trajectories: bool = False
+    entry: EstimatorEntry | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,7 @@ def recording_to_prepare(unit: Unit) -> Recording | None:
 
 def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
     """Run a unit's estimator over its prepared recording."""
-    build = find(unit.estimator).load() if unit.build is None else unit.build
+    build = unit.build or (unit.entry or find(unit.estimator)).load()
     return runner.run(unit.estimator, build, prepared.sequence, prepared.prior, progress, unit.settings)
 
 

@@ -78,12 +78,25 @@ def check_case(
         if estimator in now.absent or estimator not in now.runs:
             why = now.absent.get(estimator, "it was not run")
             collected.verdicts.append(_missing(case, estimator, "", "estimator", why))
+        elif fewer := _fewer_seeds(was, now.runs[estimator]):
+            collected.verdicts.append(_missing(case, estimator, "", "seeds", fewer))
         else:
             _check_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
             if terms.speed:
                 collected.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
                 collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
+    few = [name for name, was in before.runs.items() if _timed(was).size < FEWEST_TIMED]
+    if terms.speed and few:
+        of = f"{case.source}: the time of {', '.join(few)}"
+        collected.notes.append(f"{of} is not checked: fewer than {FEWEST_TIMED} timed runs in the baseline")
     return collected
+
+
+def _fewer_seeds(before: Series, now: Series) -> str:
+    """Say that an estimator has another number of runs than in the baseline; empty where it has as many."""
+    if len(now.status) == len(now.speed) == len(before.status):
+        return ""
+    return f"it has {min(len(now.status), len(now.speed))} runs, the baseline has {len(before.status)}"
 
 
 def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
@@ -139,11 +152,14 @@ def _check_series(
 
 
 def _check_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: CheckTerms) -> None:
-    """Put a metric among the tests, or hold it to its bound."""
-    if case.simulated:
+    """Put a metric among the tests, or hold it to its bound: of one run no test can tell chance."""
+    where, now = pairs.where, pairs.after
+    if case.simulated and now.size > 1:
         collected.tests.append(pairs)
         return
-    where, now = pairs.where, pairs.after
+    if case.simulated:
+        one = f"{case.source}: {where.estimator} has one seed to compare, too few to test"
+        collected.notes.append(f"{one}; it is held to the margins as bounds")
     if np.ptp(now) > SHOWN * np.abs(now).max():
         collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} has changed in every run")
     was, is_ = float(np.median(pairs.before)), float(np.median(now))
@@ -183,6 +199,8 @@ def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
     """Say which values are there no more; nothing where all are."""
     if now is None:
         return "it has no value any more"
+    if len(now) != len(before):
+        return f"it has {len(now)} values, the baseline has {len(before)}"
     gone = [i for i in usable if before[i] is not None and now[i] is None]
     return f"it has no value any more in {len(gone)} of {len(usable)} runs" if gone else ""
 
@@ -258,8 +276,13 @@ def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
 
 def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
     """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
-    was, is_ = (np.array([x for x in series.speed if x is not None]) for series in (before, now))
-    if min(was.size, is_.size) < FEWEST_TIMED:
+    was, is_ = _timed(before), _timed(now)
+    if was.size < FEWEST_TIMED:
+        return
+    lost = sum(old is not None and new is None for old, new in zip(before.speed, now.speed, strict=True))
+    if lost:
+        yield _missing(case, estimator, "", SPEED, f"{lost} of {was.size} runs have no time any more")
+    if is_.size < FEWEST_TIMED:
         return
     old, new = float(np.median(was)), float(np.median(is_))
     finding: Finding = "same"
@@ -273,6 +296,10 @@ def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
     }.get(finding, "")
     allowed = 100.0 * (bounds.speed_ratio - 1.0)
     yield Verdict(case.source, estimator, "", SPEED, finding, message, old, new, 100.0 * (new / old - 1.0), allowed)
+
+
+def _timed(series: Series) -> Array:
+    return np.array([x for x in series.speed if x is not None])
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:

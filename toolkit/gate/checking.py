@@ -92,7 +92,7 @@ def check_all(
     return Check(
         name,
         tuple(verdicts),
-        tuple(collected.notes),
+        tuple(dict.fromkeys(collected.notes)),
         baseline.false_alarm_rate,
         len(tested),
         installed_releases(),

@@ -60,9 +60,10 @@ class TimedPairs:
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """The times, and remarks on them."""
+    """The times, what the other version could be timed on and this one cannot, and remarks."""
 
     timed: tuple[TimedPairs, ...]
+    missing: tuple[Verdict, ...]
     notes: tuple[str, ...]
 
 
@@ -80,26 +81,34 @@ def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: P
     Raises BaselineError where the version cannot be found or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
-    return Speeds(tuple(check_speeds(turns.timed, version, rate)), turns.notes)
+    return Speeds((*turns.missing, *check_speeds(turns.timed, version, rate)), turns.notes)
 
 
 def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
     """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    timed: list[TimedPairs | str] = []
-    notes: list[str] = []
+    timed: list[TimedPairs | Verdict | str] = []
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
-        lacking = _lacking(version, sides, names)
-        if lacking:
-            notes.append(f"{', '.join(lacking)}: only here or only in {version}, and not timed")
+        there, here = _estimators_of(version, sides, names)
+        new = [name for name in names if name not in there]
+        if new:
+            timed.append(f"{', '.join(new)}: not in {version}, and not timed")
         for case in cases:
-            present = [name for name in case.estimators if name not in lacking]
+            known = [name for name in case.estimators if name in there]
+            timed += [_not_timed(case.source, name, "is not there any more") for name in known if name not in here]
             with progress_for(f"{case.source}: speed against {version}") as progress:
                 _prepare(sides, case, baseline)
-                timed += _timed(sides, case.source, present, progress)
-    notes += [why for why in timed if isinstance(why, str)]
-    return Turns(tuple(one for one in timed if isinstance(one, TimedPairs)), tuple(notes))
+                timed += _timed(sides, case.source, [name for name in known if name in here], progress)
+    return Turns(
+        tuple(one for one in timed if isinstance(one, TimedPairs)),
+        tuple(one for one in timed if isinstance(one, Verdict)),
+        tuple(one for one in timed if isinstance(one, str)),
+    )
+
+
+def _not_timed(case: str, estimator: str, why: str) -> Verdict:
+    return Verdict(case, estimator, "", SPEED, "missing", why)
 
 
 def check_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
@@ -198,12 +207,12 @@ def _end(process: "subprocess.Popen[str]") -> None:
     process.communicate()
 
 
-def _lacking(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[str]:
-    """Return the estimators that only one side has; raises BaselineError where both sides are the same code."""
+def _estimators_of(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[set[str]]:
+    """Return which estimators each side has; raises BaselineError where both sides are the same code."""
     found = [side.request("where", estimators=names) for side in sides]
     if found[0] == found[1]:
         raise BaselineError(f"{version} does not contain the code that runs here ({found[0]['toolkit']}); name another")
-    return [name for name in names if any(side["files"][name] is None for side in found)]
+    return [{name for name in names if side["files"][name] is not None} for side in found]
 
 
 def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
@@ -221,17 +230,19 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
 
 def _timed(
     sides: Sequence[Process], source: str, estimators: Sequence[str], progress: Progress
-) -> Iterator[TimedPairs | str]:
+) -> Iterator[TimedPairs | Verdict | str]:
     """Yield the times of each estimator on the recording that is ready, or why it has none."""
     for done, name in enumerate(estimators):
         progress.advance(done, len(estimators))
         yield _time(sides, source, name)
 
 
-def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | str:
-    """Time both sides in turn; return why that is not possible where a run does not end well."""
+def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | Verdict | str:
+    """Time both sides in turn; where a run does not end well return why, as a failure if it did in the other code."""
     first = [side.request("run", estimator=estimator) for side in sides]  # warms up, and is not counted
-    if any(one["status"] != "ok" for one in first):
+    if first[0]["status"] == "ok" != first[1]["status"]:
+        return _not_timed(source, estimator, f"ends {first[1]['status']} here and ended well there")
+    if first[0]["status"] != "ok":
         return f"{source}: {estimator} ends {first[0]['status']} there and {first[1]['status']} here, and is not timed"
     pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
     more = pairs_needed(TimedPairs(source, estimator, pairs).differences)

@@ -97,7 +97,12 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
     recordings = recordings_of(present, settings)
-    units = [Unit(recording, recording.seed, name, settings) for recording in recordings for name in present.estimators]
+    entries = {name: find(name) for name in present.estimators}
+    units = [
+        Unit(recording, recording.seed, name, settings, entry=entry)
+        for recording in recordings
+        for name, entry in entries.items()
+    ]
     try:
         if units:
             prepare(recordings[0])
@@ -143,8 +148,15 @@ def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], a
     read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
     hashes = tuple(read[seed].outcome.sequence_hash if seed in read else "" for seed in case.seeds)
     prints = tuple(read[seed].fingerprint if seed in read else "" for seed in case.seeds)
-    runs = {name: _series([by_run[name, seed] for seed in case.seeds], metrics) for name in case.estimators}
+    runs = {
+        name: _series([by_run.get((name, seed)) or _not_run(name, seed) for seed in case.seeds], metrics)
+        for name in case.estimators
+    }
     return Measured(hashes, prints, runs, absent)
+
+
+def _not_run(estimator: str, seed: int) -> TimedOutcome:
+    return TimedOutcome(Outcome(seed, estimator, "failed", log=("it was not run",)))
 
 
 def _why_absent(name: str) -> str:

@@ -1,10 +1,11 @@
 """Compare a folder of trajectories with a baseline, or make the baseline of one."""
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Protocol
 
 import numpy as np
@@ -122,22 +123,33 @@ def check_trajectories(
         except DataError as error:
             verdicts.append(Verdict(sequence, "", "", _SEQUENCE, "missing", printable(" ".join(str(error).split()))))
             continue
+        verdicts += _missing(sequence, before, now, (*baseline.bounds, TIME_COVERAGE))
         verdicts += _coverage(sequence, before, now, baseline.coverage_points)
         for key, percent in baseline.bounds.items():
-            lost = _lost(before.scores[key], now[key])
-            if lost:
-                verdicts.append(Verdict(sequence, "", "", key, "missing", lost))
-            elif any(value is not None for value in before.scores[key]):
-                sides = _array(before.scores[key]), _array(now[key])
+            sides = _array(before.scores[key]), _array(now.scores[key])
+            if all(side.size for side in sides):
                 compared.append(Compared(Where(sequence, "", "", key), Criterion("larger", percent), *sides))
     tested = _tested_together(compared, baseline.false_alarm_rate, accept_better=accept_better)
     order = list(baseline.sequences)
     verdicts = sorted([*verdicts, *tested], key=lambda verdict: order.index(verdict.sequence))
     unknown = sorted(set(there) - set(order))
-    notes = (f"not in the baseline, and not checked: {', '.join(unknown)}",) if unknown else ()
+    notes = [f"not in the baseline, and not checked: {', '.join(unknown)}"] if unknown else []
     tests = sum(_is_tested(one) for one in compared)
     seconds = time.monotonic() - began
-    return Check(name, tuple(verdicts), notes, baseline.false_alarm_rate, tests, {}, seconds, accept_better)
+    notes += dict.fromkeys(map(_other_rule, filter(_lost_its_test, compared)))
+    return Check(name, tuple(verdicts), tuple(notes), baseline.false_alarm_rate, tests, {}, seconds, accept_better)
+
+
+def _lost_its_test(one: Compared) -> bool:
+    """Say whether a metric that the baseline has runs enough to test has too few now."""
+    return one.before.size >= FEWEST_RUNS > one.after.size
+
+
+def _other_rule(one: Compared) -> str:
+    return (
+        f"{one.where.sequence}: {one.after.size} of the baseline's {one.before.size} runs are left, too few to test; "
+        "they are held to the bound instead"
+    )
 
 
 def _is_tested(one: Compared) -> bool:
@@ -145,12 +157,42 @@ def _is_tested(one: Compared) -> bool:
     return min(one.before.size, one.after.size) >= FEWEST_RUNS
 
 
-def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scoring) -> Mapping[str, Values]:
-    """Return the scores of a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
+def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scoring) -> ScoredSequence:
+    """Return a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
     now = given.scored(sequence, scoring, before)
     if now.truth_hash != before.truth_hash:
         raise DataError(f"{now.truth} differs from the baseline's truth; make a new baseline")
-    return now.scores
+    return now
+
+
+def _missing(sequence: str, before: ScoredSequence, now: ScoredSequence, keys: Iterable[str]) -> Iterator[Verdict]:
+    """Fail where a run of the baseline is not there by its file's name, or has no value where it had one."""
+    had, has = _names(before.files), _names(now.files)
+    missing, new = had - has, has - had
+    if missing:
+        words = f"{_listed(missing)} not there, of {len(before.files)} runs in the baseline"
+        if new:
+            words += f"; {_listed(new)} not in it: a run has the name of a file of the baseline"
+        yield Verdict(sequence, "", "", "run", "missing", words)
+    for key in keys:
+        lost = _with_value(before, key) - missing - _with_value(now, key)
+        if lost:
+            words = f"{_listed(lost)} without a value any more, of {len(before.files)} runs in the baseline"
+            yield Verdict(sequence, "", "", key, "missing", words)
+
+
+def _names(files: Iterable[str]) -> "Counter[str]":
+    """Count the names of files, whose folder may be another than the baseline's."""
+    return Counter(PurePath(file).name for file in files)
+
+
+def _with_value(scored: ScoredSequence, key: str) -> "Counter[str]":
+    values = zip(scored.files, scored.scores[key], strict=True)
+    return _names(file for file, value in values if value is not None)
+
+
+def _listed(names: "Counter[str]") -> str:
+    return f"{', '.join(names.elements())} {'is' if names.total() == 1 else 'are'}"
 
 
 def _scores_of(files: tuple[Path, ...], truth: Poses, scoring: Scoring) -> dict[str, Values]:
@@ -162,20 +204,18 @@ def _array(values: Values) -> Array:
     return np.array([value for value in values if value is not None])
 
 
-def _lost(before: Values, now: Values) -> str:
-    """Say that runs have no value now where the baseline's had one; nothing where none is lost."""
-    had, gone = sum(value is not None for value in before), sum(value is None for value in now)
-    lost = gone and had and (had == len(before) or gone == len(now))
-    return f"it has no value in {gone} of {len(now)} runs" if lost else ""
-
-
-def _coverage(sequence: str, before: ScoredSequence, now: Mapping[str, Values], allowed: float) -> Iterator[Verdict]:
-    """Fail where the worst run covers less of the time than the worst one of the baseline did."""
-    was, is_ = (float(_array(side[TIME_COVERAGE]).min()) for side in (before.scores, now))
-    worse = was - is_ > allowed
-    message = f"the least of the runs fell from {was:.1f} to {is_:.1f} percent of the time, {allowed:g} less is allowed"
+def _coverage(sequence: str, before: ScoredSequence, now: ScoredSequence, allowed: float) -> Iterator[Verdict]:
+    """Fail where the runs, from the least coverage to the largest, cover less of the time than the baseline's."""
+    was, is_ = (np.sort(_array(side.scores[TIME_COVERAGE])) for side in (before, now))
+    if not (was.size and is_.size):
+        return
+    in_order = np.quantile(is_, np.linspace(0.0, 1.0, was.size))
+    worst = int(np.argmax(was - in_order))
+    old, new = float(was[worst]), float(in_order[worst])
+    worse = old - new > allowed
+    message = f"a run covered {old:.1f} percent of the time, and {new:.1f} now; {allowed:g} less is allowed"
     finding: Finding = "regressed" if worse else "same"
-    yield Verdict(sequence, "", "", TIME_COVERAGE, finding, message if worse else "", was, is_)
+    yield Verdict(sequence, "", "", TIME_COVERAGE, finding, message if worse else "", old, new)
 
 
 def _tested_together(compared: list[Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:

@@ -1,11 +1,12 @@
-"""A check of the gate as text: the verdict in one line, a table of everything, failures with reasons, notes.
+"""A check of the gate as text: a table of what fails or of everything, notes, failures with reasons, the verdict.
 
 And its files, each on request: JUnit XML, Markdown and JSON.
 """
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from itertools import groupby, zip_longest
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,9 +15,9 @@ from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
 from toolkit.gate.case_check import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict, check_document
-from toolkit.metrics import known_metrics
+from toolkit.metrics import Metric, known_metrics
 from toolkit.report.prose import WIDTH, Width, section
-from toolkit.report.table import MISSING, Table, as_markdown, as_text, number
+from toolkit.report.table import MISSING, Table, as_markdown, as_text
 
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
@@ -26,8 +27,8 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
-# Labels give way to the numbers down to so many characters.
-_NARROWEST = 10
+# A length below this (m) is told in millimetres; a value has so many digits at least and at most.
+_SHORT_M, _DIGITS, _MOST_DIGITS = 0.1, 3, 7
 _NUMBERS = (
     ("before", "", ""),
     ("now", "", ""),
@@ -50,37 +51,20 @@ def failures_table(check: Check) -> Table:
     return Table(headings, rows, labels=len(_LABELS))
 
 
-def _folded(table: Table, width: int) -> Table:
-    """Return a table no wider than ``width``, as far as its labels give way: the widest go on in rows below."""
-    heads = zip(*table.headings, strict=True)
-    columns = list(zip(*heads, *table.rows, strict=True))
-    widest = [max(map(len, map(printable, column))) for column in columns]
-    room = width - 2 * (len(widest) - 1) - sum(widest[table.labels :])
-    while sum(widest[: table.labels]) > room and max(widest[: table.labels]) > _NARROWEST:
-        widest[widest.index(max(widest[: table.labels]))] -= 1
-    rows: list[tuple[str, ...]] = []
-    for row in table.rows:
-        parts = [_broken(text, widest[i]) if i < table.labels else [text] for i, text in enumerate(row)]
-        rows += zip_longest(*parts, fillvalue="")
-    return table._replace(rows=tuple(rows))
-
-
-def _broken(text: str, width: int) -> list[str]:
-    """Return a name in lines no wider than ``width``, broken behind a separator where there is one."""
-    lines, rest = [], printable(text)
-    while len(rest) > width:
-        behind = max((rest.rfind(mark, 0, width) for mark in "_-/. "), default=-1) + 1
-        end = behind or width
-        lines.append(rest[:end])
-        rest = rest[end:]
-    return [*lines, rest]
+def printed_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
+    """Yield the lines of a table for a terminal: what the verdicts are of stands above them, and no name is folded."""
+    rows = tuple(_row(verdict)[3:] for verdict in verdicts)
+    lines = as_text(Table((*_LABELS[3:], *_NUMBERS), rows, labels=2)).splitlines()
+    yield from (f"  {line}" for line in lines[: -len(rows)])
+    for of, members in groupby(zip(map(_of, verdicts), lines[-len(rows) :], strict=True), key=lambda one: one[0]):
+        yield printable(of)
+        yield from (f"  {line}" for _, line in members)
 
 
 def _row(verdict: Verdict) -> tuple[str, ...]:
     labels = (verdict.sequence, verdict.estimator, verdict.output, verdict.metric, verdict.finding)
     numbers = (
-        _value(verdict.before),
-        _value(verdict.after),
+        *_values(verdict),
         _percent(verdict.change_percent, sign="+"),
         _percent(verdict.allowed_percent),
         _percent(verdict.seen_percent),
@@ -89,8 +73,33 @@ def _row(verdict: Verdict) -> tuple[str, ...]:
     return (*(_escaped(label) or MISSING for label in labels), *numbers)
 
 
-def _value(value: float | None) -> str:
-    return MISSING if value is None else number(value, 4)
+def _values(verdict: Verdict) -> tuple[str, str]:
+    """Return the value before and now with their unit, and so many digits that a difference shows."""
+    before, now = verdict.before, verdict.after
+    given = [abs(value) for value in (before, now) if value is not None and math.isfinite(value)]
+    metric = _metric(verdict.metric)
+    unit, factor = metric.unit if metric is not None and metric.unit != "1" else "", 1.0
+    if unit == "m" and max(given, default=1.0) < _SHORT_M:
+        unit, factor = "mm", 1e3
+    differs = 0.0
+    if before is not None and now is not None and verdict.finding != "same":
+        differs = factor * abs(now - before)
+    return _value(before, factor, unit, differs), _value(now, factor, unit, differs)
+
+
+def _value(value: float | None, factor: float, unit: str, differs: float) -> str:
+    """Return a value with three digits or more: two of what ``differs``, which has the value's factor."""
+    if value is None:
+        return MISSING
+    scaled = factor * value
+    if not math.isfinite(scaled) or scaled == 0.0:
+        return f"{scaled:g} {unit}".rstrip()
+    first = math.floor(math.log10(abs(scaled)))
+    of_difference = first - math.floor(math.log10(differs)) + 2 if math.isfinite(differs) and differs else 0
+    digits = min(max(_DIGITS, of_difference), _MOST_DIGITS)
+    decimals = max(digits - 1 - first, 0)
+    text = f"{scaled:.{decimals}f}" if -_DIGITS <= first < _MOST_DIGITS else f"{scaled:.{_DIGITS - 1}e}"
+    return f"{text} {unit}".rstrip()
 
 
 def _percent(value: float | None, sign: str = "") -> str:
@@ -124,15 +133,19 @@ def failure_lines(check: Check) -> Iterator[str]:
 
 def about(verdict: Verdict) -> str:
     """Return what a verdict is about, in words."""
-    who = f"{verdict.estimator} {verdict.output}".strip()
-    what = _gate_name(verdict.metric)
-    on = f"{verdict.sequence}, {who}" if who else verdict.sequence
+    metric = _metric(verdict.metric)
+    what = metric.gate_name if metric is not None and metric.gate_name else verdict.metric
     found = _FAILED.get(verdict.finding, "")
-    return f"{on}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
+    return f"{_of(verdict)}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
 
 
-def _gate_name(key: str) -> str:
-    return next((m.gate_name for m in known_metrics() if m.key == key and m.gate_name), key)
+def _of(verdict: Verdict) -> str:
+    who = f"{verdict.estimator} {verdict.output}".strip()
+    return f"{verdict.sequence}, {who}" if who else verdict.sequence
+
+
+def _metric(key: str) -> Metric | None:
+    return next((metric for metric in known_metrics() if metric.key == key), None)
 
 
 def note_lines(check: Check) -> Iterator[str]:
@@ -155,9 +168,10 @@ def note_lines(check: Check) -> Iterator[str]:
     yield "; ".join(filter(None, (releases, f"took {check.seconds:.0f} s")))
 
 
-def gate_text(check: Check, width: Width = WIDTH) -> str:
-    """Return a check as plain text: the table of everything, the notes, and last what it comes to."""
-    lines = [as_text(_folded(gate_table(check), WIDTH)), ""]
+def gate_text(check: Check, width: Width = WIDTH, *, verbose: bool = False) -> str:
+    """Return a check as plain text: a table of what fails or of everything, the notes, and last what it comes to."""
+    shown = check.verdicts if verbose else check.failures
+    lines = [*printed_lines(shown), ""] if shown else []
     lines += section("notes", note_lines(check), width)
     lines += section("fails", failure_lines(check), width)
     return "\n".join([*lines, "", headline(check)])

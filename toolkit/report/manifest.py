@@ -91,7 +91,8 @@ def manifest_document(comparison: Comparison, command: str, requested: Configura
     """Return the manifest of a comparison: made by a command, that came to be asked for this."""
     here = _run_here(comparison)
     versions = {name: installed_version(package) for name, package in _PACKAGES.items()}
-    request = msgspec.structs.replace(requested.request, sequences=(comparison.source,), estimators=here)
+    words = tuple(comparison.own_files.get(name, name) for name in here)
+    request = msgspec.structs.replace(requested.request, sequences=(comparison.source,), estimators=words)
     return Manifest(
         schema="vislam.manifest/1",
         command=command,

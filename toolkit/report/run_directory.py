@@ -294,6 +294,16 @@ class SeedsFiles:
     manifest: Manifest
 
 
+def runs_in(directory: Path) -> tuple[Path, ...]:
+    """Return a run directory itself; of the folder that a comparison of several recordings made, all in it, by name."""
+    inside = sorted(directory.iterdir()) if os.path.isdir(directory) and not _holds_run(directory) else []  # noqa: PTH112
+    return tuple(filter(_holds_run, inside)) or (directory,)
+
+
+def _holds_run(directory: Path) -> bool:
+    return any((directory / name).is_file() for name in (METRICS, SEEDS, OUTCOMES))
+
+
 def read_run(directory: Path) -> RunFiles | SeedsFiles:
     """Read a run directory.
 

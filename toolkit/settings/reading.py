@@ -49,6 +49,7 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     except msgspec.ValidationError as error:
         # TOML and the command line have no null: the word "none" is used instead.
         what = readable(error, values, Settings).replace(" or null", " or none").replace("object", "a section of keys")
+        what = what.replace("only auto", "give a number or auto")
         given_text = _given(what.partition(":")[0], values) if what.endswith("got string") else ""
         raise SettingsError(f"{place}: {what}{given_text}") from error
 

@@ -9,6 +9,7 @@ from itertools import zip_longest
 
 import numpy as np
 
+from toolkit.errors import EstimatorError
 from toolkit.estimate import COV_SIZES, Estimate, Finished, Run, check_state
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
@@ -17,6 +18,8 @@ from toolkit.sequence import Packet, Sequence
 
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12
+# Of a product that is symmetric but for rounding, in units of the standard deviations.
+_SYMMETRY_TOLERANCE = 1e-9
 # False alarm rate of the test of mean NEES.
 _FALSE_ALARM = 1e-3
 
@@ -56,6 +59,22 @@ def watch(build: Build, sequence: Sequence) -> Watched:
         online_copies.append(copies_of(online[-1]))
     finished = estimator.finish()
     return Watched(sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)
+
+
+def declines(build: Build, sequence: Sequence) -> str:
+    """Return what an estimator says of an input that it is not made for; empty where it takes it.
+
+    That is an EstimatorError in ``build`` or before it has answered for the first motion. Any other error is none.
+    """
+    try:
+        for index, _ in enumerate(answers(build, sequence)):
+            if index == 1:
+                break
+    except EstimatorError as error:
+        return str(error)
+    except Exception:  # anybody's code, which may raise anything; to run it again tells what
+        return ""
+    return ""
 
 
 def answers(build: Build, sequence: Sequence) -> Iterator[Estimate | None]:
@@ -240,13 +259,15 @@ def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
         return f"has the shape {cov.shape}; expected {' or '.join(f'{n} x {n}' for n in sizes)}"
     if not np.isfinite(cov).all():
         return "is not finite"
-    if not np.array_equal(cov, cov.T):
-        return f"is not symmetric: it differs from its transpose by {_largest(cov, cov.T):.3g}"
     variances = np.diagonal(cov)
     if (variances <= 0.0).any():
         return f"has the variance {variances.min():.3g} in row {int(variances.argmin())}"
     sigmas = np.sqrt(variances)
-    least = float(np.linalg.eigvalsh(cov / np.outer(sigmas, sigmas))[0])
+    correlations = cov / np.outer(sigmas, sigmas)
+    off = _largest(correlations, correlations.T)
+    if off > _SYMMETRY_TOLERANCE:
+        return f"is not symmetric: it differs from its transpose by {off:.3g} times the standard deviations"
+    least = float(np.linalg.eigvalsh(correlations)[0])
     return "" if least > 0.0 else f"is not positive definite: its least eigenvalue is {least:.3g} times its scale"
 
 

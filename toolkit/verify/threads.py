@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 from toolkit import runner
-from toolkit.errors import EstimatorError
+from toolkit.errors import EstimatorError, SystemLimitError
 from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.threads import THREAD_VARIABLES
@@ -21,6 +21,8 @@ from toolkit.verify.promises import arrays_of
 from toolkit.verify.subject import subject_of
 
 UNAVAILABLE = "unavailable"
+# The first line of a process that has started.
+_STARTED = "started"
 _DURATION_S, _SEED = 0.8, 4
 _TIMEOUT_S = 600
 
@@ -28,10 +30,11 @@ _TIMEOUT_S = 600
 def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     """Run estimators in a process with a number of threads; return a digest of all answers, by "NAME on SCENARIO".
 
-    Raises EstimatorError where the process does not end well.
+    Raises EstimatorError where the process does not end well, SystemLimitError where it cannot start.
     """
     # Idle threads sleep at once: spinning, they starve a busy machine.
     environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"OPENBLAS_THREAD_TIMEOUT": "4"}
+    environment["PYTHONPATH"] = os.pathsep.join(folder or os.getcwd() for folder in sys.path)  # noqa: PTH109
     arguments = [sys.executable, "-m", __name__, str(threads), *estimators]
     try:
         done = subprocess.run(
@@ -39,8 +42,12 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
         )
     except subprocess.TimeoutExpired as error:
         raise EstimatorError(f"with {threads} threads it did not end within {_TIMEOUT_S} s") from error
+    except OSError as error:
+        raise SystemLimitError(f"no process can be started ({error.strerror or error})") from error
+    last = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
+    if not done.stdout.startswith(_STARTED):
+        raise SystemLimitError(f"its process cannot start: {last[0]}")
     if done.returncode != 0:
-        last = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
         raise EstimatorError(f"with {threads} threads its process ended: {last[0]}")
     digests: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
     return digests
@@ -79,6 +86,7 @@ def main(arguments: list[str]) -> None:
     """Print the digests of the estimators named behind the number of threads."""
     if hasattr(os, "sched_setaffinity"):  # read by GTSAM's thread pool
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(arguments[0])])
+    print(_STARTED, flush=True)
     print(json.dumps(_digests(arguments[1:])))
 
 

@@ -1,0 +1,112 @@
+"""An estimator in a file of one's own is compared, kept, gated and reported like an installed one."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import toolkit
+from toolkit.cli import main
+from toolkit.estimator import find
+
+PROJECT = Path(__file__).parents[2]
+SHORT = ["--max-frames", "12", "--figures", "none"]
+
+
+@pytest.fixture(autouse=True)
+def my_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Dead reckoning as a file of one's own, which imports what stands beside it."""
+    monkeypatch.chdir(tmp_path)
+    text = (PROJECT / "filters/dead_reckoning.py").read_text()
+    Path("beside_my_filter.py").write_text("FACTOR = 1\n")
+    path = Path("my_filter.py")
+    path.write_text(f"{text}\nfrom beside_my_filter import FACTOR\n")
+    return path
+
+
+def scores(capsys: pytest.CaptureFixture[str]) -> dict[str, dict]:
+    return {run["estimator"]: run for run in json.loads(capsys.readouterr().out)["runs"]}
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(capsys, workers: str) -> None:
+    words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--workers", workers]
+    assert main([*words, "--json"]) == 0
+    found = scores(capsys)
+    assert list(found) == ["dead-reckoning", "my-filter"]
+    assert found["my-filter"]["metrics"]["ate_se3_m"] == found["dead-reckoning"]["metrics"]["ate_se3_m"]
+
+
+def test_python_takes_a_file_among_names() -> None:
+    result = toolkit.compare("drive", ["dead-reckoning", "my_filter.py"], max_frames=12, workers=1)
+    assert set(result.runs) == {"dead-reckoning", "my-filter"}
+
+
+def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path, capsys) -> None:
+    words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--seeds", "2", "--out", "over"]
+    found = []
+    for change in ("", "", "# another filter\n"):
+        with my_filter.open("a") as file:
+            file.write(change)
+        assert main([*words, "--workers", "2"]) == 0
+        found.append([line for line in capsys.readouterr().out.splitlines() if line.startswith("results:")][-1])
+    assert found == [
+        "results: over",
+        "results: over (4 of 4 runs were there)",
+        "results: over (2 of 4 runs were there)",
+    ]
+
+
+def test_what_was_read_runs_whatever_becomes_of_the_file(my_filter: Path) -> None:
+    entry = find("my_filter.py")
+    my_filter.unlink()
+    assert callable(entry.load())
+
+
+def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter: Path, capsys) -> None:
+    made = [
+        "baseline",
+        "drive:1",
+        "--estimators",
+        "my_filter.py",
+        "--seeds",
+        "5",
+        "--workers",
+        "1",
+        "--out",
+        "base.json",
+    ]
+    check = ["check", "--baseline", "base.json", "--workers", "1"]
+    assert main(made) == main(check) == 0
+    my_filter.rename("other_filter.py")
+    assert main(check) == 1
+    assert "my_filter.py: there is no such file" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter: Path, capsys) -> None:
+    assert main(["compare", "drive", "--estimators", "my_filter.py", *SHORT, "--workers", "1", "--out", "run"]) == 0
+    assert main(["export", "run", "--bundle", "run.zip"]) == main(["reproduce", "run.zip", "--workers", "1"]) == 0
+    my_filter.unlink()
+    assert main(["reproduce", "run.zip", "--workers", "1"]) == 5
+    assert "my_filter.py: there is no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("estimators", "text", "told"),
+    [
+        ("my_filter", "", "is given as its file, as in my_filter.py"),
+        ("nowhere.py", "", "nowhere.py: there is no such file"),
+        ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported"),
+        ("mine.py", "x = 1\n", "mine.py defines no function build(setup)"),
+        ("ekf.py", "def build(setup): ...\n", "give the file another name"),
+        ("my_filter.py,deeper/my_filter.py", "def build(setup): ...\n", "give the file another name"),
+    ],
+)
+def test_a_file_that_is_no_estimator_is_reported_in_one_line(capsys, estimators: str, text: str, told: str) -> None:
+    Path("deeper").mkdir()
+    if text:
+        Path(estimators.rsplit(",", maxsplit=1)[-1]).write_text(text)
+    assert main(["compare", "drive", "--estimators", estimators, *SHORT]) == 5
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert told in printed

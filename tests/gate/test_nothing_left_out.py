@@ -1,0 +1,233 @@
+"""A check that has less to look at than its baseline fails: whatever is removed, emptied, cut short or renamed."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.cli import main
+from toolkit.datasets import load_sequence
+from toolkit.datasets.trajectories import tum
+from toolkit.estimate import Trajectory
+from toolkit.experiment.units import Outcome
+from toolkit.gate.baseline import Baseline, Measured, Series
+from toolkit.gate.case_check import CheckTerms, check_case
+from toolkit.gate.measuring import TimedOutcome, gathered
+from toolkit.geometry import se3_exp
+
+PROJECT = Path(__file__).parents[2]
+RUNS = {"lap": 1, "hall": 2, "maze": 3}
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def cut_in_half(path: Path) -> None:
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[: len(lines) // 2]))
+
+
+def cut_in_a_row(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: 2 * len(content) // 3])
+
+
+def rename(path: Path) -> None:
+    path.rename(path.with_name(f"other{path.suffix}"))
+
+
+DAMAGES = (remove, empty, cut_in_half, cut_in_a_row, rename)
+
+
+def damaged(folders: tuple[str, ...]) -> Iterator[str]:
+    """Damage each file below some folders in each way, one at a time; yield which it is, then restore everything."""
+    for folder in folders:
+        shutil.copytree(folder, f"kept/{folder}")
+    for damage in DAMAGES:
+        for path in sorted(path for folder in folders for path in Path(folder).rglob("*") if path.is_file()):
+            damage(path)
+            yield f"{damage.__name__} {path}"
+            for folder in folders:
+                shutil.rmtree(folder)
+                shutil.copytree(f"kept/{folder}", folder)
+
+
+@pytest.fixture
+def trajectories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of three sequences, one, two and three of each, with their truths."""
+    monkeypatch.chdir(tmp_path)
+    truth = load_sequence("drive").truth
+    assert truth is not None
+    rng = np.random.default_rng(0)
+    for name, runs in RUNS.items():
+        Path("truth").mkdir(exist_ok=True)
+        Path(f"truth/{name}.tum").write_text(tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
+        for run in range(runs):
+            errors = rng.normal(0.0, [0.001] * 3 + [0.05] * 3, (len(truth.t_ns), 6))
+            path = Path(f"results/{name}.tum" if runs == 1 else f"results/{name}/{run}.tum")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(tum.text(Trajectory(truth.t_ns, truth.T_world_imu @ se3_exp(errors))))
+
+
+@pytest.mark.usefixtures("trajectories")
+def test_no_trajectory_and_no_truth_can_be_missing_or_spoilt(capsys: pytest.CaptureFixture[str]) -> None:
+    check = ["check", "--trajectories", "results", "--baseline", "base.json"]
+    assert main(["baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json"]) == 0
+    assert main(check) == 0
+    statuses = {what: main(check) for what in damaged(("results", "truth"))}
+    assert len(statuses) == len(DAMAGES) * (sum(RUNS.values()) + len(RUNS))
+    assert [what for what, status in statuses.items() if status not in (1, 3)] == []
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("trajectories")
+def test_a_run_that_is_not_there_is_named_and_the_rule_that_changed_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json"]) == 0
+    Path("results/maze/1.tum").unlink()
+    capsys.readouterr()
+    assert main(["check", "--trajectories", "results", "--baseline", "base.json"]) == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "maze: run is missing: 1.tum" in printed
+    assert "2 of the baseline's 3 runs are left, too few to test" in printed
+
+
+@pytest.mark.usefixtures("trajectories")
+def test_no_run_and_no_score_of_an_evaluation_can_be_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "truth", "mine=results", "--out", "scored", "--quiet"]) == 0
+    document = json.loads(Path("scored/evaluation.json").read_text())
+    assert main(["baseline", "--trajectories", "scored/evaluation.json", "--out", "base.json"]) == 0
+
+    def status(change: Callable[[dict], object]) -> int:
+        changed = json.loads(json.dumps(document))
+        change(changed)
+        Path("changed.json").write_text(json.dumps(changed))
+        return main(["check", "--trajectories", "changed.json", "--baseline", "base.json"])
+
+    def without(run: int, key: str) -> Callable[[dict], object]:
+        return lambda d: (d["runs"][run]["metrics"].pop(key), d["runs"][run]["notes"].pop(key, ""))
+
+    def null(run: int, key: str) -> Callable[[dict], object]:
+        return lambda d: (d["runs"][run]["metrics"].update({key: None}), d["runs"][run]["notes"].update({key: "lost"}))
+
+    assert status(lambda _: None) == 0
+    scored = json.loads(Path("base.json").read_text())["sequences"][0]["scores"]
+    keys = [key for key, values in scored.items() if None not in values]
+    assert "time_coverage_percent" in keys
+    passed = []
+    for run in range(len(document["runs"])):
+        changes = {f"{how.__name__} {key}": how(run, key) for key in keys for how in (without, null)}
+        changes |= {
+            "run removed": lambda d, i=run: d["runs"].pop(i),
+            "run renamed": lambda d, i=run: d["runs"][i].update(file="results/other.tum"),
+            "sequence renamed": lambda d, i=run: d["sequences"][0].update(sequence="other"),
+            "system renamed": lambda d, i=run: d["runs"][i].update(estimator="other"),
+            "run failed": lambda d, i=run: d["runs"][i].update(status="failed", log=["crashed"]),
+        }
+        passed += [(run, what) for what, change in changes.items() if status(change) not in (1, 3)]
+    assert passed == []
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_no_file_of_a_recording_can_be_missing_or_spoilt(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(PROJECT / "data/drive_small", "recording")
+    words = ["--estimators", "dead-reckoning", "--workers", "1", "--duration", "3"]
+    assert main(["baseline", "recording", *words, "--out", "base.json"]) == 0
+    check = ["check", "--baseline", "base.json", "--workers", "1"]
+    assert main(check) == 0
+    statuses = {what: main(check) for what in damaged(("recording",))}
+    assert len(statuses) == 2 * len(DAMAGES)
+    assert [what for what, status in statuses.items() if status != 1] == []
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def losses(measured: Measured) -> Iterator[tuple[str, Measured]]:
+    """Yield what is measured without one thing: an estimator, a seed, a run, an output, a metric, a value or a time."""
+    last = len(measured.fingerprints) - 1
+    yield "sequence", replace(measured, unreadable="no such file")
+    for name, one in measured.runs.items():
+        others = {other: series for other, series in measured.runs.items() if other != name}
+        yield f"{name} removed", replace(measured, runs=others)
+        yield f"{name} renamed", replace(measured, runs=others | {"other": one})
+        for what, series in losses_of_a_series(one, last):
+            yield f"{name} {what}", replace(measured, runs=others | {name: series})
+    for seed in range(last + 1):
+        fingerprints = measured.fingerprints
+        yield f"seed {seed} removed", replace(measured, fingerprints=fingerprints[:seed] + fingerprints[seed + 1 :])
+        other = (*fingerprints[:seed], "other", *fingerprints[seed + 1 :])
+        yield f"seed {seed} of other data", replace(measured, fingerprints=other, hashes=other)
+
+
+def losses_of_a_series(one: Series, last: int) -> Iterator[tuple[str, Series]]:
+    yield "without its last seed", replace(one, status=one.status[:last], speed=one.speed[:last])
+    for i in range(last + 1):
+        yield f"failed under {i}", replace(one, status=(*one.status[:i], "failed", *one.status[i + 1 :]))
+        if last:
+            yield f"without time under {i}", replace(one, speed=(*one.speed[:i], None, *one.speed[i + 1 :]))
+    for output, metrics in one.outputs.items():
+        yield f"{output} removed", replace(one, outputs={o: m for o, m in one.outputs.items() if o != output})
+        yield f"{output} renamed", replace(one, outputs={"final": metrics})
+        yield f"{output} empty", replace(one, outputs={output: {}})
+        for key, values in metrics.items():
+            left = {other: of_it for other, of_it in metrics.items() if other != key}
+            changed = {"removed": left, "renamed": left | {"other": values}, "short": metrics | {key: values[:last]}}
+            for i in range(last + 1):
+                changed[f"without {i}"] = metrics | {key: (*values[:i], None, *values[i + 1 :])}
+            for what, of_output in changed.items():
+                yield f"{key} {what}", replace(one, outputs={output: of_output})
+
+
+def test_nothing_that_was_measured_can_be_missing(baseline: Baseline, gate) -> None:
+    passed, count = [], 0
+    for i, (case, before) in enumerate(baseline.cases):
+        for what, now in losses(before):
+            measured = gate.as_measured(baseline)
+            measured[i] = now
+            count += 1
+            passed += [f"{case.source}: {what}"] if gate.checked(baseline, measured).passed else []
+    assert count > 500
+    assert passed == []
+
+
+def test_a_unit_that_gives_no_result_is_a_run_that_failed(baseline: Baseline) -> None:
+    case, _ = baseline.cases[0]
+    found = [TimedOutcome(Outcome(seed, name, "ok")) for seed in case.seeds for name in case.estimators]
+    before = gathered(case, found, (), {})
+    for place in range(len(found)):
+        now = gathered(case, [*found[:place], *found[place + 1 :]], (), {})
+        (verdict,) = check_case(case, before, now, baseline.bounds, CheckTerms(speed=False)).verdicts
+        assert (verdict.finding, verdict.metric) == ("regressed", "status")
+
+
+def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline: Baseline, gate) -> None:
+    case, before = baseline.cases[0]
+    one_seed = gathered_first(before)
+    single = replace(baseline, cases=((replace(case, seeds=(0,)), one_seed), baseline.cases[1]))
+    for percent, fails in ((0.4, False), (0.6, True)):
+        now = gate.edited(one_seed, lambda _n, k, v, f=1.0 + percent / 100.0: v * f if k == "ate_se3_m" else v)
+        check = gate.checked(single, [gate.another(now), gate.as_measured(baseline)[1]], accept_better=True)
+        assert any("one seed" in note for note in check.notes)
+        assert bool([v for v in check.failures if v.metric == "ate_se3_m"]) is fails
+
+
+def gathered_first(measured: Measured) -> Measured:
+    """Return what is measured under the first seed alone."""
+    runs = {
+        name: replace(
+            one,
+            status=one.status[:1],
+            speed=one.speed[:1],
+            outputs={o: {k: values[:1] for k, values in metrics.items()} for o, metrics in one.outputs.items()},
+        )
+        for name, one in measured.runs.items()
+    }
+    return replace(measured, hashes=measured.hashes[:1], fingerprints=measured.fingerprints[:1], runs=runs)
