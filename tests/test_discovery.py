@@ -117,16 +117,16 @@ def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
 
 
 def test_a_module_says_which_common_rules_it_treats_otherwise(package):
-    write(package, "says.py", 'RULES = {"window": "it keeps all", "bridge_gaps": True}')
+    write(package, "says.py", 'RULES = {"window": "it keeps all"}')
     write(package, "silent.py", "")
-    write(package, "parts.py", 'RULES = {"match_tracks": ("imu",)}')
+    write(package, "parts.py", 'RULES = {"window": ("imu",)}')
     says, silent, parts = find("says"), find("silent"), find("parts")
-    assert parts.obeys("match_tracks", "imu")
-    assert not parts.obeys("match_tracks", "twist")
-    assert not parts.obeys("match_tracks")
-    assert {rule for rule in RULES if says.obeys(rule)} == {"outliers", "tracks", "bridge_gaps"}
+    assert parts.obeys("window", "imu")
+    assert not parts.obeys("window", "twist")
+    assert not parts.obeys("window")
+    assert {rule for rule in RULES if says.obeys(rule)} == {"outliers"}
     assert says.ignores() == {"window": "it keeps all"}
-    assert {rule for rule in RULES if silent.obeys(rule)} == {"outliers", "tracks", "window"}
+    assert {rule for rule in RULES if silent.obeys(rule)} == {"outliers", "window"}
     assert not silent.ignores()
 
 

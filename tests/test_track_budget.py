@@ -56,15 +56,9 @@ def test_withheld_tracks_are_the_same_with_a_budget():
     np.testing.assert_array_equal(budgeted().held_out.uv_px, drive().held_out.uv_px)
 
 
-def test_packets_have_the_tracks_given_with_their_ages_in_the_recording():
-    ages = {
-        (packet.index, track): age
-        for packet in drive().packets()
-        for track, age in zip(packet.frame.track_ids.tolist(), packet.frame.ages.tolist(), strict=True)
-    }
+def test_packets_have_the_tracks_given():
     for packet in budgeted().packets():
         assert set(packet.frame.track_ids.tolist()) == tracks_of(budgeted().visible, packet.index)
-        assert packet.frame.ages.tolist() == [ages[packet.index, i] for i in packet.frame.track_ids.tolist()]
 
 
 def test_every_part_of_the_view_has_one_track_before_any_has_two():

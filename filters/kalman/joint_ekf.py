@@ -87,5 +87,5 @@ class JointEkf:
         sightings, points = sightings.select(reliable), points[reliable]
         if len(points):
             linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
-            weight = self._rig.track_weight
-            joint_landmarks.add_tracks(joint, sightings.track_ids, points, linearised, weight)
+            weighted = linearised.scaled(np.full(len(points), np.sqrt(self._rig.track_weight)))
+            joint_landmarks.add_tracks(joint, sightings.track_ids, points, weighted)

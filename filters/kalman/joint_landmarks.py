@@ -132,13 +132,11 @@ def _pose_and_landmark_cov(joint: JointBelief) -> Array:
     return np.asarray(joint.cov[rows[:, :, None], rows[:, None, :]])
 
 
-def add_tracks(
-    joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised, track_weight: float
-) -> None:
+def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
     """Add N tracks seen from the clones to the state at points (N, 3) m, with the correlations of their sightings.
 
-    A landmark's error follows from the errors of its measurements, whose information counts by the weight of tracks,
-    and of the poses: it is ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``, the error of its least-squares point.
+    A landmark's error follows from the errors of its measurements, ``linearised`` with their weights, and of the poses:
+    it is ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``, the error of its least-squares point.
     """
     count, window = linearised.residuals.shape[:2]
     H_point = linearised.H_point.reshape(count, 3 * window, 3)
@@ -149,5 +147,5 @@ def add_tracks(
     ends = np.arange(0, blocks.size + 1, 6 * window)
     jacobian = csr_array((blocks.ravel(), clones, ends), (3 * count, joint.cov.shape[0]))
     cov = np.zeros((count, 3, count, 3))
-    cov[np.arange(count), :, np.arange(count), :] = cov_each / track_weight
+    cov[np.arange(count), :, np.arange(count), :] = cov_each
     joint.add_landmarks(track_ids, points, jacobian, cov.reshape(3 * count, 3 * count))

@@ -102,8 +102,7 @@ class SlidingWindowFilter:
         kept = np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room]
         if len(kept):
             ids, points = accepted.sightings.track_ids[kept], accepted.points[kept]
-            seen = track_gate.linearised(accepted, kept)
-            joint_landmarks.add_tracks(joint, ids, points, seen, self._rig.track_weight)
+            joint_landmarks.add_tracks(joint, ids, points, track_gate.linearised(accepted, kept))
         first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
         self._update(accepted.H[:, first:], accepted.residuals)
 

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import gtsam
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
 
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates, propagate
@@ -22,10 +21,9 @@ from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.models.stereo import CHANNELS, predict, project, triangulate_world
+from toolkit.models.stereo import project, triangulate_world
 from toolkit.sequence import Observations, Sequence, StereoFrame, StereoRig
 from toolkit.simulation import Scenario, simulate
-from toolkit.simulation.track_noise import TrackNoise
 
 SEED = 11
 
@@ -114,42 +112,11 @@ class BatchAtTruth:
 
 
 def _seen(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> gtsam.GaussianFactorGraph:
-    """Return the sightings of frames, linear: each by itself, or those of a track with their whole covariance."""
-    if rig.track_noise is None:
-        graph, camera = gtsam.NonlinearFactorGraph(), StereoFactors(rig)
-        for k, frame in enumerate(frames):
-            for factor in camera.of(frame, k):
-                graph.add(factor)
-        return graph.linearize(values)
-    linear = gtsam.GaussianFactorGraph()
-    for track_id in np.unique(np.concatenate([frame.track_ids for frame in frames])).tolist():
-        linear.push_back(_track(track_id, frames, values, rig))
-    return linear
-
-
-def _track(track_id: int, frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> gtsam.GaussianConditional:
-    """Return the sightings of one track. A factor on so many variables is to be had as a conditional only."""
-    ks = [k for k, frame in enumerate(frames) if track_id in frame.track_ids]
-    rows = [frames[k].track_ids.tolist().index(track_id) for k in ks]
-    ages = np.array([frames[k].ages[row] for k, row in zip(ks, rows, strict=True)], dtype=float)
-    at = [predict(values.atPoint3(L(track_id))[None], values.atPose3(X(k)).matrix(), rig) for k in ks]
-    assert rig.track_noise is not None
-    # A channel a sighting, the sightings of a channel together.
-    cov = block_diag(*rig.track_noise.cov(ages))
-    root_information = np.linalg.inv(np.linalg.cholesky(cov))
-
-    def by_channel(of_sightings: list[Array]) -> Array:
-        stacked = np.einsum("ij,njc->inc", CHANNELS, np.array(of_sightings))
-        return root_information @ stacked.reshape(3 * len(ks), -1)
-
-    def alone(n: int) -> list[Array]:
-        return [p.d_uv_d_pose[0] * (m == n) for m, p in enumerate(at)]
-
-    terms = [(L(track_id), by_channel([p.d_uv_d_point[0] for p in at]))]
-    terms += [(X(k), by_channel(alone(n))) for n, k in enumerate(ks)]
-    residuals = [frames[k].uvs_px[row] - p.uv_px[0] for k, row, p in zip(ks, rows, at, strict=True)]
-    unit = gtsam.noiseModel.Unit.Create(3 * len(ks))
-    return gtsam.GaussianConditional(terms, len(terms), by_channel([r[:, None] for r in residuals])[:, 0], unit)
+    graph, camera = gtsam.NonlinearFactorGraph(), StereoFactors(rig)
+    for k, frame in enumerate(frames):
+        for factor in camera.of(frame, k):
+            graph.add(factor)
+    return graph.linearize(values)
 
 
 def first_belief(recording: Recording) -> Belief:
@@ -162,23 +129,6 @@ def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
     assert np.abs((one - other) / np.outer(sigma, sigma)).max() < relative
 
 
-def with_track_errors(scenario: Scenario, noise: TrackNoise, seed: int) -> Sequence:
-    """Record a scenario whose sightings err as a noise of tracks says; the rig states it."""
-    unrounded = replace(scenario, camera=replace(scenario.camera, step_px=0.0))
-    sequence, exact = simulate(unrounded, seed), simulate(replace(unrounded, noise_scale=0.0), seed)
-    seen, rng = exact.observations, np.random.default_rng(seed)
-    errors_px = rng.standard_normal((len(seen), 3)) * noise.white_px
-    for track_id in np.unique(seen.track_id):
-        rows = np.flatnonzero(seen.track_id == track_id)
-        ages = seen.frame[rows] - seen.frame[rows[0]]
-        steps = rng.standard_normal((ages[-1] + 1, 3)) * noise.walk_px
-        steps[0] = rng.standard_normal(3) * noise.offset_px
-        errors_px[rows] += np.cumsum(steps, axis=0)[ages]
-    uv_px = seen.uv_px + errors_px @ np.linalg.inv(CHANNELS).T
-    observations = Observations(seen.frame, seen.track_id, uv_px)
-    return replace(sequence, observations=observations, rig=replace(sequence.rig, track_noise=noise))
-
-
 @pytest.fixture(scope="session")
 def oracle() -> SimpleNamespace:
     """Return the tools of this file: what is not a fixture cannot be imported from here."""
@@ -186,7 +136,6 @@ def oracle() -> SimpleNamespace:
         recorded=recorded,
         batch=BatchAtTruth,
         assert_covariances_agree=assert_covariances_agree,
-        with_track_errors=with_track_errors,
     )
 
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from filters.kalman.residual_correlation import ResidualCorrelation
 
 from filters.kalman import compiled as compiled_parts
 from filters.kalman import multiview, track_gate, tracks_in_view
@@ -22,12 +21,10 @@ from toolkit.compilation import Compilation
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound
 from toolkit.simulation import FLIGHT
-from toolkit.simulation.track_noise import TrackNoise
 
 WINDOW, TRACKS = 9, 40
 # Both round at 1e-16 of terms that cancel by up to a million, the carried covariance against the noise of a pixel.
 TOLERANCE = 1e-9
-CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0.0, 0.7, 0.0]))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +32,7 @@ def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
     requested = Compilation("compiled")
     gate, in_view = compiled_parts.track_test(requested), compiled_parts.steps_in_view(requested)
-    return gate, in_view, compiled_parts.learning(requested), compiled_parts.images(requested)
+    return gate, in_view, compiled_parts.images(requested)
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +62,12 @@ def sightings_in(rig, window: WindowPoses) -> TrackSightings:
     uvs_px[7, :, :2] = uvs_px[7, :, 1::-1]
     seen = rng.random((TRACKS, WINDOW)) < rng.uniform(0.3, 1.0, TRACKS)[:, None]
     seen[:, 4:6] = True
-    return TrackSightings(np.arange(TRACKS), uvs_px, seen, np.tile(np.arange(3, 3 + WINDOW), (TRACKS, 1)))
+    return TrackSightings(np.arange(TRACKS), uvs_px, seen)
 
 
-@pytest.mark.parametrize("noise", [None, CORRELATED], ids=["white", "correlated"])
-def test_compiled_and_numpy_test_tracks_alike(compiled, flight, noise):
+def test_compiled_and_numpy_test_tracks_alike(compiled, flight):
     """Of rows in two bases of the same space those products are alike that any basis gives."""
-    rig, window = replace(flight[0], track_noise=noise), flight[1]
+    rig, window = flight
     arguments = sightings_in(rig, window), window, rig, chi2_bound(np.arange(3 * WINDOW + 1), 0.95)
     ours, theirs = track_gate.tested(*arguments), compiled(*arguments)
     assert ours.sightings.track_ids.tolist() == theirs.sightings.track_ids.tolist()
@@ -91,10 +87,9 @@ def test_compiled_and_numpy_test_tracks_alike(compiled, flight, noise):
 
 
 @pytest.mark.parametrize(("probability", "huber"), [(0.95, None), (0.999, 1.0), (None, None)])
-@pytest.mark.parametrize("noise", [None, CORRELATED], ids=["white", "correlated"])
-def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noise, probability, huber):
+def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, probability, huber):
     """Of tracks with rejected and weighed sightings, newest ones that do not fit and one that is behind a camera."""
-    rig, window = replace(flight[0], track_noise=noise), flight[1]
+    rig, window = flight
     tracks = followed_in(rig, window)
     ours, theirs = (
         tell(tracks, RootedWindow.of(window), rig, FrameGate(probability, huber))
@@ -118,29 +113,14 @@ def test_compiled_and_numpy_predict_the_same_images(kernels, flight):
     points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
     points[7] = window.poses[-1, :3, 3] - 5.0 * window.poses[-1, :3, :3] @ rig.T_imu_cam[:3, 2]
     points[8] = (window.poses[-1] @ rig.T_imu_cam @ [0.3, 0.2, 1e-5, 1.0])[:3]
-    theirs = kernels[3].linearised(points, window.poses, rig)
+    theirs = kernels[2].linearised(points, window.poses, rig)
     for ours, other in zip(multiview.NUMPY.linearised(points, window.poses, rig), theirs, strict=True):
         assert ours.shape == other.shape
         assert ours == pytest.approx(other, rel=TOLERANCE, abs=TOLERANCE * np.abs(ours[np.arange(TRACKS) != 8]).max())
     for ours, other in zip(multiview.NUMPY.plain(points, window.poses, rig), theirs[::3], strict=True):
         assert ours == pytest.approx(other, rel=TOLERANCE)
-    for plain, other in zip(kernels[3].plain(points, window.poses, rig), theirs[::3], strict=True):
+    for plain, other in zip(kernels[2].plain(points, window.poses, rig), theirs[::3], strict=True):
         np.testing.assert_array_equal(plain, other)
-
-
-def test_compiled_and_numpy_learn_the_same_correlation_of_residuals(kernels, flight):
-    """Of tracks with gaps and of too few sightings, whose errors walk."""
-    rig, window = flight
-    sightings = sightings_in(rig, window)
-    sightings.uvs_px[8:] += np.cumsum(np.random.default_rng(7).normal(0.0, 3.0, (TRACKS - 8, WINDOW, 3)), axis=1)
-    sightings = sightings.select(np.arange(8, TRACKS))
-    points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
-    ours, theirs = ResidualCorrelation(rig), ResidualCorrelation(rig)
-    ours.learn(sightings, points, window.poses)
-    kernels[2](theirs, sightings, points, window.poses, rig)
-    assert 0.0 < ours.correlation < 0.98
-    assert theirs.correlation == pytest.approx(ours.correlation, rel=TOLERANCE)
-    assert theirs.share == pytest.approx(ours.share, rel=TOLERANCE)
 
 
 def followed_in(rig, window: WindowPoses) -> FollowedTracks:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from filters.smoothing.chained_window import ChainedWindow
 
 from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
@@ -21,11 +20,6 @@ from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.track_faults import moving_objects
-
-
-def unchained(lag_ns: int) -> FixedLagTree:
-    """Return a tree whose factors are its own."""
-    return FixedLagTree(lag_ns, ChainedWindow(DRIVE.rig, None))
 
 
 def setup_of(sequence: Sequence) -> Setup:
@@ -64,7 +58,7 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
     The fixes pull each position away from where it begins, beyond the threshold of relinearisation: a prior that
     followed its variables there would pull the less.
     """
-    window, everything = unchained(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
+    window, everything = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     for k in range(8):
         extension = chain_link(k)
@@ -92,7 +86,7 @@ def test_landmarks_that_the_past_ties_together_are_eliminated_a_dozen_in_a_cliqu
 
 def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_cholesky():
     """As with a good IMU after minutes: a clique of two such states is beyond the condition that GTSAM allows one."""
-    window, stiff = unchained(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    window, stiff = FixedLagTree(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
     everything, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(6):
         extension = GraphExtension(state_keys=[X(k)])
@@ -134,7 +128,7 @@ def test_a_point_that_moves_with_the_car_does_not_end_it(tracks, seed, depth_m, 
 def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sightings(monkeypatch):
     """A hold that holds nothing stands for one that is too weak."""
     monkeypatch.setattr(indeterminate, "WEAK_SIGMA", 1e200)
-    window, extension = unchained(NS_PER_S), chain_link(0)
+    window, extension = FixedLagTree(NS_PER_S), chain_link(0)
     extension.landmark_ids = [5, 6]
     for i, seen in ((5, 1.0), (6, 0.0)):
         information = gtsam.noiseModel.Diagonal.Precisions(np.full(3, seen))
@@ -151,7 +145,7 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
 
 def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_contributed_before():
     """The position that saw it has left, so the prior holds the landmark: it is marginalised, not cut out."""
-    window, everything, start = unchained(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    window, everything, start = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(5):
         extension = chain_link(k)
         sighting = gtsam.BetweenFactorPoint3(X(k), L(5), np.array([7.0 - k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
@@ -233,7 +227,7 @@ def test_the_weak_prior_of_a_landmark_is_a_tenth_of_a_radian_or_wider(distance_m
 
 def test_a_landmark_without_sightings_does_not_come_into_a_tree_built_anew():
     """GTSAM, asked to marginalise a variable that is in no clique, ends the process."""
-    window, extension = unchained(2 * NS_PER_S), chain_link(0)
+    window, extension = FixedLagTree(2 * NS_PER_S), chain_link(0)
     extension.landmark_ids = [5]
     extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
     unit = gtsam.noiseModel.Unit.Create(3)

@@ -23,14 +23,11 @@ from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.models.twist import TWIST_LAYOUT
 from toolkit.sequence import Prior, Sequence
-from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT
-from toolkit.simulation.track_noise import TrackNoise
 
 # Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.
 LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1])
 YAW = 3
-TRACK_NOISE = TrackNoise(np.full(3, 0.02), np.array([0.09, 0.13, 0.11]), np.array([0.0, 0.9, 0.0]))
 
 SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=3.0)}
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
@@ -121,21 +118,6 @@ def loosened(prior: Prior, first: Belief) -> Prior:
     directions = np.zeros((15, 4))
     directions[rows] = gauge_directions(first)
     return replace(prior, cov=prior.cov + (directions * LOOSENESS**2) @ directions.T)
-
-
-@every_scenario
-@pytest.mark.parametrize("name", ["msckf", "msckf-slam"])
-def test_no_information_about_position_and_yaw_is_gained_from_correlated_tracks(name, scenario, oracle):
-    """A landmark that enters the state with its track's error moves by a Gauss-Newton step as it does. Linearised
-    there from then on, the tracks told a heading.
-    """
-    sequence = oracle.with_track_errors(replace(SCENARIOS[scenario], duration_s=2.0), TRACK_NOISE, 4)
-    first = motion_model(sequence.noise, sequence.gravity_world).initial_belief(sequence.prior)
-    prior, settings = loosened(sequence.prior, first), Settings(window=Window(lag_s=0.4))
-    setup = Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind, settings=settings)
-    information = answers(name, setup, sequence, AtFirstEstimates()).information()
-    root = np.linalg.cholesky(np.linalg.inv(information[0]))
-    assert np.linalg.eigvalsh(root.T @ information @ root).max() < 1.0 + 1e-6
 
 
 @every_scenario

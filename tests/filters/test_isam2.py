@@ -9,7 +9,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from filters.smoothing.discounted_tracks import DiscountedTracks
 
 from filters import isam2
 from filters.isam2 import Isam2
@@ -29,12 +28,12 @@ from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
-from toolkit.models.factors import SCALE, B, L, V, X, kind_of
+from toolkit.models.factors import B, L, V, X, kind_of
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
-from toolkit.simulation import DRIVE, DRIVE_IMU, DRIVE_REALISTIC, FLIGHT, Scenario, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.track_faults import cut_tracks, moving_objects
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
@@ -224,7 +223,7 @@ def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
 
 @pytest.mark.parametrize("index", [0, 7, 2**56 - 1])
 def test_the_kind_of_a_key_is_that_of_gtsams_symbol(index):
-    for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index), "s": SCALE}.items():
+    for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index)}.items():
         assert kind_of(key) == kind == chr(gtsam.Symbol(key).chr())
 
 
@@ -514,40 +513,3 @@ def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew
     ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 20 m of odometry that is good to 0.1 m.
     assert np.linalg.norm(newest.T_world_imu[:3, 3] - ends_at) < 0.5
-
-
-def last_solves(scenario: Scenario, monkeypatch) -> list[tuple[gtsam.NonlinearFactorGraph, Solution]]:
-    """Return the graphs and the solutions of the solves at the end of a run; its answer is the last one."""
-    solves = list[tuple[gtsam.NonlinearFactorGraph, Solution]]()
-
-    def recorded(graph: gtsam.NonlinearFactorGraph, *args: Any, **named: Any) -> Solution:
-        solves.append((graph, solve(graph, *args, **named)))
-        return solves[-1][1]
-
-    monkeypatch.setattr(isam2, "solve", recorded)
-    sequence = simulate(replace(scenario, duration_s=6.0), 0)
-    assert sequence.prior is not None
-    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-    estimator = Isam2(setup)
-    for packet in sequence.packets():
-        estimator.step(packet)
-    answer = estimator.finish().trajectory
-    last = [solves[-1][1].values.atPose3(X(k)).matrix() for k in range(len(answer.t_ns))]
-    np.testing.assert_array_equal(answer.T_world_imu, last)
-    return solves
-
-
-def test_the_last_answer_gives_tracks_the_smaller_weight_that_all_their_residuals_show(monkeypatch):
-    (before, first), (after, second) = last_solves(DRIVE_REALISTIC, monkeypatch)
-    assert second.converged
-    assert after.error(first.values) < 0.9 * before.error(first.values)
-    assert after.error(second.values) < after.error(first.values)
-
-
-def test_where_tracks_err_as_stated_the_last_answer_is_solved_for_once(monkeypatch):
-    assert len(last_solves(DRIVE, monkeypatch)) == 1
-
-
-def test_a_larger_weight_than_the_run_found_is_not_taken(monkeypatch):
-    monkeypatch.setattr(DiscountedTracks, "relearned", lambda self, *_: DiscountedTracks(self._setup))
-    assert len(last_solves(DRIVE_REALISTIC, monkeypatch)) == 1

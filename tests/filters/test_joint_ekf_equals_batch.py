@@ -23,6 +23,7 @@ SCENARIOS = [
 SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=30)) for s in SCENARIOS]
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+both_weights = pytest.mark.parametrize("weight", [1.0, 0.25])
 both_linearisations = pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
 
 
@@ -37,11 +38,18 @@ def last_answer(recording, at):
     return estimate, packet.index, len(recording.track_ids) - len(ekf.joint.landmark_ids)
 
 
+def weighing(recording, weight):
+    """Return the recording with a weight of tracks."""
+    sequence = recording.sequence
+    return replace(recording, sequence=replace(sequence, rig=replace(sequence.rig, track_weight=weight)))
+
+
 @every_scenario
 @both_linearisations
-def test_its_last_mean_is_that_of_the_batch(scenario, at, oracle):
+@both_weights
+def test_its_last_mean_is_that_of_the_batch(scenario, at, weight, oracle):
     """Errors of 1e-4 of the stated noise: both correct by micrometres and agree to a hundredth of that or better."""
-    recording = oracle.recorded(scenario, 1e-4)
+    recording = weighing(oracle.recorded(scenario, 1e-4), weight)
     estimate, last, forgotten = last_answer(recording, at)
     mean, _ = oracle.batch(recording, recording.track_ids).state(last)
     assert forgotten > 10, "tracks must have come and gone"
@@ -52,9 +60,10 @@ def test_its_last_mean_is_that_of_the_batch(scenario, at, oracle):
 
 @every_scenario
 @both_linearisations
-def test_its_last_covariance_is_that_of_the_batch(scenario, at, oracle):
+@both_weights
+def test_its_last_covariance_is_that_of_the_batch(scenario, at, weight, oracle):
     """Errors of 1e-7 of the stated noise: depths, and with them Jacobians, are off by 1e-8 of themselves."""
-    recording = oracle.recorded(scenario, 1e-7)
+    recording = weighing(oracle.recorded(scenario, 1e-7), weight)
     estimate, last, forgotten = last_answer(recording, at)
     _, cov = oracle.batch(recording, recording.track_ids).state(last)
     assert forgotten > 10, "tracks must have come and gone"

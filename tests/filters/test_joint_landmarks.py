@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filters.kalman.track_error_states import TrackErrorBelief, implausible_errors
 
 from filters import iekf
 from filters.kalman import joint_landmarks
@@ -16,7 +15,6 @@ from toolkit.models import stereo
 from toolkit.models.motion import motion_model
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import FLIGHT, simulate
-from toolkit.simulation.track_noise import TrackNoise
 
 SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)
 
@@ -35,7 +33,7 @@ def belief_with_a_landmark(depth_m: float) -> JointBelief:
 def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
     """Return a frame that shows the landmark where the projection's formula puts it, but for ``off_px`` (3,)."""
     uv_px = stereo.predict(joint.points, joint.clones[0], SEQUENCE.rig).uv_px + off_px
-    return StereoFrame(0, np.array([7]), uv_px, np.zeros(1, dtype=np.int64))
+    return StereoFrame(0, np.array([7]), uv_px)
 
 
 @pytest.mark.parametrize("correct", [joint_landmarks.correct, iekf.correct], ids=["single", "iterated"])
@@ -48,15 +46,3 @@ def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residua
     assert (gate.tested, gate.accepted) == (1, accepted)
     assert np.array_equal(joint.cov, cov) == (not accepted)
     assert np.array_equal(joint.points, point) == (not accepted)
-
-
-def test_a_track_that_errs_beyond_its_walk_and_offset_is_implausible() -> None:
-    """Errors of 1.9 and 2.9 standard deviations in each channel, squared 10.8 and 25.2: the bound is between."""
-    noise = TrackNoise(np.full(3, 0.1), np.full(3, 0.2), np.array([0.0, 0.7, 0.0]))
-    assert SEQUENCE.prior is not None
-    joint = TrackErrorBelief(motion_model(SEQUENCE.noise, SEQUENCE.gravity_world).initial_belief(SEQUENCE.prior), noise)
-    ages = np.array([9, 9, 36])
-    spread_px = np.sqrt(0.04 * ages[:, None] + np.array([0.0, 0.49, 0.0]))
-    joint.track_errors_px, joint.ages = np.array([[1.9], [2.9], [1.9]]) * spread_px, ages
-    assert implausible_errors(joint, FrameGate(0.999)).tolist() == [False, True, False]
-    assert not implausible_errors(joint, FrameGate(None)).any()

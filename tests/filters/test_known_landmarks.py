@@ -12,10 +12,9 @@ from toolkit.geometry import se3, transform
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES
-from toolkit.simulation import DRIVE, SCENARIOS, simulate
-from toolkit.simulation.track_noise import TrackNoise
+from toolkit.simulation import DRIVE, simulate
 
 RIG, COUNT = DRIVE.rig, 4000
 IDS = np.arange(COUNT)
@@ -37,7 +36,7 @@ def pose_after(way_m: float) -> np.ndarray:
 def frame_from(T_world_imu: np.ndarray, points: np.ndarray, seed: int) -> StereoFrame:
     """Return what a camera sees of points, with the noise that is stated."""
     noise = np.random.default_rng(seed).standard_normal((COUNT, 3)) @ ROOT.T
-    return StereoFrame(0, IDS, stereo.predict(points, T_world_imu, RIG).uv_px + noise, np.zeros_like(IDS))
+    return StereoFrame(0, IDS, stereo.predict(points, T_world_imu, RIG).uv_px + noise)
 
 
 def estimated(frames: list[tuple[StereoFrame, np.ndarray]], true: np.ndarray) -> np.ndarray:
@@ -60,7 +59,7 @@ def test_the_gate_refuses_of_sound_sightings_what_it_says_however_often_a_landma
     frames = [(frame_from(pose_after(m), true, seed), pose_after(m)) for seed, m in enumerate(seen_from_m)]
     points = dict(zip(IDS.tolist(), estimated(frames, true), strict=True))
     for frame, pose in frames:
-        landmarks.see(frame, points, pose, share=1.0)
+        landmarks.see(frame, points, pose)
     policy = msgspec.structs.replace(POLICIES["robust"], gate_probability=0.99)
     pose = pose_after(seen_from_m[-1] + way_m)
     refused = OutlierCheck(RIG, policy).outliers(frame_from(pose, true, 99), landmarks, certain_at(pose))
@@ -74,62 +73,33 @@ def certain_at(T_world_imu: np.ndarray) -> Belief:
     return replace(belief, T_world_imu=T_world_imu, cov=np.zeros((9, 9)))
 
 
-def told_by(rig: StereoRig, share: float, sightings: int) -> np.ndarray:
+def told_by(sightings: int) -> np.ndarray:
     """Return the covariance (3, 3) of a landmark seen so often from one place."""
-    landmarks, point = KnownLandmarks(rig), landmarks_ahead()[:1]
-    uvs_px = stereo.predict(point, np.eye(4), rig).uv_px
+    landmarks, point = KnownLandmarks(RIG), landmarks_ahead()[:1]
+    uvs_px = stereo.predict(point, np.eye(4), RIG).uv_px
     for _ in range(sightings):
-        landmarks.see(StereoFrame(0, IDS[:1], uvs_px, np.zeros(1, dtype=int)), {0: point[0]}, np.eye(4), share)
+        landmarks.see(StereoFrame(0, IDS[:1], uvs_px), {0: point[0]}, np.eye(4))
     return landmarks.of([0])[1][0]
 
 
-def test_sightings_that_count_for_a_share_tell_as_much_less():
-    np.testing.assert_allclose(told_by(RIG, 0.1, 10), told_by(RIG, 1.0, 1), rtol=1e-9)
-
-
-def test_where_errors_are_taken_along_the_newest_sighting_alone_counts():
-    walking = replace(RIG, track_noise=TrackNoise(np.full(3, 0.1), np.full(3, 0.1), np.full(3, 0.5)))
-    np.testing.assert_allclose(told_by(walking, 1.0, 7), told_by(RIG, 1.0, 1), rtol=1e-9)
-
-
-@pytest.mark.parametrize("noise", [None, TrackNoise(np.full(3, 0.1), np.full(3, 0.1), np.full(3, 0.5))])
-def test_a_sighting_without_the_right_image_leaves_the_depth_known(noise):
-    """Alone it determines no depth. Where sightings err alike, it replaces none that did."""
-    rig = replace(RIG, track_noise=noise)
-    landmarks, point = KnownLandmarks(rig), landmarks_ahead()[:1]
-    both_px = stereo.predict(point, np.eye(4), rig).uv_px
+def test_a_sighting_without_the_right_image_leaves_the_depth_known():
+    """Alone it determines no depth."""
+    landmarks, point = KnownLandmarks(RIG), landmarks_ahead()[:1]
+    both_px = stereo.predict(point, np.eye(4), RIG).uv_px
     for uvs_px in (both_px, both_px * [1.0, np.nan, 1.0]):
-        landmarks.see(StereoFrame(0, IDS[:1], uvs_px, np.zeros(1, dtype=int)), {0: point[0]}, np.eye(4), 1.0)
-    once, (cov,) = told_by(RIG, 1.0, 1), landmarks.of([0])[1]
+        landmarks.see(StereoFrame(0, IDS[:1], uvs_px), {0: point[0]}, np.eye(4))
+    once, (cov,) = told_by(1), landmarks.of([0])[1]
     assert np.linalg.eigvalsh(once - cov).min() > -1e-9 * np.trace(once)
-    if noise is not None:
-        np.testing.assert_allclose(cov, once, rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["fixed-lag", "smart", "isam2"])
-def test_smoothers_with_noise_of_tracks_stated_go_on_where_the_right_image_is_missing(name, run_estimator):
-    drive = simulate(replace(SCENARIOS["drive-realistic"], duration_s=1.0), 0)
-    uv_px, lacks = drive.observations.uv_px.copy(), np.random.default_rng(0).random(len(drive.observations)) < 0.3
-    lacks[np.unique(drive.observations.track_id, return_index=True)[1]] = False
-    uv_px[lacks, 1] = np.nan
-    noise = TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
-    left_alone = replace(
-        drive,
-        observations=replace(drive.observations, uv_px=uv_px),
-        rig=replace(drive.rig, track_noise=noise),
-    )
-    run = run_estimator(name, left_alone)
-    assert run.status == "ok", run.log
 
 
 def test_a_landmark_that_was_dropped_starts_anew():
     landmarks, point = KnownLandmarks(RIG), landmarks_ahead()[:1]
-    frame = StereoFrame(0, IDS[:1], stereo.predict(point, np.eye(4), RIG).uv_px, np.zeros(1, dtype=int))
+    frame = StereoFrame(0, IDS[:1], stereo.predict(point, np.eye(4), RIG).uv_px)
     for _ in range(3):
-        landmarks.see(frame, {0: point[0]}, np.eye(4), 1.0)
+        landmarks.see(frame, {0: point[0]}, np.eye(4))
     landmarks.keep({})
     assert 0 not in landmarks
     landmarks.move({0: point[0]})
     assert 0 not in landmarks, "only what is seen is known"
-    landmarks.see(frame, {0: point[0]}, np.eye(4), 1.0)
-    np.testing.assert_allclose(landmarks.of([0])[1][0], told_by(RIG, 1.0, 1), rtol=1e-9)
+    landmarks.see(frame, {0: point[0]}, np.eye(4))
+    np.testing.assert_allclose(landmarks.of([0])[1][0], told_by(1), rtol=1e-9)

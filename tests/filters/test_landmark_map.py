@@ -16,7 +16,7 @@ POSE = se3_exp(np.array([0.1, -0.2, 1.3, 20.0, -7.0, 2.0]))
 
 def frame_of(ids: list[int], u_left: float = 400.0, disparity_px: float = 40.0) -> StereoFrame:
     uvs_px = np.array([[u_left + i, u_left + i - disparity_px, 150.0 + i] for i in ids]).reshape(-1, 3)
-    return StereoFrame(0, np.array(ids, dtype=np.int64), uvs_px, np.zeros(len(ids), dtype=np.int64))
+    return StereoFrame(0, np.array(ids, dtype=np.int64), uvs_px)
 
 
 def test_a_first_sighting_stands_where_stereo_sees_it():

@@ -5,13 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from toolkit.models.gap_bridge import KeptTwist, bridged
 
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array
-from toolkit.measured_motion import TwistChangeNoise
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, stacked
@@ -20,7 +18,7 @@ from toolkit.simulation import DRIVE, simulate
 
 
 def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[StackedFactors]]:
-    """Return two seconds with a bridge over two intervals, from disturbed truth, and the stacks."""
+    """Return two seconds of a drive from disturbed truth, and the stacks."""
     sequence = simulate(replace(DRIVE, duration_s=2.0), 2)
     model, rng = motion_model(sequence.noise, sequence.gravity_world), np.random.default_rng(5)
     graph, start = model.hold(model.initial_belief(sequence.prior), 0), gtsam.Values()
@@ -37,16 +35,14 @@ def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[StackedFacto
         for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
             if not start.exists(L(track_id)):
                 start.insert(L(track_id), point)
-    over = {5: KeptTwist(0.1, 0.1, TwistChangeNoise(np.full(3, 2.0), np.full(3, 0.7)))}
-    graph.push_back(bridged(over))
-    return graph, start, stacked(increments, over)
+    return graph, start, stacked(increments)
 
 
 def test_errors_and_linearisations_are_the_graphs_own():
     graph, start, stacks = drive()
     expected = graph.linearize(start)
     step = start.zeroVectors().scale(0.0)
-    for stacked_or_not in ((), stacks[:1], stacks):
+    for stacked_or_not in ((), stacks):
         mixed = MixedGraph(graph, stacked_or_not)
         assert mixed.has_python
         assert mixed.error(start) == pytest.approx(graph.error(start), rel=1e-10)
@@ -78,7 +74,7 @@ def test_a_factor_that_is_stacked_is_never_called():
         graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), list(keys), counted))
     solve(MixedGraph(graph, stacks), start, Stopping(1e-3, 2))
     assert not called
-    solve(MixedGraph(graph, stacks[1:]), start, Stopping(1e-3, 1))
+    solve(MixedGraph(graph, ()), start, Stopping(1e-3, 1))
     assert called
 
 

@@ -46,7 +46,7 @@ def landmarks_of(scenario: Scenario, seed: int) -> dict[int, np.ndarray]:
 def known(frame: StereoFrame, points: dict[int, np.ndarray], at: Belief, sequence: Sequence) -> KnownLandmarks:
     """Return landmarks as well known as one sighting in a frame, from a state, would tell."""
     landmarks, seen = KnownLandmarks(sequence.rig), frame.select(np.isin(frame.track_ids, list(points)))
-    landmarks.see(seen, points, at.T_world_imu, share=1.0)
+    landmarks.see(seen, points, at.T_world_imu)
     return landmarks
 
 
@@ -117,7 +117,7 @@ def test_landmarks_that_began_with_an_outlier_do_not_put_the_state_in_doubt():
     began_wrong, seen_wrong = rng.permutation(both)[: both.size // 3], rng.permutation(both)[: both.size // 3]
     moved = {i: points[i] + (2.0 if i in began_wrong else 0.0) for i in both.tolist()}
     landmarks = KnownLandmarks(sequence.rig)
-    landmarks.see(seen, moved, sequence.truth.T_world_imu[packet.index - 1], share=1.0)
+    landmarks.see(seen, moved, sequence.truth.T_world_imu[packet.index - 1])
     struck = frame.select(np.isin(frame.track_ids, both))
     off = np.where(np.isin(struck.track_ids, seen_wrong)[:, None], 40.0, 0.0) * np.array([1.0, 1.0, -1.0])
     struck = replace(struck, uvs_px=struck.uvs_px + off)

@@ -18,7 +18,6 @@ from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import POLICIES, PolicyName, Settings, Window
 from toolkit.simulation import DRIVE, simulate
 from toolkit.simulation.scenarios import noise_free
-from toolkit.simulation.track_noise import TrackNoise
 
 # The frame whose sighting is wrong, and how long before and after it the track must have been seen.
 FRAME, AROUND = 8, 4
@@ -71,7 +70,6 @@ def pull(scene, run_estimator) -> Callable[[str, float], float]:
 
 # Of what is exact a run leaves rounding, or where its iteration stops.
 WHOLE = Window(lag_s=2.0)  # no sighting of the scene leaves it
-CORRELATED = TrackNoise(np.array([0.5, 1.0, 0.5]), np.full(3, 0.3), np.array([0.0, 0.7, 0.0]))
 NOTHING_M = 1e-6
 
 
@@ -142,12 +140,12 @@ def test_the_common_policy_is_the_smoothers_too(pull, name):
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_the_smoothers_loss_holds_sightings_whose_errors_are_correlated_as_well(scene, run_estimator, name):
-    """The loss is that of what a sighting tells beyond those of its track before it; without it the pull is linear."""
+def test_the_smoothers_loss_begins_at_the_stated_noise_whatever_tracks_count(scene, run_estimator, name):
+    """At a quarter of the weight a loss in standard deviations of the update would begin at twice the pixels."""
 
     def pulled(policy: PolicyName, sigmas: float) -> float:
         sequence, settings = scene.with_error(sigmas), Settings(outliers=POLICIES[policy], window=WHOLE)
-        sequence = replace(sequence, rig=replace(sequence.rig, track_noise=CORRELATED))
+        sequence = replace(sequence, rig=replace(sequence.rig, track_weight=0.25))
         return scene.error_m(run_estimator(name, sequence, settings=settings))
 
     without = pulled("gate", 4.0)

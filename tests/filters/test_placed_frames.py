@@ -33,14 +33,14 @@ def frame_and_points(off_px: np.ndarray) -> tuple[StereoFrame, dict[int, np.ndar
     points = transform(RIG.T_imu_cam, places)
     uvs_px = stereo.predict(points, np.eye(4), RIG).uv_px + 0.5 * rng.standard_normal((40, 3))
     uvs_px[: len(off_px)] += off_px
-    return StereoFrame(0, IDS, uvs_px, np.zeros_like(IDS)), dict(zip(IDS.tolist(), points, strict=True))
+    return StereoFrame(0, IDS, uvs_px), dict(zip(IDS.tolist(), points, strict=True))
 
 
 def known(points: dict[int, np.ndarray]) -> KnownLandmarks:
     """Return landmarks as well known as one sighting from the origin tells."""
     landmarks, ids = KnownLandmarks(RIG), np.array(list(points), dtype=np.int64)
     uvs_px = stereo.predict(np.array(list(points.values())).reshape(-1, 3), np.eye(4), RIG).uv_px
-    landmarks.see(StereoFrame(0, ids, uvs_px, np.zeros_like(ids)), points, np.eye(4), share=1.0)
+    landmarks.see(StereoFrame(0, ids, uvs_px), points, np.eye(4))
     return landmarks
 
 

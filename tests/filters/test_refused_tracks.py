@@ -22,7 +22,7 @@ POSES = [se3_exp(np.array([0.0, 0.01 * k, 0.0, 0.3 * k, 0.0, 0.0])) for k in ran
 def sightings(points, k):
     uvs_px = stereo.predict(transform(RIG.T_imu_cam, points), POSES[k], RIG).uv_px
     ids = np.arange(len(points))
-    return StereoFrame(k, ids, uvs_px + 0.5 * np.random.default_rng(k).standard_normal(uvs_px.shape), ids)
+    return StereoFrame(k, ids, uvs_px + 0.5 * np.random.default_rng(k).standard_normal(uvs_px.shape))
 
 
 @pytest.mark.parametrize("taken", [1, 5])

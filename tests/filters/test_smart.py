@@ -6,8 +6,6 @@ import gtsam
 import gtsam_unstable
 import numpy as np
 import pytest
-from filters.smoothing.robust_loss import Squares
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 
 from filters.smart import Smart
 from toolkit import runner
@@ -21,7 +19,6 @@ from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-from toolkit.simulation.track_noise import TrackNoise
 
 RIG, HUBER = FLIGHT.rig, DEFAULTS.outliers.smoother_huber
 CAMERA = RobustCamera(RIG, HUBER)
@@ -37,7 +34,7 @@ def scene():
     points = transform(RIG.T_imu_cam, points_cam)
     pose, point = (a.ravel() for a in np.meshgrid(np.arange(POSES), np.arange(POINTS), indexing="ij"))
     exact = stereo.predict(points[point], poses[pose], RIG).uv_px
-    return poses, points, Sightings(pose, point, exact + 0.5 * rng.standard_normal(exact.shape), np.zeros_like(pose))
+    return poses, points, Sightings(pose, point, exact + 0.5 * rng.standard_normal(exact.shape))
 
 
 def gtsam_values(poses, points):
@@ -58,11 +55,10 @@ def ordering(*kinds_and_counts):
 
 
 def projection_factors(seen, huber=HUBER):
-    graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, gtsam.noiseModel.mEstimator.Huber.Create(huber))
+    graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, huber)
     for k in range(POSES):
         rows = seen.pose == k
-        ages = np.zeros(int(rows.sum()), dtype=np.int64)
-        for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows], ages), k):
+        for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows]), k):
             graph.add(factor)
     return graph
 
@@ -119,29 +115,6 @@ def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene, left_only):
     reduced = Vision.at(poses, points, replace(seen, uv_px=exact), RobustCamera(rig, HUBER)).reduced()
     # GTSAM triangulates linearly: the point is exact to rounding times the condition of that problem.
     np.testing.assert_allclose(reduced.information, expected, atol=1e-5 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("left_only", [[], [2, 9, 16, 17, 20]], ids=["pairs", "some by the left image alone"])
-def test_along_the_tracks_it_says_what_the_other_smoothers_factors_say(scene, left_only):
-    """A sighting may be the one before of a pair and of one by the left image alone: both are counted."""
-    poses, points, seen = scene
-    noise = TrackNoise(np.full(3, 0.3), np.full(3, 0.2), np.array([0.0, 0.7, 0.0]))
-    rig = replace(RIG, track_noise=noise)
-    uv_px = seen.uv_px.copy()
-    uv_px[left_only, 1] = np.nan
-    seen = replace(seen, uv_px=uv_px, ages=seen.pose)
-    frames = [StereoFrame(0, *(a[seen.pose == k] for a in (seen.point, uv_px, seen.ages))) for k in range(POSES)]
-    chained = ChainedFactors(ChainedSightings.of(frames, rig), rig, Squares())
-    values = gtsam_values(poses, points)
-    linear = chained.linearised(values).linearize(values)
-    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
-    n = 6 * POSES
-    across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
-    reduced = Vision.at(poses, points, seen, RobustCamera.of(rig, None)).reduced()
-    scale = np.abs(reduced.information).max()
-    expected = information[:n, :n] - across @ information[n:, :n]
-    np.testing.assert_allclose(reduced.information, expected, atol=1e-9 * scale)
-    np.testing.assert_allclose(reduced.vector, vector[:n].ravel() - across @ vector[n:].ravel(), atol=1e-9 * scale)
 
 
 def test_global_position_and_rotation_gain_no_information(scene):

@@ -16,7 +16,6 @@ from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.simulation import DRIVE
 
 WINDOW, TRACKS = 6, 12
-AGES = np.tile(np.arange(WINDOW), (TRACKS, 1))
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +27,7 @@ def scene(window_of_clones):
     points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]
     uvs_px = np.stack([stereo.predict(points, T, sequence.rig).uv_px for T in joint.clones], axis=1)
     uvs_px += rng.normal(size=uvs_px.shape) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T * 0.5
-    return joint, sequence.rig, TrackSightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool), AGES)
+    return joint, sequence.rig, TrackSightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool))
 
 
 def mismatched(sightings: TrackSightings, errors: dict[int, list[int]]) -> TrackSightings:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from filters.smoothing.discounted_tracks import DiscountedTracks
 
 from filters import smart
 from filters.fixed_lag import FixedLag
@@ -148,9 +147,7 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     values, keys = gtsam.Values(), tuple((gtsam.symbol("x", k),) for k in range(3))
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
-    none = Sightings(
-        np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64)
-    )
+    none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
     window = SmartWindow(keys, values, (), MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):
@@ -177,14 +174,3 @@ def test_a_window_started_afresh_leaves_no_state_without_a_covariance(refusing_o
     final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
     assert refusing_once
     assert np.linalg.eigvalsh(final.cov).min() > 0.0
-
-
-def test_a_window_started_afresh_has_each_frame_settle_once_with_its_own_pose(monkeypatch, refusing_once):
-    sequence, settled = simulate(SCENARIOS[2], 3), []
-    monkeypatch.setattr(DiscountedTracks, "settle", lambda _, frame, T: settled.append((frame.t_ns, T)))
-    final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
-    stamps_ns, poses = zip(*settled, strict=True)
-    assert refusing_once
-    assert len(settled) > 8
-    np.testing.assert_array_equal(stamps_ns, final.t_ns[: len(settled)])
-    np.testing.assert_array_equal(poses, final.T_world_imu[: len(settled)])

@@ -59,7 +59,7 @@ def test_unwhitened_its_rows_and_noise_say_the_same(scene):
 
 def test_smoothers_have_gtsam_factors_of_the_left_camera_for_it(scene, numerical_jacobian):
     pose, points, uvs_px = scene
-    frame = StereoFrame(0, np.arange(4), uvs_px, np.zeros(4, dtype=np.int64))
+    frame = StereoFrame(0, np.arange(4), uvs_px)
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3(pose))
     for i, point in enumerate(points):

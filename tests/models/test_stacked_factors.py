@@ -5,10 +5,9 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from toolkit.models.gap_bridge import KeptTwist, bridged
 
 from toolkit.geometry import se3_exp
-from toolkit.measured_motion import TwistChangeNoise, TwistMotion, TwistNoise
+from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models.factors import B, X
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, linear_factors, stacked
@@ -27,11 +26,6 @@ def increments(rng: np.random.Generator) -> dict[int, TwistIncrement]:
     return found
 
 
-def bridges_over() -> dict[int, KeptTwist]:
-    noise = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
-    return {2: KeptTwist(0.1, 0.25, noise), 5: KeptTwist(0.3, 0.1, noise), 6: KeptTwist(0.1, 0.2, noise)}
-
-
 def values_off(steps: dict[int, TwistIncrement], size: float, rng: np.random.Generator) -> gtsam.Values:
     """Return states that are off what the steps predict by about a size (rad, m)."""
     values, pose = gtsam.Values(), se3_exp(rng.standard_normal(6))
@@ -42,18 +36,16 @@ def values_off(steps: dict[int, TwistIncrement], size: float, rng: np.random.Gen
     return values
 
 
-def one_by_one(steps: dict[int, TwistIncrement], over: dict[int, KeptTwist]) -> list[gtsam.NonlinearFactor]:
-    bridge = bridged(over)
-    made = [twist_factor(increment.step, increment.gyro_bias, k) for k, increment in steps.items()]
-    return made + [bridge.at(i) for i in range(bridge.size())]
+def one_by_one(steps: dict[int, TwistIncrement]) -> list[gtsam.NonlinearFactor]:
+    return [twist_factor(increment.step, increment.gyro_bias, k) for k, increment in steps.items()]
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-2, 0.7])
 def test_a_stack_has_the_errors_and_linearisations_of_its_factors(size):
     rng = np.random.default_rng(3)
-    steps, over = increments(rng), bridges_over()
-    values, single = values_off(steps, size, rng), one_by_one(steps, over)
-    stacks = stacked(steps, over)
+    steps = increments(rng)
+    values, single = values_off(steps, size, rng), one_by_one(steps)
+    stacks = stacked(steps)
     keys = [keys for stack in stacks for keys in stack.keys]
     assert keys == [tuple(factor.keys()) for factor in single]
     errors = np.concatenate([0.5 * np.square(stack.residuals(values)).sum(axis=1) for stack in stacks])
@@ -70,7 +62,7 @@ def test_residuals_alone_are_those_that_are_linearised():
     steps = increments(rng)
     values = values_off(steps, 0.1, rng)
     stack: StackedFactors
-    for stack in stacked(steps, bridges_over()):
+    for stack in stacked(steps):
         np.testing.assert_array_equal(stack.residuals(values), stack.linearised(values).residuals)
 
 
@@ -79,4 +71,4 @@ def test_what_gtsam_has_itself_is_not_stacked():
     model = motion_model(sequence.noise, sequence.gravity_world)
     moved = {packet.index: packet.motion for packet in sequence.packets() if packet.motion is not None}
     assert moved
-    assert stacked({k: model.integrate(motion, np.zeros(6)) for k, motion in moved.items()}, {}) == []
+    assert stacked({k: model.integrate(motion, np.zeros(6)) for k, motion in moved.items()}) == []

@@ -16,15 +16,13 @@ import pytest
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
-from toolkit.geometry import Array, se3_exp, transform
+from toolkit.geometry import Array, se3_exp
 from toolkit.initialization import start_from_measurements
 from toolkit.models import stereo
 from toolkit.models.camera_motion import triangulation_jacobian
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.stereo import CHANNELS, d_uv_d_scale, scaled_rig
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
-from toolkit.simulation import DRIVE, FLIGHT, simulate
-from toolkit.simulation.track_faults import disparity_scale
+from toolkit.simulation import DRIVE, FLIGHT
 
 # Pixels are of the order of 1e3 and Jacobian entries of 1e4 (px / rad at 40 m): 1e-9 of the largest entry of a
 # sighting is a thousand times what double precision costs and a millionth of what any modelling slip would show.
@@ -192,7 +190,7 @@ def test_model_equals_gtsams_factor_on_every_sighting_of_03(real: Callable[[str]
 
 
 def test_a_factor_has_the_covariance_of_the_rig():
-    frame = StereoFrame(0, np.array([4]), np.array([[300.0, 280.0, 200.0]]), np.array([0]))
+    frame = StereoFrame(0, np.array([4]), np.array([[300.0, 280.0, 200.0]]))
     (factor,) = StereoFactors(DRIVE.rig).of(frame, 7)
     assert list(factor.keys()) == [X(7), L(4)]
     # One inversion of a well-conditioned diagonal matrix.
@@ -202,44 +200,10 @@ def test_a_factor_has_the_covariance_of_the_rig():
 def test_the_residual_sign_is_the_opposite_of_gtsams(pose):
     point = in_world(np.array([[1.0, 0.5, 8.0]]), pose, DRIVE.rig)
     predicted_px = stereo.predict(point, pose, DRIVE.rig).uv_px
-    frame = StereoFrame(0, np.array([0]), predicted_px + np.array([1.0, 2.0, 3.0]), np.array([0]))
+    frame = StereoFrame(0, np.array([0]), predicted_px + np.array([1.0, 2.0, 3.0]))
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3(pose))
     values.insert(L(0), point[0])
     (factor,) = StereoFactors(DRIVE.rig).of(frame, 0)
     # 600 px through two rigid motions: 1e-12 of them.
     np.testing.assert_allclose(factor.unwhitenedError(values), [-1.0, -2.0, -3.0], atol=1e-9)
-
-
-@pytest.fixture(scope="module")
-def points():
-    rng = np.random.default_rng(2)
-    points_cam = np.column_stack([rng.uniform(-4.0, 4.0, (20, 2)), rng.uniform(5.0, 40.0, 20)])
-    return transform(RIG.T_imu_cam, points_cam)
-
-
-POSE = se3_exp(np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.1]))
-
-
-def test_a_scaled_rig_sees_longer_disparities_and_nothing_else_changed(points):
-    plain, scaled = (stereo.predict(points, POSE, rig).uv_px @ CHANNELS.T for rig in (RIG, scaled_rig(RIG, 0.03)))
-    np.testing.assert_allclose(scaled, plain * np.array([1.0, 1.03, 1.0]), atol=1e-10)
-
-
-def test_it_is_the_fault_that_is_planted():
-    sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
-    planted = disparity_scale(sequence, 0.02).observations.uv_px
-    by_rig = stereo.project(stereo.triangulate(sequence.observations.uv_px, sequence.rig), sequence.rig)
-    # The shift of the left camera, given in the camera's own axes.
-    scaled = scaled_rig(replace(sequence.rig, T_imu_cam=np.eye(4)), 0.02)
-    moved = stereo.triangulate(sequence.observations.uv_px, sequence.rig) - scaled.T_imu_cam[:3, 3]
-    np.testing.assert_allclose(by_rig, sequence.observations.uv_px, atol=1e-9)
-    np.testing.assert_allclose(stereo.project(moved, scaled), planted, atol=1e-9)
-
-
-def test_the_derivative_is_that_of_the_prediction(points):
-    scale, step = 0.02, 1e-5
-    ahead, behind = (stereo.predict(points, POSE, scaled_rig(RIG, scale + s)).uv_px for s in (step, -step))
-    at = stereo.predict(points, POSE, scaled_rig(RIG, scale)).uv_px
-    # Predictions are linear in the scale; 1e3 px are good to 1e-13.
-    np.testing.assert_allclose(d_uv_d_scale(at, scale), (ahead - behind) / (2.0 * step), atol=1e-6)
