@@ -33,7 +33,7 @@ UPPER_QUARTILE, FAR_CHI2 = 4.108, 16.27
 # Beyond this squared distance, 32 standard deviations, a sighting is of another point. Sound real recordings have at
 # most 0.6 % of these, on moving objects and in repeated frames; the limit of their share was chosen with them in view.
 GROSS_CHI2, MOST_GROSS = 1000.0, 0.02
-# Median of the squared distances, and the ratios by it that agree with the stated noise, also with a fifth of
+# Ratios of the squared distances' median to its expectation that agree with the stated noise, also with a fifth of
 # mismatches. The tail must then agree as well, unless there are mismatches: a tenth of sliding tracks gives 2.1 to 5.6
 # % of far distances, sound simulations have 0.06 to 0.12 %.
 USUAL_SCATTER = (0.95, 1.12)
