@@ -10,12 +10,12 @@ import numpy as np
 
 from toolkit.arrays import rows_of
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, slope
+from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import camera_motion, neighbours
-from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.gating import LEAST_DISPARITY_PX, MAD_TO_SIGMA
 from toolkit.models.stereo import CHANNELS, disparity_px
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight
 from toolkit.noise.measurement import adjusted_stretches, measured_noise
