@@ -24,12 +24,12 @@ from itertools import pairwise
 import matplotlib.pyplot as plt
 import numpy as np
 from recordings import real
+from toolkit.track_errors import Card
 
 from toolkit import Result, compare
 from toolkit.estimator import ladder
 from toolkit.report.card import card_lines
 from toolkit.report.messages import consistency_lines
-from toolkit.track_errors import Card
 
 # %matplotlib inline
 plt.rcParams |= {"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True, "grid.alpha": 0.3}
