@@ -4,14 +4,26 @@ What it approximates: pose and landmarks are kept as if they were independent. A
 landmark, but the filter is overconfident: its covariance does not grow with the distance driven.
 """
 
-from filters.kalman.correction import corrected
+import numpy as np
+
+from filters.kalman.correction import (
+    added_noise,
+    carried_pose_cov,
+    correct_landmarks_below,
+    residuals_with_jacobians,
+    updated_by_pose_sightings,
+)
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.landmark_map import TrackedMap
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array, BoolArray, transposed
+from toolkit.models import left_only
+from toolkit.models.gating import huber_threshold, huber_weights, mahalanobis_squared
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import Packet
+from toolkit.models.state import POSE, Belief
+from toolkit.sequence import Packet, StereoRig
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the other's uncertainty as noise"
@@ -38,10 +50,44 @@ class DecoupledEkf(Filter):
         seen, uvs_px = self._map.seen_again(packet.frame)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
-            self._belief, seen = corrected(self._belief, seen, uvs_px, self._rig, gate)
+            self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate)
+            # The landmarks whose sighting passed, by the corrected pose, which is taken as uncertain and independent.
+            bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
+            pose_cov = self._belief.cov[POSE, POSE]
+            seen = correct_landmarks_below(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
         """Return every landmark the filter ever had, as it last knew it."""
         return self._map.landmarks()
+
+
+def correct_pose(
+    belief: Belief,
+    landmarks: LandmarkMap,
+    uvs_px: Array,
+    rig: StereoRig,
+    gate: FrameGate,
+) -> tuple[Belief, BoolArray]:
+    """Return the belief with its pose corrected by sightings (N, 3) px of N landmarks, and which of them passed (N,).
+
+    The landmarks' uncertainty is part of the innovation covariance, as if it were independent of the pose's.
+
+    A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
+    residual, whitened by the covariance of sighting and landmark. Gate and loss use the stated noise, the update the
+    rig's weight of tracks.
+    """
+    residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
+    noise_px2 = left_only.noise_px2(uvs_px, rig)
+    own_cov = H_point @ landmarks.covs @ transposed(H_point) + noise_px2
+    nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
+    dof = left_only.degrees_of_freedom(uvs_px)
+    accepted = gate.accepts(nis, dof, depth_m > 0.0)
+    weights = accepted.astype(float)
+    if gate.huber is not None:
+        threshold = gate.huber if isinstance(dof, int) else huber_threshold(dof, gate.huber)
+        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
+    informed = np.linalg.solve(own_cov + added_noise(noise_px2, rig), H_pose)
+    weighted = weights[:, None, None] * informed
+    return updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted

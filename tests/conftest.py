@@ -274,20 +274,20 @@ def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "usable_cpus", lambda: 1)
 
 
-@pytest.fixture(scope="session")
-def _kept_tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep what is measured or tracked for other tests on the same recording, and not where the user's is kept.
 
-
-@pytest.fixture
-def shared_cache(_kept_tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep tracks made of images for other tests on the same images; what is kept is found by its content."""
-    monkeypatch.setenv("VISLAM_CACHE", str(_kept_tracks))
+    What is kept is found by its content, and what an earlier state of the code has kept there is not read.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VISLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep tracks made of images where no other test finds them."""
+    """Keep what is measured or tracked where no other test finds it."""
     monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 

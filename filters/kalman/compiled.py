@@ -5,23 +5,21 @@ A filter calls these functions when it is built, each with the compilation its r
 that calls a kernel. Kernels are imported only when they are used, because only they import numba.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import lru_cache
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from filters.kalman import multiview, track_gate, tracks_in_view, triangulation
+from filters.kalman import track_gate, tracks_in_view, triangulation
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
-from filters.kalman.linearisation import Integrator
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TestedTracks, TrackTest, WindowPoses
 from filters.kalman.tracks_in_view import FollowedTracks, Information, RootedWindow
 from toolkit.compilation import Compilation
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
-from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import (
     FEWEST_SIGHTINGS,
     LEAST_DEPTH_M,
@@ -29,10 +27,7 @@ from toolkit.models.gating import (
     MISMATCHED_TRACK_FACTOR,
     huber_threshold,
 )
-from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
-from toolkit.models.motion import Increment, MotionModel, motion_model
-from toolkit.models.state import Belief, Prediction
-from toolkit.models.stereo import StereoPrediction
+from toolkit.models.state import Belief
 from toolkit.sequence import StereoRig
 
 _GATE_RULES = np.array(
@@ -55,10 +50,9 @@ def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
     return compilation.module(f"{_KERNELS}.{name}")
 
 
-def share_windowed(noise: MotionNoise, compilation: Compilation) -> None:
+def share_windowed(compilation: Compilation) -> None:
     """Let processes that start together share the compilation of the windowed filters' kernels, the longest first."""
-    along_imu = ["preintegration"] if isinstance(noise, ImuNoise) else []
-    compilation.share(f"{_KERNELS}.{name}" for name in ["track_gate", "corrections", "tracks_in_view", *along_imu])
+    compilation.share(f"{_KERNELS}.{name}" for name in ["track_gate", "tracks_in_view"])
 
 
 def track_test(compilation: Compilation) -> TrackTest:
@@ -124,84 +118,6 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         return Information(points, weights, in_front, matrix, root.T @ vector - eliminated.T @ taken)
 
     return tracks_in_view.Steps(followed, information)
-
-
-def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
-    """Return the function that maps twists (N, 6) to motions (N, 4, 4): :func:`toolkit.geometry.se3_exp`."""
-    kernel = _kernel(compilation, "corrections")
-    if kernel is None:
-        return se3_exp
-    return lambda twists: kernel.exponentials(np.ascontiguousarray(twists))
-
-
-def images(compilation: Compilation) -> multiview.Images:
-    """Return the functions that predict images: :data:`filters.kalman.multiview.NUMPY`."""
-    kernel = _kernel(compilation, "corrections")
-    if kernel is None:
-        return multiview.NUMPY
-
-    def linearised(points: Array, poses: Array, rig: StereoRig) -> StereoPrediction:
-        """Predict images and their Jacobians as the definition does."""
-        uvs_px, d_pose, d_point, depths_m = kernel.predict_images(*_as_kernel_arrays((points, poses)), _camera(rig))
-        seen = depths_m.shape
-        return StereoPrediction(uvs_px, d_pose.reshape(*seen, 3, 6), d_point.reshape(*seen, 3, 3), depths_m)
-
-    def plain(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-        """Predict images as the definition does."""
-        uvs_px, _, _, depths_m = kernel.predict_images(*_as_kernel_arrays((points, poses)), _camera(rig))
-        return uvs_px, depths_m
-
-    return multiview.Images(plain, linearised)
-
-
-def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
-    """Return an integrator for motion of a noise model under gravity (3,) m/s^2: the motion model, or its kernel."""
-    model = motion_model(noise, gravity_world)
-    kernel = _kernel(compilation, "preintegration") if isinstance(noise, ImuNoise) else None
-    if kernel is None:
-        return model
-    assert isinstance(noise, ImuNoise)
-    densities = noise.accel_noise_density, noise.gyro_noise_density, noise.accel_random_walk, noise.gyro_random_walk
-    return _ImuIntegrator(model, kernel, np.square([*densities, INTEGRATION_DENSITY]), np.array(gravity_world))
-
-
-class _ImuIntegrator(NamedTuple):
-    """Integrates samples by the kernel as the model does by GTSAM; variances and gravity are in the kernel's form."""
-
-    model: MotionModel
-    kernel: ModuleType
-    variances: Array
-    gravity_world: Array
-
-    def integrate(self, motion: Motion, bias: Array) -> Increment:
-        """Return the samples between two frames, to be integrated about a bias (6,)."""
-        assert isinstance(motion, ImuMotion)
-        return _ImuIncrement(motion, bias, self)
-
-
-class _ImuIncrement(NamedTuple):
-    """The samples between two frames and a bias; they are integrated when a state is predicted over them."""
-
-    motion: ImuMotion
-    bias: Array
-    by: _ImuIntegrator
-
-    def predict(self, start: Belief) -> Prediction:
-        """Predict a state over the interval."""
-        motion, variances = self.motion, self.by.variances
-        if motion.noise_scale is not None:
-            variances = np.concatenate([np.square(mean_noise_scale(motion)) * variances[:2], variances[2:]])
-        samples = np.array(motion.dt_s), np.array(motion.accel_mps2), np.array(motion.gyro_radps)
-        state = _pose_of(start), np.array(start.v_world), np.array(start.bias)
-        return Prediction(*self.by.kernel.predict(samples, variances, state, self.by.gravity_world))
-
-    def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``."""
-        return transition_over(float(self.motion.dt_s.sum()), self.by.gravity_world, start, end)
-
-    def factors(self, k: int) -> Any:
-        """Return GTSAM's factors between state k - 1 and state k."""
-        return self.by.model.integrate(self.motion, self.bias).factors(k)
 
 
 def _as_kernel_arrays(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:

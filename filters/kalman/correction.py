@@ -1,75 +1,21 @@
-"""EKF corrections of the pose by many landmarks and of many landmarks by one pose (Kang, eqs. 6-14).
+"""Corrections that the decoupled filters share: of many landmarks by one pose, and of the pose by information.
 
-The report leaves one problem open: its gain inverts a matrix of the size of all measurements (eq. 12). Because the
-measurement noise is block diagonal, the same update in information form, ``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``,
-needs only 3x3 blocks and is identical; no landmark is left out.
+Source: Kang, eqs. 6-14. The report leaves one problem open: its gain inverts a matrix of the size of all measurements
+(eq. 12). Because the measurement noise is block diagonal, the same update in information form,
+``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``, needs only 3x3 blocks and is identical; no landmark is left out.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
-from toolkit.geometry import Array, BoolArray, transposed
+from toolkit.geometry import Array, transposed
 from toolkit.models import left_only, stereo
-from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, mahalanobis_squared
+from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
-
-
-class FrameCorrection(NamedTuple):
-    """The corrected belief and the corrected landmarks."""
-
-    belief: Belief
-    landmarks: LandmarkMap
-
-
-def corrected(
-    belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
-) -> FrameCorrection:
-    """Correct the pose by sightings (N, 3) px of N landmarks, then by the pose the landmarks whose sighting passed."""
-    belief, accepted = correct_pose(belief, landmarks, uvs_px, rig, gate)
-    nis_bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
-    pose_cov = belief.cov[POSE, POSE]
-    landmarks = correct_landmarks_below(landmarks, uvs_px, belief.T_world_imu, pose_cov, rig, nis_bound)
-    return FrameCorrection(belief, landmarks)
-
-
-class PoseCorrection(NamedTuple):
-    """The corrected belief, and which sightings (N,) passed the gate."""
-
-    belief: Belief
-    accepted: BoolArray
-
-
-def correct_pose(
-    belief: Belief,
-    landmarks: LandmarkMap,
-    uvs_px: Array,
-    rig: StereoRig,
-    gate: FrameGate,
-) -> PoseCorrection:
-    """Correct the pose by sightings (N, 3) px of N landmarks, whose uncertainty is part of the innovation covariance.
-
-    A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
-    residual, whitened by the covariance of sighting and landmark. Gate and loss use the stated noise, the update the
-    rig's weight of tracks.
-    """
-    residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
-    noise_px2 = left_only.noise_px2(uvs_px, rig)
-    own_cov = H_point @ landmarks.covs @ transposed(H_point) + noise_px2
-    nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
-    dof = left_only.degrees_of_freedom(uvs_px)
-    accepted = gate.accepts(nis, dof, depth_m > 0.0)
-    weights = accepted.astype(float)
-    if gate.huber is not None:
-        threshold = gate.huber if isinstance(dof, int) else huber_threshold(dof, gate.huber)
-        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
-    informed = np.linalg.solve(own_cov + added_noise(noise_px2, rig), H_pose)
-    weighted = weights[:, None, None] * informed
-    return PoseCorrection(updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted)
 
 
 def added_noise(noise_px2: Array, rig: StereoRig) -> Array:
@@ -77,7 +23,7 @@ def added_noise(noise_px2: Array, rig: StereoRig) -> Array:
     return (1.0 / rig.track_weight - 1.0) * noise_px2
 
 
-def _residuals_with_jacobians(
+def residuals_with_jacobians(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig
 ) -> stereo.StereoPrediction:
     """Return the residuals (N, 3) px of sightings, with Jacobians; both are zero where uR is missing."""
@@ -130,7 +76,7 @@ def correct_landmarks(
     ``pose_cov`` (6, 6), zero in the report, is added to the measurement noise, so that an uncertain pose does not make
     the map overconfident. The NIS is by the stated noise, the update has the rig's weight of tracks.
     """
-    residual_px, H_pose, H_point, depth_m = _residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
+    residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
     noise_px2 = left_only.noise_px2(uvs_px, rig)
     carried = H_point @ landmarks.covs
     innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + noise_px2

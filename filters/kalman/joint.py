@@ -4,7 +4,6 @@ Only this class touches the covariance. Every quantity that measurements are lin
 estimate and its first estimate; the filter chooses which of the two a Jacobian uses.
 """
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from itertools import accumulate
@@ -43,8 +42,6 @@ class JointBelief:
         self.points: Array = np.empty((0, 3))
         self.first_points: Array = np.empty((0, 3))
         self._cov = _symmetric(core.cov)
-        # Maps twists (N, 6) to motions (N, 4, 4).
-        self.exponentials: Callable[[Array], Array] = se3_exp
 
     @property
     def core(self) -> Belief:
@@ -177,7 +174,7 @@ class JointBelief:
 
     def _displace(self, delta: Array) -> None:
         d, clones = self._core.layout.size, self.clone_columns
-        steps = self.exponentials(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
+        steps = se3_exp(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
         self._core = self._core.displaced(delta[:d], steps[0])
         self.clones = self.clones @ steps[1:]
         self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)

@@ -12,7 +12,7 @@ from filters.kalman import multiview
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
-from filters.kalman.multiview import NUMPY, Images, Linearised
+from filters.kalman.multiview import Linearised
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -75,26 +75,23 @@ def correct(
     at: Linearisation,
     rig: StereoRig,
     gate: FrameGate,
-    images: Images = NUMPY,
 ) -> None:
     """Correct the whole state by its landmarks; the frame must show every one of them."""
     if not len(joint.landmark_ids):
         return
-    seen = linearise_sightings(joint, frame, at, rig, images)
+    seen = linearise_sightings(joint, frame, at, rig)
     weights = weighed(joint, seen, gate)
     if weights.any():
         H, residuals = stacked(joint, seen).weighed(weights)
         joint.update(H, residuals, columns(joint))
 
 
-def linearise_sightings(
-    joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, images: Images = NUMPY
-) -> LandmarkSightings:
+def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
     """Linearise the frame's sightings of all landmarks of the state; the frame must show every one of them."""
     order = np.argsort(frame.track_ids)
     uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
-    predicted_px, depth_m = images.plain(joint.points, joint.clones[-1:], rig)
-    there = images.linearised(at.points(joint), at.clones(joint)[-1:], rig)
+    predicted_px, depth_m = multiview.images(joint.points, joint.clones[-1:], rig)
+    there = multiview.linearised_images(at.points(joint), at.clones(joint)[-1:], rig)
     whitener = left_only.whitener(uvs_px, rig)
     residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], rig)
     H_pose, H_point = whitener @ there.d_uv_d_pose[:, 0], whitener @ there.d_uv_d_point[:, 0]

@@ -13,7 +13,7 @@ import numpy as np
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray
 from toolkit.measured_motion import Motion
-from toolkit.models.motion import Increment
+from toolkit.models.motion import Increment, MotionModel
 from toolkit.models.state import Prediction
 
 
@@ -78,14 +78,7 @@ class AtFirstEstimates:
         return np.asarray(moved_m > self._most_moved * distance_m)
 
 
-class Integrator(Protocol):
-    """Integrates the measured motion between two frames; every motion model does."""
-
-    def integrate(self, motion: Motion, bias: Array) -> Increment:
-        """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
-
-
-def propagate(joint: JointBelief, model: Integrator, at: Linearisation, motion: Motion | None) -> None:
+def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None) -> None:
     """Propagate a joint belief over the motion between two frames; the first frame has none (None)."""
     if motion is None:
         return

@@ -5,7 +5,6 @@ Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-
 the stereo measurement replaces their monocular one.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -53,16 +52,6 @@ class TrackSightings(NamedTuple):
         return TrackSightings(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
-class Images(NamedTuple):
-    """Functions that predict the images of points (F, 3) from poses (W, 4, 4).
-
-    ``plain`` returns images (F, W, 3) px and depths (F, W) m; ``linearised`` the Jacobians as well, (F, W, 3, .).
-    """
-
-    plain: Callable[[Array, Array, StereoRig], tuple[Array, Array]]
-    linearised: Callable[[Array, Array, StereoRig], stereo.StereoPrediction]
-
-
 class Linearised(NamedTuple):
     """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3)."""
 
@@ -90,26 +79,28 @@ def _in_imu(points: Array, poses: Array) -> Array:
     return np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
 
 
-NUMPY = Images(
-    lambda points, poses, rig: stereo.images(_in_imu(points, poses), rig),
-    lambda points, poses, rig: stereo.linearise(_in_imu(points, poses), poses[:, :3, :3], rig),
-)
+def linearised_images(points: Array, poses: Array, rig: StereoRig) -> stereo.StereoPrediction:
+    """Predict the images of points (F, 3) from poses (W, 4, 4), with Jacobians: the leading axes are (F, W)."""
+    return stereo.linearise(_in_imu(points, poses), poses[:, :3, :3], rig)
 
 
-def linearise(
-    sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig, images: Images = NUMPY
-) -> Linearised:
+def images(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Predict the images (F, W, 3) px of points (F, 3) from poses (W, 4, 4), and their depths (F, W) m."""
+    return stereo.images(_in_imu(points, poses), rig)
+
+
+def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
     """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same poses, or their first estimates.
     Rows of unseen places are zero throughout, and so is the row of uR where the right image is missing.
     """
     whitener, seen = left_only.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
-    there = images.linearised(points, poses_at, rig)
+    there = linearised_images(points, poses_at, rig)
     if poses_at is poses:
         uv_px, depth_m = there.uv_px, there.depth_m
     else:
-        uv_px, depth_m = images.plain(points, poses, rig)
+        uv_px, depth_m = images(points, poses, rig)
     residuals = np.where(seen, left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)

@@ -39,17 +39,15 @@ class SlidingWindowFilter:
         self, setup: Setup, linearisation: Linearisation, landmarks: int = 0, window_s: float | None = None
     ) -> None:
         self._rig, self._at = setup.rig, linearisation
-        self._outliers, model = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
-        compiled.share_windowed(setup.noise, setup.compilation)
-        self._motion = compiled.integrator(setup.noise, setup.gravity_world, setup.compilation)
+        self._outliers, self._motion = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
+        compiled.share_windowed(setup.compilation)
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
-        self._joint = JointBelief(model.initial_belief(setup.prior))
-        self._joint.exponentials = compiled.exponentials(setup.compilation)
+        self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks = WindowTracks()
-        self._track_test, self._images = compiled.track_test(setup.compilation), compiled.images(setup.compilation)
+        self._track_test = compiled.track_test(setup.compilation)
         self._in_view = TracksInView(
             linearisation, setup.rig, self._outliers, compiled.steps_in_view(setup.compilation)
         )
@@ -62,7 +60,7 @@ class SlidingWindowFilter:
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate, self._images)
+        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._tracks.add_frame(_without_landmarks(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
@@ -96,7 +94,7 @@ class SlidingWindowFilter:
         """Correct the window by tracks; add those still seen as landmarks, as many as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        track_gate = TrackGate(joint, self._at, self._rig, self._track_test, self._images)
+        track_gate = TrackGate(joint, self._at, self._rig, self._track_test)
         accepted = track_gate.accepted(sightings, gate)
         if not len(accepted.points):
             return

@@ -191,9 +191,8 @@ class TrackGate:
         at: Linearisation,
         rig: StereoRig,
         test: TrackTest = tested,
-        images: multiview.Images = multiview.NUMPY,
     ) -> None:
-        self._rig, self._test, self._images = rig, test, images
+        self._rig, self._test = rig, test
         self._window = WindowPoses.of(joint, at)
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
@@ -208,7 +207,7 @@ class TrackGate:
         """Return some rows (m,) of the accepted tracks, linearised with their landmarks and weighted."""
         sightings, points = tracks.sightings.select(rows), tracks.points[rows]
         poses, poses_at, _ = self._window
-        linearised = multiview.linearise(sightings, points, poses, poses_at, self._rig, self._images)
+        linearised = multiview.linearise(sightings, points, poses, poses_at, self._rig)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:

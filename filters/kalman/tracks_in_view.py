@@ -33,7 +33,7 @@ from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import WindowPoses
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
-from toolkit.geometry import Array, BoolArray, IntArray, transposed
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, transposed
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
@@ -309,7 +309,7 @@ def _corrected_by_information(joint: JointBelief, root: Array, matrix: Array, ve
     halves = divided_by_root(cholesky_root(matrix), np.column_stack([to_core, vector]))
     half = halves[:, :-1]
     delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
-    moved = core.displaced(delta, joint.exponentials(delta[None, POSE])[0])
+    moved = core.displaced(delta, se3_exp(delta[POSE]))
     return replace(moved, cov=0.5 * (cov + cov.T))
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import gtsam
 
-from filters.smoothing import robust_schedule
+from filters import batch
 from filters.smoothing.levenberg_marquardt import Solution, Stopping
 from toolkit import runner
 from toolkit.audit import audit
@@ -56,7 +56,7 @@ def measure(source: str, frames: int) -> None:
     sequence = audit(load_sequence(source)).sequence
     prior = start_from_measurements(sequence)
     sequence = sequence.truncated(frames) if frames else sequence
-    solve, ours_s, theirs_s = robust_schedule.solve, [], []
+    solve, ours_s, theirs_s = batch.solve, [], []
 
     def both(graph: Any, start: Any, stopping: Stopping, *rest: Any, **named: Any) -> Solution:
         solution, spent_s = timed(lambda: solve(graph, start, stopping, *rest, **named))
@@ -69,12 +69,12 @@ def measure(source: str, frames: int) -> None:
         )
         return solution
 
-    robust_schedule.solve = both
+    batch.solve = both
     try:
         print(f"{sequence.name}, {sequence.frame_count} frames")
         run = runner.run("batch", find("batch").load(), sequence, prior)
     finally:
-        robust_schedule.solve = solve
+        batch.solve = solve
     assert run.status == "ok" and run.timings is not None, run.log
     whole_s = run.timings.cpu_s - sum(theirs_s)
     print(f"  solves {sum(ours_s) / sum(theirs_s):.2f}, whole batch {whole_s / sum(theirs_s):.2f} x GTSAM's own")

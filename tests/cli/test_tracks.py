@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import pytest
 
-pytestmark = pytest.mark.usefixtures("shared_cache")
 Vislam = Callable[..., int]
 
 

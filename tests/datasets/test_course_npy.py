@@ -239,7 +239,7 @@ SPECKLED = np.random.default_rng(0).integers(0, 255, (200, 320), dtype=np.uint8)
 
 
 @pytest.fixture
-def with_images(kitti_drive: Path, tmp_path: Path, shared_cache: None) -> Path:
+def with_images(kitti_drive: Path, tmp_path: Path) -> Path:
     """Return a recording without features, and the images of a drive towards a wall beside it."""
     sides = [sorted((kitti_drive / f"image_{side}").iterdir()) for side in (0, 1)]
     left, right = ([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths] for paths in sides)

@@ -18,8 +18,6 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.measured_motion import NoSamples, TwistChangeNoise
 from toolkit.settings import Frontend
 
-pytestmark = pytest.mark.usefixtures("shared_cache")
-
 # Of the rendered drive, as in conftest.
 FRAMES, FOCAL_PX, BASELINE_M, STEP_M = 8, 250.0, 0.4, 0.05
 

@@ -13,8 +13,6 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
 from toolkit.measured_motion import ImuSamples, TwistSamples
 
-pytestmark = pytest.mark.usefixtures("shared_cache")
-
 FRAMES, STEP_M, SPEED_MPS = 8, 0.05, 0.5
 DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"
 # The camera looks along the IMU's x and stands 0.3 m before and 0.1 m above it.

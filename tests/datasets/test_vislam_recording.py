@@ -16,7 +16,6 @@ from toolkit.geometry import Array
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
-from toolkit.simulation.track_noise import TrackNoise
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -59,13 +58,13 @@ def test_what_is_optional_may_be_absent(flight: Sequence, tmp_path: Path) -> Non
         assert_same(vislam_recording.load(tmp_path / name), sequence)
 
 
-def test_the_noise_of_tracks_comes_back(drive: Sequence, tmp_path: Path) -> None:
-    noise = TrackNoise(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.1, 0.15]), np.array([0.0, 0.7, 0.1]))
-    vislam_recording.save(replace(drive, rig=replace(drive.rig, track_noise=noise)), tmp_path / "correlated")
-    loaded = vislam_recording.load(tmp_path / "correlated").rig.track_noise
-    assert loaded is not None
-    for part in ("white_px", "walk_px", "offset_px"):
-        np.testing.assert_array_equal(getattr(loaded, part), getattr(noise, part))
+@pytest.mark.parametrize("stated", [None, {"white_px": [0.1] * 3, "walk_px": [0.2] * 3, "offset_px": [0.0] * 3}])
+def test_a_noise_of_tracks_that_an_earlier_version_kept_is_passed_over(
+    drive: Sequence, tmp_path: Path, stated: dict[str, list[float]] | None
+) -> None:
+    vislam_recording.save(drive, tmp_path / "drive")
+    edit_text(lambda t: t["rig"].update(track_noise=stated))(tmp_path / "drive")
+    assert_same(vislam_recording.load(tmp_path / "drive"), drive)
 
 
 def test_pairing_and_gravity_come_back(drive: Sequence, tmp_path: Path) -> None:

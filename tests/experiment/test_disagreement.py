@@ -16,7 +16,7 @@ from toolkit.metrics.correction_trend import LIMIT, NOTHING_CORRECTED, TREND
 from toolkit.progress import SILENT
 from toolkit.report.messages import motion_test_lines
 from toolkit.sequence import Sequence
-from toolkit.settings import Settings
+from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, faults, simulate
 
 NAMES = ("dead-reckoning", "seed-ekf", "ekf-slam", "msckf")
@@ -97,8 +97,8 @@ def test_one_that_differs_and_whose_corrections_cannot_be_tested_does_not_count_
     assert MotionTest.of([motion, held, row("a", far, cov, 1.0)]).is_contradicted
 
 
-def rows_of(sequence: Sequence) -> list[Row]:
-    prepared = prepare(Recording(replace(sequence, truth=None)))
+def rows_of(sequence: Sequence, noise: Noise) -> list[Row]:
+    prepared = prepare(Recording(replace(sequence, truth=None), noise=noise))
     return [_row_of(name, prepared) for name in NAMES]
 
 
@@ -108,9 +108,13 @@ def _row_of(name: str, prepared: Prepared) -> Row:
 
 
 def test_an_odometer_that_slips_is_reported_of_dead_reckoning_too_and_a_sound_one_of_nobody() -> None:
-    sound = simulate(replace(DRIVE, duration_s=8.0), 5)
-    assert not any(True for _ in motion_test_lines(MotionTest.of(rows_of(sound))))
-    slipping = MotionTest.of(rows_of(faults.disturbed_motion(sound, 0.8, 5)))
+    sound, as_stated = simulate(replace(DRIVE, duration_s=8.0), 5), Noise(motion_scale=1.0)
+    for noise in (Noise(), as_stated):
+        assert not any(True for _ in motion_test_lines(MotionTest.of(rows_of(sound, noise))))
+    slips = faults.disturbed_motion(sound, 0.8, 5)
+    # With its noise as measured, four times as large, no estimate is too far from the motion alone.
+    assert MotionTest.of(rows_of(slips, Noise())).is_contradicted
+    slipping = MotionTest.of(rows_of(slips, as_stated))
     assert (slipping.uncorrected, slipping.is_contradicted) == (("dead-reckoning",), True)
     assert set(slipping.contradicting) <= {"ekf-slam", "msckf"} == set(slipping.tested)
     assert "seed-ekf" in {one.row.estimator for one in slipping.too_far}

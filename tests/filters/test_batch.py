@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from filters.smoothing import robust_schedule
+from filters import batch
+from filters.batch import worth_smoothing
 from filters.smoothing.levenberg_marquardt import Solution, solve
-from filters.smoothing.robust_schedule import worth_smoothing
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import StereoFrame
@@ -68,7 +68,7 @@ def test_once_a_step_has_raised_the_error_landmarks_move_in_images_from_the_star
         at_once.append(None if images is None else images.at_once)
         return solve(*arguments)._replace(overshot=overshoots and len(at_once) == 1)
 
-    monkeypatch.setattr(robust_schedule, "solve", recorded)
+    monkeypatch.setattr(batch, "solve", recorded)
     assert run_estimator("batch", simulate(replace(DRIVE, duration_s=2.0), 0)).status == "ok"
     assert at_once == [None, overshoots, overshoots]
 

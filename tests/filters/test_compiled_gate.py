@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from filters.kalman import compiled as compiled_parts
-from filters.kalman import multiview, track_gate, tracks_in_view
+from filters.kalman import track_gate, tracks_in_view
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.multiview import TrackSightings
@@ -31,8 +31,7 @@ TOLERANCE = 1e-9
 def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
     requested = Compilation("compiled")
-    gate, in_view = compiled_parts.track_test(requested), compiled_parts.steps_in_view(requested)
-    return gate, in_view, compiled_parts.images(requested)
+    return compiled_parts.track_test(requested), compiled_parts.steps_in_view(requested)
 
 
 @pytest.fixture(scope="module")
@@ -106,23 +105,6 @@ def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, pro
     assert ours.vector == pytest.approx(theirs.vector, abs=TOLERANCE * np.abs(ours.matrix).max())
 
 
-def test_compiled_and_numpy_predict_the_same_images(kernels, flight):
-    """Of points in front of the camera, behind it and in its plane, to poses and landmarks."""
-    rig, window = flight
-    sightings = sightings_in(rig, window)
-    points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
-    points[7] = window.poses[-1, :3, 3] - 5.0 * window.poses[-1, :3, :3] @ rig.T_imu_cam[:3, 2]
-    points[8] = (window.poses[-1] @ rig.T_imu_cam @ [0.3, 0.2, 1e-5, 1.0])[:3]
-    theirs = kernels[2].linearised(points, window.poses, rig)
-    for ours, other in zip(multiview.NUMPY.linearised(points, window.poses, rig), theirs, strict=True):
-        assert ours.shape == other.shape
-        assert ours == pytest.approx(other, rel=TOLERANCE, abs=TOLERANCE * np.abs(ours[np.arange(TRACKS) != 8]).max())
-    for ours, other in zip(multiview.NUMPY.plain(points, window.poses, rig), theirs[::3], strict=True):
-        assert ours == pytest.approx(other, rel=TOLERANCE)
-    for plain, other in zip(kernels[2].plain(points, window.poses, rig), theirs[::3], strict=True):
-        np.testing.assert_array_equal(plain, other)
-
-
 def followed_in(rig, window: WindowPoses) -> FollowedTracks:
     """Return the tracks that the newest pose sees, with landmarks a little off and some sightings that count less."""
     sightings = sightings_in(rig, window)
@@ -173,7 +155,6 @@ def test_numpy_runs_where_nothing_is_set_and_where_it_is_requested():
     for compilation in (Compilation(), Compilation("numpy")):
         assert compiled_parts.track_test(compilation) is track_gate.tested
         assert compiled_parts.steps_in_view(compilation) is tracks_in_view.NUMPY
-        assert compiled_parts.images(compilation) is multiview.NUMPY
         assert compilation.ran == "numpy"
 
 

@@ -83,7 +83,7 @@ def in_sigmas(one, other):
 def test_the_newest_pose_is_better_than_one_carried_by_the_motion_and_knows_it(scenario, monkeypatch):
     sequence = simulate(replace(scenario, duration_s=2.0), 5)
     answer = run("one", msckf_fej.build, sequence, sequence.prior).causal
-    monkeypatch.setattr(TracksInView, "corrected", lambda self, joint, sightings, share: joint.core)
+    monkeypatch.setattr(TracksInView, "corrected", lambda self, joint, sightings: joint.core)
     carried = run("one", msckf_fej.build, sequence, sequence.prior).causal
     squared_m2 = [
         np.square(trajectory.T_world_imu[:, :3, 3] - sequence.truth.T_world_imu[:, :3, 3]).sum(axis=1).mean()

@@ -168,8 +168,8 @@ def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pa
 
 
 @pytest.fixture(autouse=True)
-def _shared_cache(shared_cache: None, one_process: None) -> None:
-    """Leave the user's own cache alone, and start no process: a folder that is refused needs none."""
+def _in_this_process(one_process: None) -> None:
+    """Start no process: a folder that is refused needs none."""
 
 
 def write_images(folder: Path, images: list[Image], names: list[str]) -> None:

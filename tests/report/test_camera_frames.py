@@ -23,11 +23,9 @@ from toolkit.report.run_directory import MadeBy, RunFiles, check_run_directory, 
 
 
 @pytest.fixture(scope="module")
-def filmed(kitti_drive: Path, _kept_tracks: Path) -> Comparison:
+def filmed(kitti_drive: Path) -> Comparison:
     """The truth as an estimator, and one whose every other pose is 5 cm to the side."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VISLAM_CACHE", str(_kept_tracks))
-        sequence = load_sequence(str(kitti_drive))
+    sequence = load_sequence(str(kitti_drive))
     assert sequence.truth is not None
     right = Trajectory(sequence.frames_t_ns, sequence.truth.T_world_imu)
     shaken = right.T_world_imu.copy()

@@ -110,10 +110,11 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
         document = _decoded(content)
     except _NOT_JSON as why:
         raise DataError(f"cannot be read as JSON ({why})") from why
-    wanted, given = schema_name(record), _schema_of(document)
+    known, given = schema_names(record), _schema_of(document)
+    wanted = known[-1]
     if older and isinstance(document, dict) and isinstance(given, str) and given in older:
         document, given = {**older[given](document), "schema": wanted}, wanted
-    if given != wanted:
+    if given not in known:
         what = "it has none" if given is None else f"its schema is {given!r}"
         raise DataError(f"has not the schema {wanted}, which this version reads: {what}")
     try:
@@ -122,10 +123,9 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
         raise DataError(f"breaks the contract {wanted}: {readable(why, document, record)}") from why
 
 
-def schema_name(record: type[msgspec.Struct]) -> str:
-    """Return the name and version of a record's contract, such as vislam.metrics/1."""
-    (name,) = get_args(get_type_hints(record)["schema"])
-    return str(name)
+def schema_names(record: type[msgspec.Struct]) -> tuple[str, ...]:
+    """Return the names and versions of a record's contract, such as vislam.metrics/1, the present one last."""
+    return get_args(get_type_hints(record)["schema"])
 
 
 def schema(record: type[msgspec.Struct]) -> Json:

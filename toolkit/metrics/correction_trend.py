@@ -27,6 +27,8 @@ CAUSAL_ONLY = "corrections from frame to frame belong to the causal output"
 TREND, LIMIT = "correction_trend", "correction_trend_limit"
 # Length of a stretch (s): errors shared by all tracks add up within it; in longer stretches biases absorb them.
 _STRETCH_S = 1.0
+# A variance that is reduced by no more than this share of it is as it was predicted.
+_ROUNDING = 1e-12
 NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
 # A consistent estimator exceeds half of the limit less than once in a million runs. The other half allows for filters
 # that linearise at estimates which they correct later, and so count some information twice. It was chosen by
@@ -72,7 +74,9 @@ def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
         before = replace(step.belief, cov=cov[step.start]).predicted(step.prediction)
         correction = Correction.of(before, _answer(before, evaluation.estimate, cov, step.end))
         total = correction if total is None else total + correction
-        sigma2, since_s = sigma2 + np.maximum(np.diag(correction.taken), 0.0), since_s + step.dt_s
+        taken = np.diag(correction.taken)
+        sigma2 = sigma2 + np.where(taken > _ROUNDING * np.diag(before.cov), taken, 0.0)
+        since_s += step.dt_s
         if since_s > _STRETCH_S - 1e-6:
             yield total.test(np.sqrt(sigma2))
             total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log
-from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
+from toolkit.models.gating import CHI2_3_MEDIAN, LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, StereoRig
@@ -32,8 +32,6 @@ LEAST_SCALE2 = 1e-6
 RIDGE = 1e-12
 # Depth given to a point that the motion puts behind the camera or at infinity.
 MOST_DEPTH_M = 1e5
-# Median of a chi-square variable with three degrees of freedom.
-CHI2_3_MEDIAN = 2.366
 # Pairs of sightings that are computed at a time: they take about 10 MB, however long the recording.
 PAIRS_AT_A_TIME = 10_000
 

@@ -10,6 +10,9 @@ from scipy.special import chdtr, chdtrc, chdtri
 
 from toolkit.geometry import Array, IntArray
 
+# Standard deviation of a normal variable over its median absolute deviation; median of a chi-square variable with three
+# degrees of freedom.
+MAD_TO_SIGMA, CHI2_3_MEDIAN = 1.4826, 2.366
 # At this disparity and a pixel of noise the depth is uncertain by 100 %: a landmark waits for a better view.
 LEAST_DISPARITY_PX = 1.0
 # A point nearer to the camera than this is not triangulated: stereo lenses are not focused there.

@@ -4,6 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.measured_motion import ImuNoise, TwistChangeNoise, TwistNoise
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
@@ -19,8 +20,6 @@ MEMS_ACCEL, MEMS_GYRO, MEMS_ACCEL_WALK = 2e-2, 1e-3, 3e-3
 # Change of an unmeasured motion (m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)): a second of braking at 3 m/s^2, or of a hand that
 # turns at 1 rad/s. The tracks determine the motion; a factor of three in these numbers changes the result little.
 VELOCITY_CHANGE, TURN_CHANGE = 3.0, 1.0
-
-_MAD_TO_SIGMA = 1.4826
 
 
 def mems_imu() -> ImuNoise:
@@ -48,7 +47,7 @@ def white_sigma(samples: Array) -> Array:
     if len(clean) < 3:
         return np.zeros(samples.shape[1])
     second = clean[2:] - 2.0 * clean[1:-1] + clean[:-2]
-    sigma: Array = _MAD_TO_SIGMA * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+    sigma: Array = MAD_TO_SIGMA * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
     return sigma
 
 

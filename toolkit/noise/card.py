@@ -10,12 +10,12 @@ import numpy as np
 
 from toolkit.arrays import rows_of
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, slope
+from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import camera_motion, neighbours
-from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.gating import LEAST_DISPARITY_PX, MAD_TO_SIGMA
 from toolkit.models.stereo import CHANNELS, disparity_px
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight
 from toolkit.noise.measurement import adjusted_stretches, measured_noise
@@ -70,7 +70,9 @@ class Card:
 def card_of(sequence: Sequence) -> Card:
     """Return the card of a sequence; raises DataError where it cannot be run or its tracks are too few."""
     check_runnable(sequence)
-    seen, rig = sequence.visible, sequence.rig
+    seen, rig, measured = sequence.visible, sequence.rig, measured_noise(sequence)
+    if measured.why_not:
+        raise DataError(f"{sequence.name}: what its tracks are like cannot be measured: {measured.why_not}")
     here = _Residuals(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
     for _, adjusted in adjusted_stretches(sequence):
         more = _Residuals.of(adjusted, int(here.track.max(initial=-1)) + 1)
@@ -93,7 +95,7 @@ def card_of(sequence: Sequence) -> Card:
         depth_m=np.quantile(depth_m, QUANTILES),
         intervals=common.size,
         blind_intervals=int((common == 0).sum()),
-        weight=measured_noise(sequence).tracks,
+        weight=measured.tracks,
         correlation=np.stack([_correlation(of_sound, lag) for lag in range(1, LAGS + 1)]),
         left_right=_left_right(of_sound.px),
         tails=float((np.abs(here.px) > _TAIL * spread_px).mean()),

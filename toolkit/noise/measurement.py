@@ -18,7 +18,7 @@ from toolkit.noise.stretches import Adjusted, MotionFit, Stretch, stretches
 from toolkit.sequence import Sequence, StereoRig
 
 # Raised with every change of the measurement that changes what it finds.
-_MEASUREMENT = 1
+_MEASUREMENT = 2
 # The weight of tracks is measured with the motion's noise so many times as large as stated: a motion that errs more
 # than stated would otherwise pull the poses, and with them all residuals of an image.
 _LOOSE = 10.0
@@ -62,6 +62,8 @@ def _measured(sequence: Sequence) -> MeasuredNoise:
     if not at_hand:
         return MeasuredNoise(why_not="the tracks do not determine the motion in any part of it")
     weight = track_weight((one.residuals(FEWEST_SIGHTINGS), stretch.used) for stretch, one in at_hand)
+    if not weight.pairs:
+        return MeasuredNoise(why_not=f"no track is seen by both images in {FEWEST_SIGHTINGS} frames and more")
     if sequence.motion_kind == "none":
         return MeasuredNoise(weight)
     rig = replace(sequence.rig, track_weight=weight.value)

@@ -24,6 +24,7 @@ from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models import stereo
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
@@ -57,8 +58,6 @@ _EUROC_NAMES: dict[LensModel, str] = {
     "radtan": "radial-tangential",
     "equidistant": "equidistant",
 }
-# Ratio of a normal variable's sigma to its median absolute deviation, which mismatches do not change.
-_TO_SIGMA = 1.4826
 _MISMATCH_PX = 3.0
 
 
@@ -337,7 +336,7 @@ def with_scene_errors(sequence: Sequence) -> Sequence:
     off_px = off_px[np.isfinite(off_px).all(axis=1)]
     if not len(off_px):
         return sequence
-    u_left, u_right, v = (_TO_SIGMA * np.median(np.abs(off_px), axis=0)).tolist()
+    u_left, u_right, v = (MAD_TO_SIGMA * np.median(np.abs(off_px), axis=0)).tolist()
     beyond = 100.0 * float((np.abs(off_px) > _MISMATCH_PX).any(axis=1).mean())
     fact = (
         f"against the rendered scene, at the points that tracks began with, sightings are off by {u_left:.2f} px (uL), "

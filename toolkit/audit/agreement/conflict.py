@@ -16,9 +16,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.integrated_gravity import IntegratedGravity
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR, median
+from toolkit.audit.parts.robust import MEDIAN_TO_MEAN_ERROR, median
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.camera_motion import CameraMotion
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 

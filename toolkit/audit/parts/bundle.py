@@ -15,6 +15,7 @@ import numpy as np
 
 from toolkit.audit.parts.strides import ImuStrides, TwistStrides
 from toolkit.geometry import Array, IntArray, se3, skew, so3_exp
+from toolkit.models.gating import CHI2_3_MEDIAN
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
@@ -29,7 +30,7 @@ GYRO_BIAS, _BIASES, RIGHT_SHIFT, RIGHT_ROLL = slice(13, 16), slice(13, 19), 19, 
 # Those on which sightings depend.
 _OF_CAMERA = np.r_[:13, RIGHT_SHIFT, RIGHT_ROLL]
 _CAMERA = len(_OF_CAMERA)
-CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
+CAUCHY_SIGMAS, LEAST_SCALE2 = 2.0, 1e-4
 LEAST_DEPTH_M = 0.1
 # Information that fixes the first pose, and a ridge far below the information of a sighting.
 _GAUGE, _RIDGE = 1e10, 1e-9

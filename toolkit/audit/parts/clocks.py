@@ -16,11 +16,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
-from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar, slope, spread
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, slope, spread
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import CameraMotion
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S, Pairing
 from toolkit.sequence import Sequence, Truth
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.intervals import moved_as_measured, moved_by
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar
+from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.jackknife import jackknife_error
 from toolkit.measured_motion import TwistChangeNoise, TwistNoise
 from toolkit.models.camera_motion import CameraMotion, triangulation_jacobian, usable_pairs
-from toolkit.models.gating import LEAST_DEPTH_M
+from toolkit.models.gating import LEAST_DEPTH_M, MAD_TO_SIGMA
 from toolkit.models.stereo import project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

@@ -8,8 +8,8 @@ from scipy.special import stdtrit
 
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES
+from toolkit.models.gating import MAD_TO_SIGMA
 
-MAD_TO_SIGMA = 1.4826
 CAUCHY_SIGMAS = 2.0
 ITERATIONS = 10
 # Standard error of a median over that of a mean, for normal errors.

@@ -9,8 +9,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.one_step import errors_are_independent
-from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar
 from toolkit.geometry import Array, BoolArray
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 
 # The parts before and after each of these shares of the recording are compared. A change must be beyond so many

@@ -11,8 +11,8 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.edits import keep_samples
-from toolkit.audit.parts.robust import MAD_TO_SIGMA
 from toolkit.geometry import Array, BoolArray
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 

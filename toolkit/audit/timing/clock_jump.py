@@ -13,10 +13,11 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.edits import keep_frames, keep_samples
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar
+from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.stamps import NOT_A_TIME
 from toolkit.geometry import Array, IntArray
 from toolkit.models.camera_motion import camera_motion
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, median_error
+from toolkit.audit.parts.robust import Scalar, median_error
 from toolkit.geometry import Array
+from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.resampling import NS_PER_S
 
 # An interval is a candidate beyond so many standard deviations of all and beyond this angle (rad). Single intervals of

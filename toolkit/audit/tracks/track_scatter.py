@@ -22,7 +22,7 @@ from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.audit.parts.one_step import errors_are_independent
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.gating import CHI2_3_MEDIAN, mahalanobis_squared
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 
 # Limit of the ratio of the standard deviation to the stated one. 21 sound simulated recordings have 0.98 to 1.00 and
@@ -33,10 +33,10 @@ UPPER_QUARTILE, FAR_CHI2 = 4.108, 16.27
 # Beyond this squared distance, 32 standard deviations, a sighting is of another point. Sound real recordings have at
 # most 0.6 % of these, on moving objects and in repeated frames; the limit of their share was chosen with them in view.
 GROSS_CHI2, MOST_GROSS = 1000.0, 0.02
-# Median of the squared distances, and the ratios by it that agree with the stated noise, also with a fifth of
+# Ratios of the squared distances' median to its expectation that agree with the stated noise, also with a fifth of
 # mismatches. The tail must then agree as well, unless there are mismatches: a tenth of sliding tracks gives 2.1 to 5.6
 # % of far distances, sound simulations have 0.06 to 0.12 %.
-MEDIAN_CHI2, USUAL_SCATTER = 2.366, (0.95, 1.12)
+USUAL_SCATTER = (0.95, 1.12)
 MOST_FAR, FAR_SIGMAS = 0.008, 3.0
 # Independent errors contradict a noise that is stated this many times too large. With few tracks the scatter is a
 # little too small, because the camera's motion is fitted to them; and a noise overstated on purpose is often less than
@@ -140,7 +140,7 @@ def _scatter(chi2: Array) -> float:
 
 def _nearer_scatter(chi2: Array) -> float:
     """Return the same ratio by the median of the squared distances (P,)."""
-    return float(np.sqrt(np.median(chi2) / MEDIAN_CHI2))
+    return float(np.sqrt(np.median(chi2) / CHI2_3_MEDIAN))
 
 
 def _gross_share(chi2: Array) -> float:
