@@ -24,7 +24,6 @@ from itertools import pairwise
 import matplotlib.pyplot as plt
 import numpy as np
 from recordings import real
-from toolkit.track_errors import Card
 
 from toolkit import Result, compare
 from toolkit.estimator import ladder
