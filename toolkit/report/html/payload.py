@@ -20,7 +20,8 @@ from toolkit.report import curves
 from toolkit.report.html.highlights import highlights
 from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
-from toolkit.report.score_records import ConsistencyMark, RunOverSeeds
+from toolkit.report.score_records import ConsistencyMark, MetricOverSeeds, RunOverSeeds
+from toolkit.report.table import Unit, unit_of
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -36,10 +37,9 @@ def payload_of(runs: Sequence[Files]) -> Json:
     """Return what the page shows of run directories, side by side in this order."""
     titles = _titles(runs)
     colours = _colours(runs)
-    keys = {key for files in runs for run in files.scores.runs for key in run.metrics}
     return {
         "title": " / ".join(titles),
-        "columns": columns_of(keys),
+        "columns": columns_of(_values(runs)),
         "cases": [
             _case(files, f"c{i}", title, colours)
             if isinstance(files, RunFiles)
@@ -196,16 +196,27 @@ def _nees(series: NeesSeries | str) -> Json | str:
     return thinned(columns, "pose") | band
 
 
-def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
-    """Return a column for each metric that the runs have, and for each key that no metric here declares."""
-    present = [metric for metric in known_metrics() if metric.key in keys_present]
+def _values(runs: Sequence[Files]) -> dict[str, list[float | None]]:
+    """Return the values, over seeds the means, that stand in the column of each metric, of runs that ended well."""
+    values: dict[str, list[float | None]] = {}
+    for files in runs:
+        for run in files.scores.runs:
+            for key, metric in run.metrics.items():
+                value = metric.mean if isinstance(metric, MetricOverSeeds) else metric
+                values.setdefault(key, []).append(value if "ok" in run.status else None)
+    return values
+
+
+def columns_of(values: Mapping[str, Sequence[float | None]]) -> list[dict[str, Any]]:
+    """Return a column for each metric that has values, and for each key that no metric here declares."""
+    present = [metric for metric in known_metrics() if metric.key in values]
     usual = [metric for metric in present if metric.table != "on request"]
     columns = [
         {
             "key": metric.key,
             "name": metric.name,
             "unit": metric.unit,
-            "decimals": metric.decimals,
+            "shown_in": unit_of(metric, values[metric.key])._asdict(),
             "count": metric.count,
             "meaning": metric.meaning,
             "best": metric.best,
@@ -214,12 +225,20 @@ def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
         }
         for metric in (*usual, *(metric for metric in present if metric not in usual))
     ]
-    return [*columns, *(_undeclared(key) for key in sorted(keys_present - {metric.key for metric in present}))]
+    return [*columns, *(_undeclared(key) for key in sorted(values.keys() - {metric.key for metric in present}))]
 
 
 def _undeclared(key: str) -> dict[str, Any]:
     """Return the column of a metric that the runs have and this installation does not know."""
-    words = {"key": key, "name": key, "unit": "", "decimals": 3, "count": False, "meaning": "", "best": ""}
+    words = {
+        "key": key,
+        "name": key,
+        "unit": "",
+        "shown_in": Unit("")._asdict(),
+        "count": False,
+        "meaning": "",
+        "best": "",
+    }
     return {**words, "usual": False, "usual_over_seeds": False}
 
 
