@@ -106,18 +106,17 @@ def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metr
     if comparison.over_seeds:
         return tuple(metric for metric in valued if metric.over_seeds)
     differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
+    return (*differing, *usual_metrics(valued, real=comparison.sequence.provenance.format != "simulated"))
+
+
+def usual_metrics(valued: list[Metric], *, real: bool) -> list[Metric]:
+    """Return the columns of one run by default, of the metrics that have values.
+
+    Those of a ``real`` recording are those of a drive where it is long enough for the KITTI benchmark's drift.
+    """
     usual = [metric for metric in valued if metric.table == "always"]
-    return (*differing, *(_for_a_drive(valued, usual) if _is_real(comparison) else usual))
-
-
-def _is_real(comparison: Comparison) -> bool:
-    return comparison.sequence.provenance.format != "simulated"
-
-
-def _for_a_drive(valued: list[Metric], usual: list[Metric]) -> list[Metric]:
-    """Return the columns of a recording: those of a drive where it is long enough for the KITTI benchmark's drift."""
     leading = [metric for key in _LEADING for metric in valued if metric.key == key]
-    if len(leading) < len(_LEADING):
+    if not real or len(leading) < len(_LEADING):
         return usual
     return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SHOWN_AS_DRIFT))]
 

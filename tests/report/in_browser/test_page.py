@@ -93,7 +93,7 @@ def test_trouble_is_reported_in_words(page: Page, single: Path) -> None:
 @pytest.mark.parametrize("how", ["click", "keyboard"])
 def test_an_estimator_can_be_switched_off_everywhere(page: Page, single: Path, how: str) -> None:
     page.open(single)
-    views = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart='Position error']")
+    views = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart^='Position error']")
     before = [page.picture(view) for view in views]
     chip = ".chip[data-line='steady both']"
     if how == "click":

@@ -17,7 +17,9 @@ from toolkit.files.documents import number, numbers
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves
+from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.html.highlights import highlights
+from toolkit.report.looks import look_numbers
 from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.score_records import ConsistencyMark, MetricOverSeeds, RunOverSeeds
@@ -39,7 +41,7 @@ def payload_of(runs: Sequence[Files]) -> Json:
     colours = _colours(runs)
     return {
         "title": " / ".join(titles),
-        "columns": columns_of(_values(runs)),
+        "columns": columns_of(_values(runs), real=any(one.manifest.sequence.format != "simulated" for one in runs)),
         "cases": [
             _case(files, f"c{i}", title, colours)
             if isinstance(files, RunFiles)
@@ -60,9 +62,7 @@ def _titles(runs: Sequence[Files]) -> list[str]:
 
 
 def _colours(runs: Sequence[Files]) -> dict[str, int]:
-    """Number the estimators in order of appearance; one of the same name has the same colour in every run."""
-    names = dict.fromkeys(run.estimator for files in runs for run in files.scores.runs)
-    return {name: i for i, name in enumerate(names)}
+    return look_numbers(run.estimator for files in runs for run in files.scores.runs)
 
 
 def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
@@ -207,10 +207,15 @@ def _values(runs: Sequence[Files]) -> dict[str, list[float | None]]:
     return values
 
 
-def columns_of(values: Mapping[str, Sequence[float | None]]) -> list[dict[str, Any]]:
-    """Return a column for each metric that has values, and for each key that no metric here declares."""
+def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> list[dict[str, Any]]:
+    """Return a column for each metric that has values, and for each key that no metric here declares.
+
+    First stand those of the table of a comparison, of a ``real`` recording where any of them is one.
+    """
     present = [metric for metric in known_metrics() if metric.key in values]
-    usual = [metric for metric in present if metric.table != "on request"]
+    valued = [metric for metric in present if any(value is not None for value in values[metric.key])]
+    usual = usual_metrics(valued, real=real)
+    usual += [metric for metric in present if metric.table == "where rows differ"]
     columns = [
         {
             "key": metric.key,

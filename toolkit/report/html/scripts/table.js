@@ -74,7 +74,12 @@ function summaryTable(cases, columns, title) {
   }
 
   function wordCell(row, column, i) {
-    if (i === 0) return el("th", { scope: "row", class: "word" }, swatch(row), el("span", { text: row.estimator }));
+    if (i === 0) {
+      // On a phone these words take the place of their columns, so that numbers are seen at once.
+      const rest = words.slice(1).map((other) => other.text(row)).filter((text) => text && text !== "ok");
+      return el("th", { scope: "row", class: "word" }, swatch(row), el("span", { text: row.estimator }),
+        el("small", { "aria-hidden": "true", text: [...rest, row.mark].filter(Boolean).join(", ") }));
+    }
     const text = column.text(row);
     if (column.name !== "status") return el("td", { class: "word", text });
     const mark = row.mark ? [" ", el("span", { class: "status mark", text: row.mark })] : [];
