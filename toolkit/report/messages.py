@@ -228,7 +228,7 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def _figure(value: float) -> str:
-    return number(value, 2)
+    return number(value)
 
 
 def consistency_lines(comparison: Comparison) -> Iterator[str]:

@@ -100,9 +100,10 @@ class ErrorKind(Struct, frozen=True, kw_only=True):
     """What the errors of this report are."""
 
     what: Annotated[str, Meta(description="error, or the difference from whom")]
-    placing: Annotated[
-        str, Meta(description="how the estimates are placed; empty in older documents, where a fit did")
-    ] = ""
+    placing: (
+        Annotated[str, Meta(description="how estimates are placed; absent in older documents, whose caption says it")]
+        | UnsetType
+    ) = UNSET
     caption: str
 
 

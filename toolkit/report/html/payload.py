@@ -76,7 +76,7 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
         "words": to_builtins(report.words),
         "card": [] if report.card is UNSET else report.card.words,
         "alignment": report.alignment,
-        "error": None if report.error is None else asdict(report.error),
+        "error": to_builtins(report.error),
         "highlights": highlights(rows, sequence.motion),
         "rows": rows,
         "truth": None if report.truth is None else _drawn(files.tracks[report.truth]),
