@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.report.scores_json import path_length_m
-from toolkit.report.table import MISSING, Table, Unit, cell, heading, number, unit_of
+from toolkit.report.table import MISSING, ShownUnit, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Noise, Window, outlier_summary
 
@@ -79,11 +79,11 @@ def _metric_columns(comparison: Comparison, columns: Columns) -> Iterator[_Colum
             yield _Column(("NEES", "band", "%"), _in_band)
 
 
-def _value(row: Row, metric: Metric, unit: Unit) -> str:
+def _value(row: Row, metric: Metric, unit: ShownUnit) -> str:
     return cell(row.value(metric.key), metric, unit)
 
 
-def _std(row: Row, metric: Metric, unit: Unit) -> str:
+def _std(row: Row, metric: Metric, unit: ShownUnit) -> str:
     spread = row.spread(metric.key)
     return cell(None if spread is None else spread.std, metric, unit)
 

@@ -13,8 +13,8 @@ from toolkit.metrics import Metric
 from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
 from toolkit.report.table import (
     MISSING,
+    ShownUnit,
     Table,
-    Unit,
     as_latex,
     as_markdown,
     as_text,
@@ -101,7 +101,7 @@ def sequences_table(evaluation: EvaluatedSystems) -> Table:
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
-def _median_and_failures(runs: Cell, metric: Metric, unit: Unit) -> str:
+def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
     """Return the median of the runs of a system on a sequence, and how many of them failed."""
     failed = f"{runs.failed} of {len(runs.runs)} failed" if runs.failed else ""
     median = runs.median(metric)
@@ -110,7 +110,7 @@ def _median_and_failures(runs: Cell, metric: Metric, unit: Unit) -> str:
     return f"{cell(median, metric, unit)} ({failed})" if failed else cell(median, metric, unit)
 
 
-def _quartiles(found: QuantilesOfAll | None, metric: Metric, unit: Unit) -> str:
+def _quartiles(found: QuantilesOfAll | None, metric: Metric, unit: ShownUnit) -> str:
     if found is None or found.n < 2:
         return MISSING
     return " .. ".join(cell(q, metric, unit) for q in (found.lower_quartile, found.upper_quartile))

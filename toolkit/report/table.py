@@ -55,27 +55,27 @@ class Table(NamedTuple):
     best: frozenset[tuple[int, int]] = frozenset()
 
 
-class Unit(NamedTuple):
+class ShownUnit(NamedTuple):
     """The unit of a column, and how many of it one of the metric's own unit is."""
 
     name: str
     factor: float = 1.0
 
 
-def unit_of(metric: Metric, values: Iterable[float | None]) -> Unit:
+def unit_of(metric: Metric, values: Iterable[float | None]) -> ShownUnit:
     """Return the unit in which the values of a metric that stand in one column are written."""
     sizes = sorted(abs(value) for value in values if value is not None)
     if metric.unit == "m" and sizes and sizes[len(sizes) // 2] < _SHORT_M and sizes[-1] < _LONGEST_IN_MM:
-        return Unit("mm", 1e3)
-    return Unit(metric.unit)
+        return ShownUnit("mm", 1e3)
+    return ShownUnit(metric.unit)
 
 
-def heading(metric: Metric, unit: Unit) -> tuple[str, str, str]:
+def heading(metric: Metric, unit: ShownUnit) -> tuple[str, str, str]:
     """Return the lines above a metric's column: what, which, unit."""
     return (*metric.heading, unit.name)
 
 
-def cell(value: float | None, metric: Metric, unit: Unit | None = None) -> str:
+def cell(value: float | None, metric: Metric, unit: ShownUnit | None = None) -> str:
     """Return a metric's value as it stands in a table, in the metric's own unit unless another is given."""
     if value is None:
         return MISSING

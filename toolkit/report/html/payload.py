@@ -23,7 +23,7 @@ from toolkit.report.looks import look_numbers
 from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.score_records import ConsistencyMark, MetricOverSeeds, RunOverSeeds
-from toolkit.report.table import Unit, unit_of
+from toolkit.report.table import ShownUnit, unit_of
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -239,7 +239,7 @@ def _undeclared(key: str) -> dict[str, Any]:
         "key": key,
         "name": key,
         "unit": "",
-        "shown_in": Unit("")._asdict(),
+        "shown_in": ShownUnit("")._asdict(),
         "count": False,
         "meaning": "",
         "best": "",
