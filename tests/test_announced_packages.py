@@ -170,7 +170,11 @@ def test_a_metric_file_that_is_none_is_named(
     announce("toolkit.metrics", {"answer.py": text})
     with pytest.raises(ExtensionError, match=re.escape(why)):
         metrics.known_metrics()
-    for words in (("compare", "drive", "--columns", "answer"), ("diff", "one", "two", "--columns", "all"), ("list",)):
+    for words in (
+        ("compare", "drive", "--columns", "answer"),
+        ("diff", "one", "two", "--columns", "all"),
+        ("list", "metrics"),
+    ):
         assert main(words) == 70
         assert why in capsys.readouterr().err
 

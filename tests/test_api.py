@@ -173,7 +173,7 @@ def test_a_sequence_is_loaded_by_a_name_and_a_whole_number(source: Any, seed: An
 
 def test_a_table_is_text_and_markdown(result: Result) -> None:
     shown = result.table("ATE SE(3)")
-    assert " ATE SE(3) [m] |" in shown._repr_markdown_()
+    assert " ATE SE(3) [mm] |" in shown._repr_markdown_()
     assert "dead-reckoning" in str(shown)
     assert repr(shown) == str(shown)
 

@@ -1,6 +1,7 @@
 """What the subcommands do when all is well."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,11 +53,21 @@ def test_a_start_from_the_truth_is_labelled(vislam: Vislam, capsys: pytest.Captu
     assert "truth" in start
 
 
-def test_list_names_every_kind_of_part(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     assert vislam("list") == 0
-    listed = capsys.readouterr().out
-    for name in ("dead-reckoning", "kitti00", "drive", "ate_se3_m", *audit.faults()):
-        assert name in listed
+    counts = re.findall(r"^ *(\d+) (\w+)", capsys.readouterr().out, flags=re.MULTILINE)
+    listed = {kind: (vislam("list", kind), capsys.readouterr().out)[1] for _, kind in counts}
+    for count, kind in counts:
+        assert len(re.findall(r"^\S", listed[kind], flags=re.MULTILINE)) == int(count), kind
+    names = {"estimators": ["dead-reckoning"], "sequences": ["kitti00", "drive"], "metrics": ["ate_se3_m"]}
+    names |= {"faults": list(audit.faults()), "settings": ["window.lag_s"], "formats": ["euroc"]}
+    for kind, some in names.items():
+        assert {*some} <= {line.split()[0] for line in listed[kind].splitlines()}
+
+
+def test_list_answers_an_unknown_kind_with_those_there_are(vislam: Vislam, one_line: Callable[[], str]) -> None:
+    assert vislam("list", "cameras") == 2
+    assert "estimators, metrics, faults" in one_line()
 
 
 def test_a_simulated_recording_can_be_compared(vislam: Vislam) -> None:

@@ -37,7 +37,6 @@ COMMANDS = (
     "verify",
     "completion",
 )
-STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 
 
@@ -59,10 +58,8 @@ def test_help_imports_nothing_slow(command: str) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_an_example_and_the_exit_statuses(command: str) -> None:
+def test_help_has_an_example(command: str) -> None:
     assert re.search(r"^  \$ vislam ", help_of(command).stdout, flags=re.MULTILINE)
-    matches = re.findall(r"^  (\d+) ", help_of(command).stdout, flags=re.MULTILINE)
-    assert tuple(matches) == STATUSES
 
 
 @pytest.mark.usefixtures("one_process", "unrendered", "own_cache")

@@ -241,10 +241,10 @@ def test_formats_say_the_same(tree, capsys) -> None:
     tree("evaluate", "truths", "results", "--format", "latex")
     latex = capsys.readouterr().out
     assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 2
-    assert r"\textbf{0.17}" in latex
+    assert r"\textbf{0.174}" in latex
     assert r"[\%]" in latex
     tree("evaluate", "truths", "results", "--format", "markdown")
-    assert "**0.17**" in capsys.readouterr().out
+    assert "**0.174**" in capsys.readouterr().out
     tree("evaluate", "truths", "results", "--quiet")
     assert capsys.readouterr().out == ""
 

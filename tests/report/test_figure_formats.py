@@ -1,12 +1,14 @@
-"""Figures in other formats are whole and repeatable, and fourteen estimators are told apart."""
+"""Figures in other formats are whole and repeatable, and estimators are told apart in all of them."""
 
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from toolkit.estimator import defaults, discover
 from toolkit.report.figures import FigureFormat, save
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
+from toolkit.report.looks import COLOURS, look_numbers
 
 BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
 
@@ -27,11 +29,18 @@ def test_a_figure_is_of_its_format_and_the_same_every_time(tmp_path, kind: Figur
     assert one == two
 
 
-def test_fourteen_estimators_are_distinguished_and_both_outputs_keep_one_colour() -> None:
-    names = [f"e{i}" for i in range(14)]
-    comparison = cast(Any, SimpleNamespace(runs=[SimpleNamespace(estimator=name) for name in names]))
+def test_all_estimators_are_distinguished_and_both_outputs_keep_one_colour() -> None:
+    names = [*discover(), "one of my own"]
+    comparison = cast(Any, SimpleNamespace(estimators=names))
     for output in ("causal", "final"):
         looks = [str(stroke_of(comparison, name, output)) for name in names]
-        assert len(set(looks)) == 14
+        assert len(set(looks)) == len(names)
     lines = {str(stroke_of(comparison, name, output)["linestyle"]) for name in names for output in ("causal", "final")}
-    assert len(lines) == 4
+    assert len(lines) == 6
+
+
+def test_an_estimator_has_one_look_whatever_it_is_compared_with() -> None:
+    together = look_numbers([*discover(), "one of my own"])
+    for name in together:
+        assert look_numbers([name])[name] == together[name]
+    assert len({together[name] % COLOURS for name in (*defaults(), "one of my own")}) == len(defaults()) + 1

@@ -9,10 +9,10 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from toolkit.estimate import Landmarks
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, se3
-from toolkit.report.curves import errors_to, onto_truth, truth_during
+from toolkit.report.curves import error_curves, errors_to, onto_truth, truth_during
 from toolkit.report.figures import against_bound, errors_over_time, frame_times, reprojection, top_view
 from toolkit.report.figures.style import colour_of, width_of
 from toolkit.settings import Metrics, Settings
@@ -99,7 +99,32 @@ def test_without_truth_the_figure_says_it_shows_differences(without_truth: Compa
 
 def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
     (drawn,) = errors_over_time.draw(comparison)
-    assert drawn.figure.axes[0].get_ylim()[1] < 2.0
+    curves = error_curves(comparison)
+    assert curves is not None
+    good_m = max(errors.position_m.max() for row, errors in curves.of_rows if row.status == "ok")
+    position, _ = drawn.figure.axes
+    assert position.get_ylim()[1] < 2.0 * good_m
+    assert "astray" in position.get_title(loc="right")
+
+
+def test_a_heading_far_from_the_others_leaves_its_panel_and_is_named(
+    comparison: Comparison, comparison_of: ComparisonOf
+) -> None:
+    runs = [run for run in comparison.runs if run.status == "ok"]
+    turned = replace(runs[0], estimator="turned", final=None, causal=turning(runs[0].trajectory("causal"), 30.0))
+    (drawn,) = errors_over_time.draw(comparison_of(comparison.sequence, (*runs, turned)))
+    heading = drawn.figure.axes[1]
+    assert heading.get_ylim()[1] < 15.0
+    assert "turned" in heading.get_title(loc="right")
+
+
+def turning(trajectory: Trajectory | None, most_deg: float) -> Trajectory:
+    """Return a trajectory whose heading leaves the one given ever more."""
+    assert trajectory is not None
+    angles = np.radians(np.linspace(0.0, most_deg, trajectory.t_ns.size))
+    poses = trajectory.T_world_imu.copy()
+    poses[:, :3, :3] = np.stack([about_z(float(angle)) for angle in angles]) @ poses[:, :3, :3]
+    return replace(trajectory, T_world_imu=poses)
 
 
 @pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw_all])

@@ -12,7 +12,10 @@ from msgspec import to_builtins
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.curves import components
+from toolkit.metrics import Evaluation
+from toolkit.metrics.parts.consistency import body_errors
+from toolkit.metrics.parts.residuals import rmse
+from toolkit.report.curves import components, error_curves
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document
 
@@ -61,11 +64,18 @@ def test_a_series_that_is_not_there_says_why(scored: Comparison) -> None:
     assert of(build(scored), "dead-reckoning")["nis"] == "the estimator reports no innovations"
 
 
-def test_errors_are_those_of_the_metric(comparison: Comparison) -> None:
+def test_errors_after_a_fit_are_those_of_the_metric(comparison: Comparison) -> None:
+    curves = error_curves(comparison, fitted=True)
+    assert curves is not None
+    for row, errors in curves.of_rows:
+        assert rmse(errors.position_m) == pytest.approx(row.scores.values["ate_se3_m"], rel=1e-9)
+
+
+def test_errors_are_those_from_the_start_that_the_nees_takes(comparison: Comparison) -> None:
     run, row = of(build(comparison), "late", "final"), comparison.rows[-2]
     assert row.estimator == "late"
-    rmse_m = np.sqrt(np.mean(np.square(run["errors"]["position_m"])))
-    assert rmse_m == pytest.approx(row.scores.values["ate_se3_m"], rel=1e-5)
+    expected_m = body_errors(Evaluation(row.run, "final", comparison.sequence)).distance_m
+    np.testing.assert_allclose(run["errors"]["position_m"], expected_m, rtol=1e-5, atol=1e-9)
     path_m = run["errors"]["path_m"]
     assert np.all(np.diff(path_m) >= 0.0)
     assert path_m[0] == 0.0

@@ -16,7 +16,7 @@ from toolkit.metrics import Scores, known_metrics
 from toolkit.report import prose
 from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
-from toolkit.report.table import Table, as_markdown, as_text, heading
+from toolkit.report.table import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
@@ -78,7 +78,7 @@ def test_pairs_that_differ_are_reported_with_columns_that_leave_them_out(
         same, lambda row: Scores(row.scores.values | ({"pairs": 90.0} if row.estimator == "steady" else {}), {})
     )
     text = comparison_text(fewer, ("ate_se3_m",))
-    assert text.splitlines()[1] == "scored: coverage 100.0 %, pairs 90 to 120"
+    assert text.splitlines()[1] == "scored: coverage 100 %, pairs 90 to 120"
 
 
 def test_no_line_is_wider_than_100_characters(comparison: Comparison) -> None:
@@ -86,13 +86,15 @@ def test_no_line_is_wider_than_100_characters(comparison: Comparison) -> None:
 
 
 def test_the_widest_default_table_fits_100_characters() -> None:
-    """The longest estimator names, every column there can be, numbers of five characters, and a ladder below."""
+    """The estimators there are, every column there can be, errors of six characters, and a ladder below."""
     metrics = [metric for metric in known_metrics() if metric.table != "on request"]
-    names = [*discover(), "openvins (est.txt)"]
-    rows = tuple((name, "causal", "diverged", *["12.34"] * len(metrics)) for name in names)
+    cells = [
+        "0.0123" if metric.best != "most" and metric.unit not in ("s", "ms", "") else "12.34" for metric in metrics
+    ]
+    rows = tuple((name, "causal", "diverged", *cells) for name in discover())
     labels = (("estimator", "", ""), ("output", "", ""), ("status", "", ""))
     under = tuple(change_lines((name, entry.change()) for name, entry in discover().items()))
-    table = Table((*labels, *map(heading, metrics)), rows, len(labels), under)
+    table = Table((*labels, *(heading(metric, unit_of(metric, [])) for metric in metrics)), rows, len(labels), under)
     assert max(map(len, as_text(table).splitlines())) <= 100
 
 
@@ -157,16 +159,42 @@ def test_a_table_without_rows_keeps_its_headings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "cell"),
-    [(0.123, "0.12"), (15.8, "15.80"), (123.456, "123.5"), (26509.65, "26510"), (3.2e11, "3e+11"), (None, "-")],
+    ("value", "text"),
+    [
+        *[(0.0, "0"), (0.0237, "0.0237"), (0.123, "0.123"), (9.996, "10.0"), (99.96, "100"), (15.8, "15.8")],
+        *[(123.456, "123"), (-0.5, "-0.500"), (26509.65, "26510"), (3.2e11, "3e+11"), (5.31e-4, "5.3e-4")],
+    ],
 )
-def test_large_numbers_lose_decimals_before_they_take_space(
-    comparison: Comparison, rescored: Rescored, value: float | None, cell: str
+def test_a_number_has_three_significant_digits_and_its_whole_part(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_errors_of_millimetres_are_told_apart_in_millimetres(comparison: Comparison, rescored: Rescored) -> None:
+    sizes_m = iter([0.00383, 0.00371, 0.00355, 0.0036, 0.0037, 0.0038, 0.5, 0.0039])
+    small = rescored(comparison, lambda row: Scores(row.scores.values | {"ate_yaw_m": next(sizes_m)}, {}))
+    table = comparison_table(small)
+    cells = [row[table.headings.index(("ATE", "yaw", "mm"))] for row in table.rows]
+    assert cells == [f"{1e3 * (row.value('ate_yaw_m') or 0.0):.2f}" for row in small.lines if row.answered] + ["-"]
+    assert cells[0] == "3.83"
+
+
+@pytest.mark.parametrize(
+    ("values_m", "unit"), [([0.05, 0.09, 3.0], "mm"), ([0.05, 0.09, 30.0], "m"), ([0.05, 0.2, 0.3], "m"), ([], "m")]
+)
+def test_a_column_of_lengths_is_in_millimetres_where_most_are_short_and_none_is_long(
+    values_m: list[float], unit: str
 ) -> None:
-    changed = {"ate_yaw_m": value, "ate_se3_m": 1.0}
-    table = comparison_table(rescored(comparison, lambda row: Scores(row.scores.values | changed, {})))
-    cells = dict(zip(table.headings, table.rows[0], strict=True))
-    assert cells.get(("ATE", "yaw", "m"), "-") == cell
+    (metric,) = (metric for metric in known_metrics() if metric.key == "ate_se3_m")
+    assert unit_of(metric, values_m).name == unit
+    (percent,) = (metric for metric in known_metrics() if metric.key == "kitti_t_percent")
+    assert unit_of(percent, values_m).name == "%"
+
+
+def test_what_rounding_makes_equal_is_not_the_best() -> None:
+    assert unrivalled([(0.00355, "3.55"), (0.00371, "3.71")]) == "3.55"
+    assert unrivalled([(0.003551, "3.55"), (0.003553, "3.55"), (0.00371, "3.71")]) is None
+    assert unrivalled([(0.00355, "3.55"), (0.00355, "3.55")]) == "3.55"
+    assert unrivalled([]) is None
 
 
 def test_columns_are_aligned(comparison: Comparison) -> None:

@@ -1,4 +1,4 @@
-"""What the subcommands share: the parser, the kinds of arguments and the exit statuses."""
+"""What the subcommands share: the parser and the kinds of arguments."""
 
 import argparse
 import math
@@ -23,24 +23,6 @@ if TYPE_CHECKING:
 
 # "s" last, which the others end with.
 _TIMES = {"min": 60.0, "ms": 1e-3, "s": 1.0}
-
-_EXIT_STATUSES = """\
-exit status:
-  0    everything ran and ended well
-  1    an estimator diverged or failed (the results are written and say so),
-       check-data found a fault that is not repaired, or check found that
-       something got worse than the baseline, moved or is missing
-  2    the command line is wrong
-  3    a recording, a truth, trajectory or baseline file cannot be used
-  4    the results cannot be written
-  5    an estimator is unknown or cannot be used here
-  70   a defect of vislam itself, or of a package that adds to it, which the
-       message names; VISLAM_TRACEBACK=1 shows where
-  71   a resource of the system is lacking: memory, processes, a cluster, an
-       encoding
-  130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,
-       and what has ended of a comparison over seeds is kept
-  141  the reader of the output went away"""
 
 
 class UsageError(VislamError):
@@ -111,9 +93,8 @@ class ShowVersion(argparse.Action):
 
 
 def epilog(*examples: str) -> str:
-    """Return the end of a help text: examples that a test executes, and the exit statuses."""
-    lines = "\n".join(f"  $ {example}" for example in examples)
-    return f"example:\n{lines}\n\n{_EXIT_STATUSES}"
+    """Return the end of a help text: examples that a test executes."""
+    return "\n".join(["example:", *(f"  $ {example}" for example in examples)])
 
 
 class Command(NamedTuple):
@@ -227,7 +208,7 @@ def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
         "--estimators",
         metavar="NAME,...",
         type=names,
-        help=f"{what}; my_filter.py is a file of your own (default: those that 'vislam list' marks)",
+        help=f"{what}; my_filter.py is a file of your own (default: those that 'vislam list estimators' marks)",
     )
 
 
@@ -296,7 +277,9 @@ def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that keep the audit from repairing; read them with :func:`kept_faults`."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--no-repair", action="store_true", help="report the faults of a recording, repair none")
-    group.add_argument("--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these (see list)")
+    group.add_argument(
+        "--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these, see 'vislam list faults'"
+    )
 
 
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:

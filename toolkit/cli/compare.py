@@ -54,7 +54,7 @@ def _add_what_to_compare(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help=f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
     )
-    add_estimators_argument(parser, "estimators to compare, see 'vislam list'; 'ladder' is every rung")
+    add_estimators_argument(parser, "estimators to compare, see 'vislam list estimators'; 'ladder' is every rung")
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
     parser.add_argument(
         "--trajectory",

@@ -60,7 +60,7 @@ def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
     )
-    add_estimators_argument(parser, "estimators to measure, see 'vislam list'")
+    add_estimators_argument(parser, "estimators to measure, see 'vislam list estimators'")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
     what = "seeds of each simulated sequence, from 0"
     add_option(parser, "--seeds", SEEDS, what, metavar="N", type=at_least(FEWEST_SEEDS))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import add_output_arguments, command
@@ -15,36 +15,66 @@ if TYPE_CHECKING:
 _INDENT = "  "
 
 
-@command("list", "list estimators, built-in sequences, formats, metrics, faults and settings", "vislam list")
-def list_parts(_options: argparse.Namespace) -> int:
-    """List what can be named on the command line: estimators, built-in sequences, the formats that are recognised,
-    metrics, the faults the audit knows, and settings.
+KINDS = ("estimators", "metrics", "faults", "settings", "formats", "sequences")
+# How many names of each kind stand for all of it.
+_EXAMPLES = 4
+
+
+def _list_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", metavar="KIND", nargs="?", choices=KINDS, help=f"one of {', '.join(KINDS)}")
+
+
+@command(
+    "list",
+    "list estimators, metrics, faults, settings, formats and built-in sequences",
+    "vislam list",
+    "vislam list estimators",
+    arguments=_list_arguments,
+)
+def list_parts(options: argparse.Namespace) -> int:
+    """Print one kind of what can be named on the command line, a name a line: estimators, metrics, faults the audit
+    knows, settings, formats that are recognised, built-in sequences. Without a kind, how many there are of each.
     """
+    if options.kind is None:
+        print("\n".join(_summary(kind, list(_entries(kind))) for kind in KINDS))
+        print(f"\nvislam list KIND prints one of them: {', '.join(KINDS)}")
+    else:
+        print(_listing(_entries(options.kind)))
+    return 0
+
+
+def _entries(kind: str) -> Mapping[str, str]:
+    """Return the names of a kind with their one-line summaries."""
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.estimator import discover
     from toolkit.settings import describe
 
-    sections = {
-        "estimators": {name: _estimator(entry) for name, entry in discover().items()},
-        "built-in sequences": dict.fromkeys(datasets.built_in_names(), ""),
-        "formats": datasets.formats() | _marked(datasets.unavailable()),
-        "metrics": metrics.describe() | _marked(metrics.unavailable()),
-        "faults": faults(),
-        "settings": {one.key: _setting(one) for one in describe()},
+    entries: Mapping[str, Callable[[], Mapping[str, str]]] = {
+        "estimators": lambda: {name: _estimator(entry) for name, entry in discover().items()},
+        "metrics": lambda: metrics.describe() | _marked(metrics.unavailable()),
+        "faults": faults,
+        "settings": lambda: {one.key: _setting(one) for one in describe()},
+        "formats": lambda: datasets.formats() | _marked(datasets.unavailable()),
+        "sequences": lambda: dict.fromkeys(datasets.built_in_names(), ""),
     }
-    print("\n\n".join(_listing(title, entries) for title, entries in sections.items()))
-    return 0
+    return entries[kind]()
 
 
-def _listing(title: str, entries: Mapping[str, str]) -> str:
-    """Return names with their one-line summaries under a title."""
+def _summary(kind: str, names: list[str]) -> str:
+    """Return a kind in one line: how many names it has, and a few of them."""
+    more = ", ..." if len(names) > _EXAMPLES else ""
+    return f"{len(names):>3} {kind:<{max(map(len, KINDS))}}{_INDENT}{', '.join(names[:_EXAMPLES])}{more}"
+
+
+def _listing(entries: Mapping[str, str]) -> str:
+    """Return names with their one-line summaries."""
     from toolkit.report.prose import filled, width_of_output
 
     longest, width = max((len(name) for name in entries), default=0), width_of_output()
-    further = " " * (longest + 2 * len(_INDENT))
-    lines = (filled(text, width, f"{_INDENT}{name:<{longest}}{_INDENT}", further) for name, text in entries.items())
-    return "\n".join([f"{title}:", *(line.rstrip() for line in lines)])
+    further = " " * (longest + len(_INDENT))
+    lines = (filled(text, width, f"{name:<{longest}}{_INDENT}", further) for name, text in entries.items())
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def _estimator(entry: EstimatorEntry) -> str:

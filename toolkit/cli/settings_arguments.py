@@ -68,7 +68,7 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="one setting, as in window.lag_s=3 (see 'vislam list'); may be repeated",
+        help="one setting, as in window.lag_s=3 (see 'vislam list settings'); may be repeated",
     )
 
 

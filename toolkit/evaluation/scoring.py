@@ -53,7 +53,6 @@ COVERAGE = Metric(
     "%",
     ("cover", "time"),
     name="time coverage",
-    decimals=1,
     best="most",
     table="always",
 )

@@ -140,7 +140,9 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
         if name not in by_name:
             close = did_you_mean(name, by_name)
             lacking = "".join(f"; {file} is unavailable: {why}" for file, why in unavailable().items())
-            raise UnknownNameError(f"no metric is called {name}{close}; 'vislam list' names them all, by key{lacking}")
+            raise UnknownNameError(
+                f"no metric is called {name}{close}; 'vislam list metrics' names them all, by key{lacking}"
+            )
     return tuple(metric for name in chosen for metric in by_name[name])
 
 

@@ -29,8 +29,8 @@ GROUP = ON_REQUEST = "bound"
 _BLOCKS = {"variance": "whole state", "pose": "pose", "vel": "velocity", "bias": "biases"}
 
 
-def _metric(key: str, meaning: str, heading: tuple[str, str], decimals: int = 3, unit: str = "1") -> Metric:
-    return Metric(key, meaning, unit, heading, decimals=decimals, best="", over_seeds=True)
+def _metric(key: str, meaning: str, heading: tuple[str, str], unit: str = "1") -> Metric:
+    return Metric(key, meaning, unit, heading, best="", over_seeds=True)
 
 
 METRICS = (
@@ -40,13 +40,12 @@ METRICS = (
         "%",
         ("effi-", "ciency"),
         name="efficiency",
-        decimals=1,
         best="most",
         over_seeds=True,
     ),
-    _metric("bound_position_m", "least RMS position error of any unbiased estimator (m)", ("bound", "pos"), 4, "m"),
-    _metric("bound_rotation_deg", "the same of the rotation (deg)", ("bound", "rot"), 3, "deg"),
-    _metric("error_over_bound", "RMS position error over bound_position_m", ("error", "/bound"), 2),
+    _metric("bound_position_m", "least RMS position error of any unbiased estimator (m)", ("bound", "pos"), "m"),
+    _metric("bound_rotation_deg", "the same of the rotation (deg)", ("bound", "rot"), "deg"),
+    _metric("error_over_bound", "RMS position error over bound_position_m", ("error", "/bound")),
     *(
         _metric(
             f"excess_{key}",

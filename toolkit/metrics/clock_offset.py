@@ -27,7 +27,6 @@ METRICS = (
         "shift of the estimate's stamps with which its positions fit the truth's best (ms)",
         "ms",
         ("clock", "offset"),
-        decimals=1,
         best="",
     ),
     Metric(
@@ -36,7 +35,6 @@ METRICS = (
         "ms",
         ("clock", "off. +-"),
         name="clock offset, error",
-        decimals=1,
         best="",
     ),
 )

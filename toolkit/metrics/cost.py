@@ -32,7 +32,6 @@ METRICS = (
         "peak resident memory of the process during the run (MB)",
         "MB",
         ("peak", "memory"),
-        decimals=0,
         in_contract=True,
     ),
     Metric(

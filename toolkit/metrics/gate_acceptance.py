@@ -24,7 +24,6 @@ METRICS = (
         "%",
         ("gate", "accepts"),
         name="gate acceptance",
-        decimals=1,
         best="",
     ),
 )

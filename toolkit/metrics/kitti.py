@@ -26,7 +26,6 @@ METRICS = (
         "mean rotation error over segments of 100 ... 800 m (deg/m)",
         "deg/m",
         ("KITTI", "rot"),
-        decimals=3,
         in_contract=True,
     ),
 )

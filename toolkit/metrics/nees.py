@@ -45,7 +45,6 @@ METRICS = (
         "poses whose NEES is within the two-sided 95 % chi-square band of one run (percent)",
         "%",
         ("NEES", "in band"),
-        decimals=1,
         best="most",
         in_contract=True,
     ),

@@ -17,13 +17,12 @@ from toolkit.resampling import NS_PER_S
 
 ORDER = 20
 METRICS = (
-    Metric("rpe_1s_m", "RMSE of the translation error over 1 s (m)", "m", ("RPE", "1 s"), decimals=3, in_contract=True),
+    Metric("rpe_1s_m", "RMSE of the translation error over 1 s (m)", "m", ("RPE", "1 s"), in_contract=True),
     Metric(
         "rpe_1s_deg",
         "RMSE of the rotation error over 1 s (deg)",
         "deg",
         ("RPE rot", "1 s"),
-        decimals=3,
         in_contract=True,
     ),
     Metric(

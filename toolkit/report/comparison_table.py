@@ -13,7 +13,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.noise import MotionScale, TrackWeight
 from toolkit.report.scores_json import path_length_m
-from toolkit.report.table import MISSING, Table, cell, heading, number
+from toolkit.report.table import MISSING, ShownUnit, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Window, outlier_summary
 
@@ -73,25 +73,27 @@ def _ok_of(comparison: Comparison) -> _Column:
 def _metric_columns(comparison: Comparison, columns: Columns) -> Iterator[_Column]:
     """Yield a column for each metric; over seeds also the spread of the first, and how long the NEES is in its band."""
     for i, metric in enumerate(shown_metrics(comparison, columns)):
-        yield _Column(heading(metric), partial(_value, metric=metric))
+        good = [row for row in comparison.lines if row.counts["ok"]]
+        unit = unit_of(metric, (row.value(metric.key) for row in good))
+        yield _Column(heading(metric, unit), partial(_value, metric=metric, unit=unit))
         if comparison.over_seeds and i == 0:
-            yield _Column((metric.heading[0], "std", metric.unit), partial(_std, metric=metric))
+            yield _Column((metric.heading[0], "std", unit.name), partial(_std, metric=metric, unit=unit))
         if comparison.over_seeds and metric.key == _BANDED:
             yield _Column(("NEES", "band", "%"), _in_band)
 
 
-def _value(row: Row, metric: Metric) -> str:
-    return cell(row.value(metric.key), metric)
+def _value(row: Row, metric: Metric, unit: ShownUnit) -> str:
+    return cell(row.value(metric.key), metric, unit)
 
 
-def _std(row: Row, metric: Metric) -> str:
+def _std(row: Row, metric: Metric, unit: ShownUnit) -> str:
     spread = row.spread(metric.key)
-    return cell(None if spread is None else spread.std, metric)
+    return cell(None if spread is None else spread.std, metric, unit)
 
 
 def _in_band(row: Row) -> str:
     nees = row.mean_nees
-    return MISSING if nees is None else number(nees.in_band_percent, 1)
+    return MISSING if nees is None else number(nees.in_band_percent)
 
 
 def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
@@ -107,18 +109,17 @@ def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metr
     if comparison.over_seeds:
         return tuple(metric for metric in valued if metric.over_seeds)
     differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
+    return (*differing, *usual_metrics(valued, real=comparison.sequence.provenance.format != "simulated"))
+
+
+def usual_metrics(valued: list[Metric], *, real: bool) -> list[Metric]:
+    """Return the columns of one run by default, of the metrics that have values.
+
+    Those of a ``real`` recording are those of a drive where it is long enough for the KITTI benchmark's drift.
+    """
     usual = [metric for metric in valued if metric.table == "always"]
-    return (*differing, *(_for_a_drive(valued, usual) if _is_real(comparison) else usual))
-
-
-def _is_real(comparison: Comparison) -> bool:
-    return comparison.sequence.provenance.format != "simulated"
-
-
-def _for_a_drive(valued: list[Metric], usual: list[Metric]) -> list[Metric]:
-    """Return the columns of a recording: those of a drive where it is long enough for the KITTI benchmark's drift."""
     leading = [metric for key in _LEADING for metric in valued if metric.key == key]
-    if len(leading) < len(_LEADING):
+    if not real or len(leading) < len(_LEADING):
         return usual
     return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SHOWN_AS_DRIFT))]
 

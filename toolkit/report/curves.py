@@ -1,8 +1,9 @@
-"""The series that figures and report.json draw over time: errors after a fit to the truth, and by component.
+"""The series that figures and report.json draw over time: errors, and errors by component.
 
-Pairs and fits are those of the metrics. With an IMU the vertical is measured and only heading and position are fitted
-(the fit of ate_yaw_m); from twists alone an estimator does not know the vertical, and a whole rigid motion is fitted
-(that of ate_se3_m).
+Errors over time are drawn from the common start, which shows drift, or after a fit to the truth. Pairs and fits are
+those of the metrics. With an IMU the vertical is measured and only heading and position are fitted (the fit of
+ate_yaw_m); from twists alone an estimator does not know the vertical, and a whole rigid motion is fitted (that of
+ate_se3_m).
 """
 
 from collections.abc import Callable
@@ -14,9 +15,9 @@ from toolkit.estimate import Output, Run, Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
 from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_yaw
+from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_yaw, place_first
 from toolkit.metrics.parts.association import associate, finite_poses, median_period_ns
-from toolkit.metrics.parts.consistency import POSE_DOF, body_errors
+from toolkit.metrics.parts.consistency import POSE_DOF, body_errors, starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.sequence import Sequence, Truth
@@ -24,6 +25,7 @@ from toolkit.sequence import Sequence, Truth
 _MICROSECONDS = 6
 _HALF_WINDOW = 7
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
+_FROM_START = "All start from the same pose and nothing is fitted, so that the error is what has drifted since."
 
 
 class Errors(NamedTuple):
@@ -73,12 +75,28 @@ def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
         return NOT_ALIGNED
 
 
+def from_start(run: Run, output: Output, sequence: Sequence) -> Alignment:
+    """Return what places a run's first pose on the truth; nothing where its start is in the truth's world already."""
+    if run.timings is not None and starts_in_the_truths_world(sequence):
+        return NOT_ALIGNED
+    evaluation = Evaluation(run, output, sequence)
+    try:
+        pairs = evaluation.compared
+    except Unavailable:
+        return NOT_ALIGNED
+    return place_first(pairs.truth[0], pairs.estimate[0], evaluation.level)
+
+
+def fit_name(sequence: Sequence) -> str:
+    """Return what is fitted where estimates are aligned to the truth."""
+    return "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
+
+
 def alignment_text(sequence: Sequence) -> str:
     """Say how a figure's estimates are aligned."""
     if sequence.truth is None:
         return "There is no truth; every estimator starts from the same pose and nothing is aligned."
-    how = "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
-    return f"Estimates are aligned to the truth by {how}."
+    return f"Estimates are aligned to the truth by {fit_name(sequence)}."
 
 
 def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, sequence: Sequence) -> Errors | None:
@@ -120,7 +138,7 @@ def shown_output(run: Run) -> Output:
 
 
 class _Reference(NamedTuple):
-    """The reference of the curves, the alignment of a row to it, and the name of the difference.
+    """The reference of the curves, the alignment of a row to it in code and words, and the name of the difference.
 
     ``trajectory`` is the estimate that replaces the truth where there is none.
     """
@@ -128,21 +146,26 @@ class _Reference(NamedTuple):
     truth: Truth
     align: Callable[[Row], Alignment]
     what: str
+    placing: str
     caption: str
     trajectory: Trajectory | None = None
 
 
 class ErrorCurves(NamedTuple):
-    """The rows with their errors, the name of these ("error", or "difference from" a run) and the caption."""
+    """The rows with their errors, the name of these ("error", or "difference from" a run), how placed, the caption."""
 
     of_rows: list[tuple[Row, Errors]]
     what: str
+    placing: str
     caption: str
 
 
-def error_curves(comparison: Comparison) -> ErrorCurves | None:
-    """Return every row's errors (with truth) or differences (without), or None where no row has any."""
-    reference = _from_truth(comparison) or _from_estimate(comparison)
+def error_curves(comparison: Comparison, *, fitted: bool = False) -> ErrorCurves | None:
+    """Return every row's errors (with truth) or differences (without), or None where no row has any.
+
+    Errors are those from the common start, or ``fitted`` after a fit to the truth.
+    """
+    reference = _from_truth(comparison, fitted=fitted) or _from_estimate(comparison)
     if reference is None:
         return None
     curves: list[tuple[Row, Errors]] = []
@@ -155,19 +178,22 @@ def error_curves(comparison: Comparison) -> ErrorCurves | None:
         errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
         if errors is not None:
             curves.append((row, errors))
-    return ErrorCurves(curves, reference.what, reference.caption) if curves else None
+    return ErrorCurves(curves, reference.what, reference.placing, reference.caption) if curves else None
 
 
-def _from_truth(comparison: Comparison) -> _Reference | None:
+def _from_truth(comparison: Comparison, *, fitted: bool) -> _Reference | None:
     sequence = comparison.sequence
     truth = truth_during(sequence)
     if truth is None:
         return None
     caption = (
-        f"Position and heading error over time. {alignment_text(sequence)} "
+        f"{alignment_text(sequence) if fitted else _FROM_START} "
         "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
     )
-    return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
+    place, placing = (
+        (onto_truth, f"aligned by {fit_name(sequence)}") if fitted else (from_start, "from the common start")
+    )
+    return _Reference(truth, lambda row: place(row.run, row.output, sequence), "error", placing, caption)
 
 
 def _from_estimate(comparison: Comparison) -> _Reference | None:
@@ -179,7 +205,9 @@ def _from_estimate(comparison: Comparison) -> _Reference | None:
         "A difference says that two estimators disagree, not which of them is right."
     )
     as_truth = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
-    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {estimate.name}", caption, estimate.trajectory)
+    return _Reference(
+        as_truth, lambda _: NOT_ALIGNED, f"difference from {estimate.name}", "not aligned", caption, estimate.trajectory
+    )
 
 
 class Components(NamedTuple):

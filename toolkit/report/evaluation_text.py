@@ -6,12 +6,24 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedTest
+from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
 from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
-from toolkit.report.table import MISSING, Table, as_latex, as_markdown, as_text, cell, heading
+from toolkit.report.table import (
+    MISSING,
+    ShownUnit,
+    Table,
+    as_latex,
+    as_markdown,
+    as_text,
+    cell,
+    heading,
+    number,
+    unit_of,
+    unrivalled,
+)
 
 # Beside the metric that ranks, where there are values.
 _USUAL = (
@@ -39,81 +51,69 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     several, metrics = len(evaluation.sequences) > 1, shown_metrics(evaluation, columns)
     heads: list[tuple[str, ...]] = [("system", "", ""), ("runs", "ok", "")]
     heads += [("mean", "rank", ""), ("first", f"of {len(evaluation.ranked_sequences)}", "")] if several else []
-    heads += [(evaluation.ranked_by.heading[0], "quartiles", evaluation.ranked_by.unit)]
-    heads += [heading(metric) for metric in metrics]
+    medians = {metric: _medians(evaluation, metric, several=several) for metric in (evaluation.ranked_by, *metrics)}
+    units = {metric: unit_of(metric, values) for metric, values in medians.items()}
+    heads += [(evaluation.ranked_by.heading[0], "quartiles", units[evaluation.ranked_by].name)]
+    heads += [heading(metric, units[metric]) for metric in metrics]
     rows = []
-    for standing in evaluation.leaderboard:
+    for i, standing in enumerate(evaluation.leaderboard):
         counts = [f"{standing.mean_rank:.2f}", str(standing.wins)] if several else []
-        spread = standing.quantiles.get(evaluation.ranked_by.key)
-        if not several:
-            spread = evaluation.cells[standing.system, evaluation.sequences[0]].quantiles(evaluation.ranked_by)
-        values = [
-            _median(_quartiles_of(evaluation, standing.system, metric, several=several), metric) for metric in metrics
-        ]
-        ends = f"{standing.ok} of {standing.runs}"
-        rows.append((standing.system, ends, *counts, _quartiles(spread, evaluation.ranked_by), *values))
-    best = _best_rows(evaluation, metrics, len(heads) - len(metrics), several=several)
-    return Table(tuple(heads), tuple(rows), labels=1, best=best)
+        spread = _quartiles_of(evaluation, standing, evaluation.ranked_by, several=several)
+        values = [cell(medians[metric][i], metric, units[metric]) for metric in metrics]
+        ends, ranked_by = f"{standing.ok} of {standing.runs}", evaluation.ranked_by
+        rows.append((standing.system, ends, *counts, _quartiles(spread, ranked_by, units[ranked_by]), *values))
+    before = len(heads) - len(metrics)
+    best = {(i, before + j) for j, metric in enumerate(metrics) for i in _best(medians[metric], metric)}
+    return Table(tuple(heads), tuple(rows), labels=1, best=frozenset(best))
 
 
-def _quartiles_of(evaluation: EvaluatedSystems, system: str, metric: Metric, *, several: bool) -> QuantilesOfAll | None:
+def _medians(evaluation: EvaluatedSystems, metric: Metric, *, several: bool) -> list[float | None]:
+    found = [_quartiles_of(evaluation, one, metric, several=several) for one in evaluation.leaderboard]
+    return [None if quartiles is None else quartiles.median for quartiles in found]
+
+
+def _quartiles_of(
+    evaluation: EvaluatedSystems, standing: Standing, metric: Metric, *, several: bool
+) -> QuantilesOfAll | None:
     if several:
-        standing = next(one for one in evaluation.leaderboard if one.system == system)
         return standing.quantiles.get(metric.key)
-    return evaluation.cells[system, evaluation.sequences[0]].quantiles(metric)
-
-
-def _best_rows(
-    evaluation: EvaluatedSystems, metrics: tuple[Metric, ...], before: int, *, several: bool
-) -> frozenset[tuple[int, int]]:
-    """Return row and column of the best of each metric; none where there is one system only."""
-    if len(evaluation.systems) < 2:
-        return frozenset()
-    best: set[tuple[int, int]] = set()
-    for j, metric in enumerate(metrics):
-        found = [_quartiles_of(evaluation, one.system, metric, several=several) for one in evaluation.leaderboard]
-        best |= {(i, before + j) for i in _best([None if q is None else q.median for q in found], metric)}
-    return frozenset(best)
+    return evaluation.cells[standing.system, evaluation.sequences[0]].quantiles(metric)
 
 
 def _best(medians: list[float | None], metric: Metric) -> set[int]:
+    """Return which median is best, or are: none of one alone, nor where another that prints alike is worse."""
     costs: Mapping[str, Callable[[float], float]] = {"least": float, "most": lambda v: -v, "one": lambda v: abs(v - 1)}
     known = [(costs[metric.best](v), i) for i, v in enumerate(medians) if v is not None] if metric.best else []
-    least = min((cost for cost, _ in known), default=0.0)
-    return {i for cost, i in known if cost == least}
+    text = unrivalled((cost, number(medians[i] or 0.0)) for cost, i in known) if len(medians) > 1 else None
+    return {i for _, i in known if number(medians[i] or 0.0) == text}
 
 
 def sequences_table(evaluation: EvaluatedSystems) -> Table:
     """Return a row a sequence and a column a system: the median over the runs of the metric that ranks."""
     metric, systems = evaluation.ranked_by, [standing.system for standing in evaluation.leaderboard]
-    heads = (("sequence", "", ""), *((system, "", metric.unit) for system in systems))
+    unit = unit_of(metric, (one.median(metric) for one in evaluation.cells.values()))
+    heads = (("sequence", "", ""), *((system, "", unit.name) for system in systems))
     rows, best = [], set()
     for i, sequence in enumerate(evaluation.sequences):
         cells = [evaluation.cells[system, sequence] for system in systems]
-        rows.append((sequence, *(_median_and_failures(one, metric) for one in cells)))
-        if len(systems) > 1:
-            best |= {(i, 1 + j) for j in _best([one.median(metric) for one in cells], metric)}
+        rows.append((sequence, *(_median_and_failures(one, metric, unit) for one in cells)))
+        best |= {(i, 1 + j) for j in _best([one.median(metric) for one in cells], metric)}
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
-def _median_and_failures(runs: Cell, metric: Metric) -> str:
+def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
     """Return the median of the runs of a system on a sequence, and how many of them failed."""
     failed = f"{runs.failed} of {len(runs.runs)} failed" if runs.failed else ""
     median = runs.median(metric)
     if median is None:
         return failed or MISSING
-    return f"{cell(median, metric)} ({failed})" if failed else cell(median, metric)
+    return f"{cell(median, metric, unit)} ({failed})" if failed else cell(median, metric, unit)
 
 
-def _median(found: QuantilesOfAll | None, metric: Metric) -> str:
-    return MISSING if found is None else cell(found.median, metric)
-
-
-def _quartiles(found: QuantilesOfAll | None, metric: Metric) -> str:
+def _quartiles(found: QuantilesOfAll | None, metric: Metric, unit: ShownUnit) -> str:
     if found is None or found.n < 2:
         return MISSING
-    ends = [MISSING if q is None else cell(q, metric) for q in (found.lower_quartile, found.upper_quartile)]
-    return " .. ".join(ends)
+    return " .. ".join(cell(q, metric, unit) for q in (found.lower_quartile, found.upper_quartile))
 
 
 def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:

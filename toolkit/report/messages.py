@@ -217,7 +217,7 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def _figure(value: float) -> str:
-    return number(value, 2)
+    return number(value)
 
 
 def consistency_lines(comparison: Comparison) -> Iterator[str]:
@@ -268,7 +268,7 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
     """Say by how much two estimators differ, and whether that is significant."""
     if found.mean == found.error == 0.0:
         return f"equal to that of {best} under all {found.n} seeds"
-    decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else metric.decimals
+    decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else 2
     figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
     listed = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
     if found.is_significant:

@@ -93,6 +93,10 @@ class ErrorKind(Struct, frozen=True, kw_only=True):
     """What the errors of this report are."""
 
     what: Annotated[str, Meta(description="error, or the difference from whom")]
+    placing: (
+        Annotated[str, Meta(description="how estimates are placed; absent in older documents, whose caption says it")]
+        | UnsetType
+    ) = UNSET
     caption: str
 
 
@@ -261,7 +265,9 @@ class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
     estimator: str
     output: Output
     nees: MeanNeesSeries | None
-    position_rms_m: Annotated[Numbers | None, Meta(description="root mean square over the seeds, not aligned")]
+    position_rms_m: Annotated[
+        Numbers | None, Meta(description="root mean square over the seeds, from the common start")
+    ]
 
 
 class SeedsMessages(Struct, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ from msgspec import UNSET, UnsetType
 
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
-from toolkit.files.documents import number, numbers, rounded
+from toolkit.files.documents import number, numbers, of_attributes, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
@@ -77,7 +77,7 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         start_ns=int(comparison.sequence.frames_t_ns[0]),
         truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
         alignment=alignment_text(comparison.sequence),
-        error=None if curves is None else ErrorKind(what=curves.what, caption=_error_caption(comparison, curves)),
+        error=None if curves is None else of_attributes(ErrorKind, curves),
         runs=tuple(_row(row, comparison, _curve_of(row, curves)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
         maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
@@ -100,13 +100,6 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
             start=over.prior.source,
         ),
     )
-
-
-def _error_caption(comparison: Comparison, curves: ErrorCurves) -> str:
-    """Say how the errors are measured; with a truth the reader may choose what they are drawn over."""
-    if comparison.sequence.truth is None:
-        return curves.caption
-    return f"{alignment_text(comparison.sequence)} Dashed: causal, what was known at the time. Solid: final."
 
 
 def _curve_of(row: Row, curves: ErrorCurves | None) -> Errors | None:

@@ -1,9 +1,11 @@
 """Tables for a terminal, for Markdown and for LaTeX, and a metric's heading and value as they stand in one.
 
-Under which heading and with how many decimals is said by the metrics' own records; tabulate renders the cells.
+The heading is said by the metrics' own records. Numbers have three significant digits, lengths of centimetres and less
+are in millimetres, a whole column in one unit; tabulate renders the cells.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from typing import Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
@@ -13,7 +15,11 @@ from toolkit.metrics import Metric
 from toolkit.report.prose import in_markdown
 
 MISSING = "-"
-_WIDEST_NUMBER = 5
+DIGITS = 3
+# Numbers outside of these are written in powers of ten: that of a diverged estimator may have any size.
+_SMALLEST, _LARGEST = 1e-3, 1e5
+# A column of lengths is in millimetres where most are below the first and all below the second (m).
+_SHORT_M, _LONGEST_IN_MM = 0.1, 10.0
 _CELLS = DataRow("", "  ", "")
 _PLAIN_TEXT = TableFormat(
     lineabove=None,
@@ -49,26 +55,57 @@ class Table(NamedTuple):
     best: frozenset[tuple[int, int]] = frozenset()
 
 
-def heading(metric: Metric) -> tuple[str, str, str]:
+class ShownUnit(NamedTuple):
+    """The unit of a column, and how many of it one of the metric's own unit is."""
+
+    name: str
+    factor: float = 1.0
+
+
+def unit_of(metric: Metric, values: Iterable[float | None]) -> ShownUnit:
+    """Return the unit in which the values of a metric that stand in one column are written."""
+    sizes = sorted(abs(value) for value in values if value is not None)
+    if metric.unit == "m" and sizes and sizes[len(sizes) // 2] < _SHORT_M and sizes[-1] < _LONGEST_IN_MM:
+        return ShownUnit("mm", 1e3)
+    return ShownUnit(metric.unit)
+
+
+def heading(metric: Metric, unit: ShownUnit) -> tuple[str, str, str]:
     """Return the lines above a metric's column: what, which, unit."""
-    return (*metric.heading, metric.unit)
+    return (*metric.heading, unit.name)
 
 
-def cell(value: float | None, metric: Metric) -> str:
-    """Return a metric's value as it stands in a table."""
+def cell(value: float | None, metric: Metric, unit: ShownUnit | None = None) -> str:
+    """Return a metric's value as it stands in a table, in the metric's own unit unless another is given."""
     if value is None:
         return MISSING
-    if metric.count:
-        return f"{value:.0f}"
-    # An error of a few centimetres needs three decimals to say anything.
-    return number(value, metric.decimals + (abs(value) < 0.1))
+    scaled = value if unit is None else unit.factor * value
+    return f"{scaled:.0f}" if metric.count else number(scaled)
 
 
-def number(value: float, decimals: int) -> str:
-    """Return a number with at most so many decimals in five characters, in powers of ten where it needs more."""
-    texts = (f"{value:.{d}f}" for d in range(decimals, -1, -1))
-    # The number of a diverged estimator may have any size and must not widen the table.
-    return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")
+def number(value: float, digits: int = DIGITS) -> str:
+    """Return a number with so many significant digits, its whole part in full; in powers of ten where it is extreme."""
+    if value == 0.0:
+        return "0"
+    if abs(value) >= _LARGEST or not math.isfinite(value):
+        return f"{value:.0e}"
+    if abs(value) < _SMALLEST:
+        return f"{value:.1e}".replace("e-0", "e-")
+    # After rounding, for 9.996 has one digit before the point and 10.0 two.
+    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    return f"{value:.{max(0, digits - 1 - exponent)}f}"
+
+
+def unrivalled(costs: Iterable[tuple[float, str]]) -> str | None:
+    """Return how the least of costs prints, or None where another that prints alike is not equal to it.
+
+    Given are a cost and its text for each cell of a column.
+    """
+    known = list(costs)
+    least = min(known, default=None)
+    if least is None or any(cost != least[0] for cost, text in known if text == least[1]):
+        return None
+    return least[1]
 
 
 def as_text(table: Table) -> str:

@@ -140,7 +140,7 @@ def test_two_fingers_zoom(page: Page, single: Path) -> None:
 
 def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     page.open(single)
-    figures = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart='Position error']")
+    figures = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart^='Position error']")
     before = [page.picture(figure) for figure in figures]
     page.press(".scrubber input", *[Keys.PAGE_UP] * 3)
     assert all(page.picture(figure) != picture for figure, picture in zip(figures, before, strict=True))
@@ -152,7 +152,7 @@ def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
 
 def test_pointing_at_a_chart_reads_every_line_there(page: Page, single: Path) -> None:
     page.open(single)
-    ActionChains(page.driver).move_to_element(page.into_view("canvas[data-chart='Position error']")).perform()
+    ActionChains(page.driver).move_to_element(page.into_view("canvas[data-chart^='Position error']")).perform()
     page.settle()
     reported = page.find(".hint").text
     assert all(name in reported for name in ("steady", "astray", "late final"))
@@ -161,7 +161,7 @@ def test_pointing_at_a_chart_reads_every_line_there(page: Page, single: Path) ->
 
 def test_errors_are_over_distance_or_time(page: Page, single: Path) -> None:
     page.open(single)
-    chart = "canvas[data-chart='Position error']"
+    chart = "canvas[data-chart^='Position error']"
     over_distance = page.picture(chart)
     page.click(".segmented button:last-child")
     assert page.find(".segmented button:last-child").get_attribute("aria-pressed") == "true"

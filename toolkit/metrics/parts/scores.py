@@ -28,7 +28,6 @@ class Metric:
     unit: str
     heading: tuple[str, str]
     name: str = ""
-    decimals: int = 2
     best: Best = "least"
     table: InTable = "on request"
     over_seeds: bool = False

@@ -38,6 +38,7 @@ _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
 _FEW: tuple[_Drawing, ...] = (
     top_view.draw_all,
     errors_over_time.draw,
+    errors_over_time.draw_telling_components,
     consistency.draw_nees,
     against_bound.draw,
 )
@@ -47,7 +48,8 @@ _MORE: tuple[_Drawing, ...] = (
     frame_times.draw,
     error_map.draw_trajectories,
     error_map.draw_maps,
-    errors_over_time.draw_components,
+    errors_over_time.draw_fitted,
+    errors_over_time.draw_other_components,
     top_view.draw_each,
 )
 _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)

@@ -11,7 +11,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Evaluation, Unavailable
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.report.figures.panels import Drawn, Normalised, figure_with_bands
-from toolkit.report.figures.style import NamedFigure, shown_as
+from toolkit.report.figures.style import NamedFigure, colour_of, shown_as
 
 _OF_NEES = (
     "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the estimator "
@@ -55,7 +55,7 @@ def _drawn(comparison: Comparison, of_row: _OfRow) -> Iterator[Drawn]:
             continue
         try:
             with np.errstate(all="ignore"):  # a diverged run may overflow; that is drawn at the edge
-                yield Drawn(row.estimator, shown_as(row), of_row(comparison, row))
+                yield Drawn(row.estimator, colour_of(comparison, row.estimator), shown_as(row), of_row(comparison, row))
         except Unavailable:
             continue
 

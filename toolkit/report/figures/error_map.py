@@ -44,6 +44,7 @@ from toolkit.report.figures.top_view import (
     true_track,
     view_of,
 )
+from toolkit.report.table import number
 
 # Plasma (Smith and van der Walt 2015) without its yellow, which white paper swallows: legible for the colour-blind.
 _COLOURS = LinearSegmentedColormap.from_list("plasma without yellow", colormaps["plasma"](np.linspace(0.0, 0.85, 64)))
@@ -150,7 +151,7 @@ def _figure(comparison: Comparison, shown: Sequence[_Coloured], kind: _Kind) -> 
                 axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=0.6, zorder=3)
             axes.add_collection(_line(one, scale))
             middle = rmse(one.value)
-        axes.set_title(f"{middle:.2g} {kind.unit}", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+        axes.set_title(f"{number(middle)} {kind.unit}", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
     bar = figure.colorbar(scale, ax=panels, shrink=0.9, aspect=35, pad=0.02, extend="both")
     bar.set_label(f"{kind.what} [{kind.unit}]", fontsize=LABEL_PT)
     bar.ax.tick_params(labelsize=TICK_PT)

@@ -16,12 +16,15 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.residuals import rmse
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import Components, ErrorCurves, Errors, components, error_curves, reference_estimate
-from toolkit.report.figures.panels import COLOUR_OF, scale_by_decades
+from toolkit.report.figures.panels import scale_by_decades
 from toolkit.report.figures.style import (
+    MUTED_COLOUR,
+    SMALL_PT,
     TITLE_PT,
     ZERO_COLOUR,
     Entry,
     NamedFigure,
+    colour_of,
     entries_of,
     legend_below,
     line_of,
@@ -30,9 +33,12 @@ from toolkit.report.figures.style import (
     style_axes,
     width_of,
 )
+from toolkit.report.table import number
 
-# A run that is not ok is drawn up to this many times the largest error of the runs that are.
-_ROOM_FOR_DIVERGED = 1.5
+# What leaves a panel is drawn up to this many times the largest error of what does not.
+_ROOM_BEYOND = 1.5
+# A heading larger than so many times that of the middle row leaves its panel, which has no logarithmic axis.
+_FAR_FROM_MIDDLE = 10.0
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
 _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _ORDER_OF_MAGNITUDE, _BELOW_LEAST, _LEAST_LOGARITHMIC_M = 12.0, 0.2, 1e-5
@@ -45,13 +51,20 @@ _LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure of errors (with truth) or of differences (without, given two trajectories)."""
+    """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
     curves = error_curves(comparison)
     if curves is not None:
-        yield _figure(comparison, curves)
+        yield _figure(comparison, curves, "errors_over_time")
 
 
-def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
+def draw_fitted(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of errors after a fit to the truth, where there is one."""
+    curves = error_curves(comparison, fitted=True)
+    if curves is not None and comparison.sequence.truth is not None:
+        yield _figure(comparison, curves, "errors_over_time_fitted")
+
+
+def _figure(comparison: Comparison, curves: ErrorCurves, name: str) -> NamedFigure:
     figure = new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
     for row, errors in curves.of_rows:
@@ -59,14 +72,18 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
         stroke = stroke_of(comparison, row.estimator, row.output)
         position.plot(t_s, errors.position_m, linewidth=width, **stroke)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **stroke)
-    style_axes(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
+    style_axes(position, f"{comparison.name}: position {curves.what}, {curves.placing}", "", "position [m]")
     style_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
     _limit_position(position, curves.of_rows)
-    low, high = heading.get_ylim()
-    heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
+    _limit_heading(heading, curves.of_rows)
     figure.align_ylabels()
-    legend_below(figure, entries_of(comparison, [(row.estimator, row.output) for row, _ in curves.of_rows]))
-    return NamedFigure("errors_over_time", curves.caption, figure)
+    rms_m = {row.estimator: f"{number(rmse(errors.position_m))} m" for row, errors in curves.of_rows}
+    entries = entries_of(comparison, [(row.estimator, row.output) for row, _ in curves.of_rows])
+    legend_below(figure, [entry._replace(label=f"{entry.label}: {rms_m[entry.label]}") for entry in entries])
+    caption = (
+        f"Position and heading {curves.what} over time, in the legend the RMS of the position, of the final output"
+    )
+    return NamedFigure(name, f"{caption} where there is one. {curves.caption}", figure)
 
 
 def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
@@ -79,12 +96,36 @@ def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     _, high = axes.get_ylim()
     if good and len(good) < len(curves):
         largest = max(float(position_m.max()) for position_m in good)
-        high = min(high, largest * _ROOM_FOR_DIVERGED) if largest > 0.0 else high
+        high = min(high, largest * _ROOM_BEYOND) if largest > 0.0 else high
     high = max(high, _LEAST_POSITION_M)
     if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and high > _LEAST_POSITION_M:
         scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), high)
     else:
         axes.set_ylim(0.0, high)
+    _say_who_leaves(axes, [(row, float(np.nanmax(errors.position_m))) for row, errors in curves], high, "m")
+
+
+def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
+    """Keep the heading axis to what most runs that are ok need, and say which leave it."""
+    largest = [(row, float(np.nanmax(np.abs(errors.heading_deg)))) for row, errors in curves]
+    sizes = sorted(size for row, size in largest if row.status == "ok") or sorted(size for _, size in largest)
+    middle = max(sizes[(len(sizes) - 1) // 2], _LEAST_HEADING_DEG)
+    reach = max(size for size in (*sizes, middle) if size <= _FAR_FROM_MIDDLE * middle)
+    if reach < max(size for _, size in largest):
+        reach *= _ROOM_BEYOND
+        axes.set_ylim(-reach, reach)
+    else:
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
+    _say_who_leaves(axes, largest, reach, "deg")
+
+
+def _say_who_leaves(axes: Axes, largest: list[tuple[Row, float]], reach: float, unit: str) -> None:
+    """Name above a panel, to the right, the rows whose largest errors are beyond its axis."""
+    beyond = {row.estimator: size for row, size in largest if size > 1.01 * reach}
+    if beyond:
+        listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
+        axes.set_title(f"beyond it: {listed}", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
 
 
 def _without_wraps(heading_deg: Array) -> Array:
@@ -94,33 +135,60 @@ def _without_wraps(heading_deg: Array) -> Array:
     return broken
 
 
-def draw_components(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield a figure for each estimator with a trajectory that has something to be compared with."""
+def draw_telling_components(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the components of the least and the most consistent estimator, by the mean pose NEES of its rows."""
+    for name in _telling(comparison):
+        yield from _components_of(comparison, name)
+
+
+def draw_other_components(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield a figure for each other estimator with a trajectory that has something to be compared with."""
     for run in comparison.runs:
-        rows = [row for row in comparison.lines if row.run is run]
-        found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
-        if found:
-            yield _components_figure(comparison, run.estimator, run.final_is_causal, found)
+        if run.estimator not in _telling(comparison):
+            yield from _components_of(comparison, run.estimator)
+
+
+def _telling(comparison: Comparison) -> list[str]:
+    """Name the estimators of the rows whose mean pose NEES is farthest from and nearest to 1; none without truth."""
+    nees = [(row, value) for row in comparison.lines if (value := row.value("nees_pose_mean")) and row.status == "ok"]
+    off = sorted((abs(np.log(value)), row.estimator) for row, value in nees)
+    return list(dict.fromkeys((off[-1][1], off[0][1]))) if off else []
+
+
+def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
+    rows = [row for row in comparison.lines if row.estimator == name]
+    found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
+    if found:
+        yield _components_figure(comparison, name, rows[0].run.final_is_causal, found)
 
 
 def _components_figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:
     figure = new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
-    what = _what(comparison)
+    what, colour = _what(comparison), colour_of(comparison, name)
     for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
         for i, axis in enumerate(_ROWS):
             axes = grid[i, column]
             for output, one in found.items():
-                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, "final" if both else output)
+                t_s, shown_as = comparison.sequence.elapsed_s(one.t_ns), "final" if both else output
+                _plot(axes, t_s, one, block.start + i, colour, shown_as)
             _limit(axes, found.values(), block.start + i, least)
             style_axes(
                 axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
             )
-    grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
+    stated = "" if comparison.sequence.truth is None else _nees_text(comparison, name)
+    figure.suptitle(f"{comparison.name}: {name}{stated}", fontsize=TITLE_PT, x=0.01, ha="left")
+    grid[0, 0].set_title(f"position {what}", fontsize=TITLE_PT, loc="left")
     grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
     figure.align_ylabels(grid)
-    legend_below(figure, _entries(found, both, what.split()[0]))
+    legend_below(figure, _entries(found, both, what.split()[0], colour))
     return NamedFigure(f"components_{plain_name(name)}", _caption(comparison, name), figure)
+
+
+def _nees_text(comparison: Comparison, name: str) -> str:
+    values = [row.value("nees_pose_mean") for row in comparison.lines if row.estimator == name]
+    listed = ", ".join(number(value) for value in values if value is not None)
+    return f" (mean NEES {listed})" if listed else ""
 
 
 def _what(comparison: Comparison) -> str:
@@ -129,8 +197,8 @@ def _what(comparison: Comparison) -> str:
     return "error" if reference is None else f"difference from {reference.name}"
 
 
-def _plot(axes: Axes, t_s: Array, one: Components, i: int, shown_as: Output) -> None:
-    colour, line = COLOUR_OF[shown_as], line_of(shown_as)
+def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as: Output) -> None:
+    line = line_of(shown_as)
     if one.sigma is not None:
         band = _SIGMAS * one.sigma[:, i]
         if shown_as == "final":
@@ -149,11 +217,11 @@ def _limit(axes: Axes, drawn: Collection[Components], i: int, least: float) -> N
     axes.axhline(0.0, color=ZERO_COLOUR, linewidth=0.8, zorder=1)
 
 
-def _entries(found: dict[Output, Components], both: bool, what: str) -> list[Entry]:
+def _entries(found: dict[Output, Components], both: bool, what: str, colour: str) -> list[Entry]:
     entries = []
     for output, one in found.items():
         shown_as: Output = "final" if both else output
-        name, colour = "causal = final" if both else output, COLOUR_OF[shown_as]
+        name = "causal = final" if both else output
         entries.append(Entry.of_line(f"{name}: {what}", colour, line_of(shown_as)))
         if one.sigma is not None:
             band = Patch(facecolor=to_rgba(colour, _BAND_ALPHA if shown_as == "final" else 0.0), edgecolor=colour)

@@ -8,7 +8,6 @@ from matplotlib.patches import Patch
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.report.figures.panels import (
-    COLOUR_OF,
     RANGE,
     Drawn,
     Normalised,
@@ -17,7 +16,7 @@ from toolkit.report.figures.panels import (
     output_entries,
     panels_of,
 )
-from toolkit.report.figures.style import Entry, NamedFigure, line_of
+from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of, line_of
 
 
 def draw(over: Comparison) -> Iterator[NamedFigure]:
@@ -38,19 +37,17 @@ def _errors(over: Comparison) -> NamedFigure:
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
         kind = _shown_as(over, group)
-        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], COLOUR_OF[kind]
+        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], colour_of(over, group.estimator)
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
         kinds.add(kind)
-    title = f"{over.name}, {len(over.seeds)} seeds: position error"
-    quartiles = Entry(
-        "quartiles (lines: medians)", tuple(Patch(color=COLOUR_OF[kind], alpha=0.2) for kind in sorted(kinds))
-    )
+    title = f"{over.name}, {len(over.seeds)} seeds: position error from the common start"
+    quartiles = Entry("quartiles (lines: medians)", (Patch(color=MUTED_COLOUR, alpha=0.2),))
     finish(figure, panels, "position error [m]", title, [*output_entries(kinds), quartiles])
     next(iter(panels.values())).set_ylim(bottom=0.0)
     caption = (
-        f"Position error over time on {over.name}, {len(over.seeds)} seeds, not aligned: the median and, shaded, "
-        "the quartiles over the runs that are ok. Dashed: causal, what was known at the time. Solid: final."
+        f"Position error over time on {over.name}, {len(over.seeds)} seeds, from the common start: the median and, "
+        "shaded, the quartiles over the runs that are ok. Dashed: causal, what was known at the time. Solid: final."
     )
     return NamedFigure("errors_over_seeds", caption, figure)
 
@@ -58,7 +55,10 @@ def _errors(over: Comparison) -> NamedFigure:
 def _nees(over: Comparison) -> NamedFigure:
     drawn = [
         Drawn(
-            group.estimator, _shown_as(over, group), Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high)
+            group.estimator,
+            colour_of(over, group.estimator),
+            _shown_as(over, group),
+            Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high),
         )
         for group in over.rows
         if (nees := group.mean_nees) is not None and not _repeats(over, group)

@@ -26,8 +26,6 @@ from toolkit.report.figures.style import (
     style_axes,
 )
 
-# Okabe & Ito (2008). In panels of one estimator the colour tells the output.
-COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}
 # Values of a NEES or NIS over its expectation beyond these are drawn at the limit, and the panel gives the largest.
 RANGE = (1e-2, 1e4)
 # From so many panels on there are four in a row, before that three; two or four make a square.
@@ -107,9 +105,10 @@ class Normalised(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What a panel of an estimator shows, with the colour and the line of a kind of output."""
+    """What a panel of an estimator shows, in its colour and with the line of a kind of output."""
 
     estimator: str
+    colour: str
     output: Output
     series: Normalised
 
@@ -123,10 +122,10 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
     shares: dict[str, list[float]] = {}
     largest: dict[str, float] = {}
     least = most = 1.0
-    for estimator, output, series in drawn:
+    for estimator, colour, output, series in drawn:
         axes, shown = panels[estimator], np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
-        axes.plot(series.t_s, shown, color=COLOUR_OF[output], linestyle=line_of(output), linewidth=1.0)
+        axes.plot(series.t_s, shown, color=colour, linestyle=line_of(output), linewidth=1.0)
         shares.setdefault(estimator, []).append(series.in_band_percent)
         largest[estimator] = np.nanmax([largest.get(estimator, 0.0), *series.value])
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
@@ -149,7 +148,7 @@ def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
 def output_entries(outputs: Collection[Output]) -> list[Entry]:
     """Return the legend's entries for the outputs that are drawn; a filter's final output repeats its causal one."""
     names: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
-    return [Entry.of_line(names[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
+    return [Entry.of_line(names[output], MUTED_COLOUR, line_of(output)) for output in sorted(outputs)]
 
 
 def band_entry() -> Entry:

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.report.looks import COLOURS, look_numbers
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -24,12 +25,12 @@ GRID_COLOUR, BAND_COLOUR, ZERO_COLOUR, MUTED_COLOUR = "#e4e7ea", "#d5dade", "#9a
 TRUTH_COLOUR = "#1a1a1a"
 LANDMARK_COLOUR = "#8a949f"
 
-# Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it, in other dashes.
+# Okabe & Ito (2008), in the order in which neighbours differ most.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
 Dashes = Literal["-", "--", ":"] | tuple[float, tuple[float, ...]]
 _LINE_OF: dict[Output, tuple[Dashes, ...]] = {
-    "causal": ("--", ":"),
-    "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5))),
+    "causal": ("--", ":", (0.0, (1.0, 3.0))),
+    "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
 
@@ -43,9 +44,8 @@ class NamedFigure(NamedTuple):
 
 
 def colour_of(comparison: Comparison, estimator: str) -> str:
-    """Return the colour an estimator has in every figure of a comparison."""
-    order = [run.estimator for run in comparison.runs]
-    return _COLOURS[order.index(estimator) % len(_COLOURS)]
+    """Return the colour an estimator has in every figure of every run."""
+    return _COLOURS[look_numbers(comparison.estimators)[estimator] % COLOURS]
 
 
 def line_of(output: Output) -> Dashes:
@@ -63,11 +63,10 @@ class Stroke(TypedDict):
 def stroke_of(comparison: Comparison, estimator: str, output: Output) -> Stroke:
     """Return colour and dashes of one kind of output of an estimator: other dashes where its colour is another's too.
 
-    Both outputs keep the estimator's colour, so that twice as many estimators as there are colours are told apart.
+    Both outputs keep the estimator's colour, so that thrice as many estimators as there are colours are told apart.
     """
-    order = [run.estimator for run in comparison.runs]
     styles = _LINE_OF[output]
-    dashes = styles[order.index(estimator) // len(_COLOURS) % len(styles)]
+    dashes = styles[look_numbers(comparison.estimators)[estimator] // COLOURS % len(styles)]
     return Stroke(color=colour_of(comparison, estimator), linestyle=dashes)
 
 

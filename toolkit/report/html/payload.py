@@ -17,10 +17,13 @@ from toolkit.files.documents import number, numbers
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves
+from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.html.highlights import highlights
+from toolkit.report.looks import look_numbers
 from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
-from toolkit.report.score_records import ConsistencyMark, RunOverSeeds
+from toolkit.report.score_records import ConsistencyMark, MetricOverSeeds, RunOverSeeds
+from toolkit.report.table import ShownUnit, unit_of
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -36,10 +39,9 @@ def payload_of(runs: Sequence[Files]) -> Json:
     """Return what the page shows of run directories, side by side in this order."""
     titles = _titles(runs)
     colours = _colours(runs)
-    keys = {key for files in runs for run in files.scores.runs for key in run.metrics}
     return {
         "title": " / ".join(titles),
-        "columns": columns_of(keys),
+        "columns": columns_of(_values(runs), real=any(one.manifest.sequence.format != "simulated" for one in runs)),
         "cases": [
             _case(files, f"c{i}", title, colours)
             if isinstance(files, RunFiles)
@@ -60,9 +62,7 @@ def _titles(runs: Sequence[Files]) -> list[str]:
 
 
 def _colours(runs: Sequence[Files]) -> dict[str, int]:
-    """Number the estimators in order of appearance; one of the same name has the same colour in every run."""
-    names = dict.fromkeys(run.estimator for files in runs for run in files.scores.runs)
-    return {name: i for i, name in enumerate(names)}
+    return look_numbers(run.estimator for files in runs for run in files.scores.runs)
 
 
 def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
@@ -76,7 +76,7 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
         "words": to_builtins(report.words),
         "card": [] if report.card is UNSET else report.card.words,
         "alignment": report.alignment,
-        "error": None if report.error is None else asdict(report.error),
+        "error": to_builtins(report.error),
         "highlights": highlights(rows, sequence.motion),
         "rows": rows,
         "truth": None if report.truth is None else _drawn(files.tracks[report.truth]),
@@ -196,16 +196,32 @@ def _nees(series: NeesSeries | str) -> Json | str:
     return thinned(columns, "pose") | band
 
 
-def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
-    """Return a column for each metric that the runs have, and for each key that no metric here declares."""
-    present = [metric for metric in known_metrics() if metric.key in keys_present]
-    usual = [metric for metric in present if metric.table != "on request"]
+def _values(runs: Sequence[Files]) -> dict[str, list[float | None]]:
+    """Return the values, over seeds the means, that stand in the column of each metric, of runs that ended well."""
+    values: dict[str, list[float | None]] = {}
+    for files in runs:
+        for run in files.scores.runs:
+            for key, metric in run.metrics.items():
+                value = metric.mean if isinstance(metric, MetricOverSeeds) else metric
+                values.setdefault(key, []).append(value if "ok" in run.status else None)
+    return values
+
+
+def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> list[dict[str, Any]]:
+    """Return a column for each metric that has values, and for each key that no metric here declares.
+
+    First stand those of the table of a comparison, of a ``real`` recording where any of them is one.
+    """
+    present = [metric for metric in known_metrics() if metric.key in values]
+    valued = [metric for metric in present if any(value is not None for value in values[metric.key])]
+    usual = usual_metrics(valued, real=real)
+    usual += [metric for metric in present if metric.table == "where rows differ"]
     columns = [
         {
             "key": metric.key,
             "name": metric.name,
             "unit": metric.unit,
-            "decimals": metric.decimals,
+            "shown_in": unit_of(metric, values[metric.key])._asdict(),
             "count": metric.count,
             "meaning": metric.meaning,
             "best": metric.best,
@@ -214,12 +230,20 @@ def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
         }
         for metric in (*usual, *(metric for metric in present if metric not in usual))
     ]
-    return [*columns, *(_undeclared(key) for key in sorted(keys_present - {metric.key for metric in present}))]
+    return [*columns, *(_undeclared(key) for key in sorted(values.keys() - {metric.key for metric in present}))]
 
 
 def _undeclared(key: str) -> dict[str, Any]:
     """Return the column of a metric that the runs have and this installation does not know."""
-    words = {"key": key, "name": key, "unit": "", "decimals": 3, "count": False, "meaning": "", "best": ""}
+    words = {
+        "key": key,
+        "name": key,
+        "unit": "",
+        "shown_in": ShownUnit("")._asdict(),
+        "count": False,
+        "meaning": "",
+        "best": "",
+    }
     return {**words, "usual": False, "usual_over_seeds": False}
 
 

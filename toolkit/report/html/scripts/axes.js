@@ -60,7 +60,8 @@ function drawAxes(context, axes, xLabel, yLabel) {
   context.save();
   context.translate(11, (axes.top + axes.bottom) / 2);
   context.rotate(-Math.PI / 2);
-  context.fillText(yLabel, 0, 0);
+  // A label longer than the axis is set narrower: the canvas would cut it.
+  context.fillText(yLabel, 0, 0, axes.bottom - axes.top + 24);
   context.restore();
   context.textAlign = "left";
 }

@@ -30,6 +30,11 @@ function farApart(lines) {
   return Math.max(...largest) > 30 * Math.min(...largest);
 }
 
+/** What is drawn, and how the estimates are placed. */
+function titled(one, name) {
+  return [`${name} ${one.error.what}`, one.error.placing].filter(Boolean).join(", ");
+}
+
 function positionCard(one) {
   let log = farApart(errorLines(one, "position_m").lines);
   const toggle = el("button", { type: "button", class: "quiet", text: "log", "aria-pressed": String(log),
@@ -39,14 +44,14 @@ function positionCard(one) {
       changed();
     } });
   const what = one.error.what;
-  const describe = () => ({ ...errorLines(one, "position_m"), yLabel: `position ${what} [m]`, unit: "m", log, least: 1e-3 });
-  return chartCard(one, `Position ${what}`, describe, one.error.caption, toggle);
+  const describe = () => ({ ...errorLines(one, "position_m"), yLabel: `${what.split(" ")[0]} [m]`, unit: "m", log, least: 1e-3 });
+  return chartCard(one, titled(one, "Position"), describe, one.error.caption, toggle);
 }
 
 function headingCard(one) {
   const what = one.error.what;
-  const describe = () => ({ ...errorLines(one, "heading_deg"), yLabel: `heading ${what} [deg]`, unit: "deg", signed: true, wraps: true, least: 1e-2 });
-  return chartCard(one, `Heading ${what}`, describe, "Positive is turned to the left of where it should be.");
+  const describe = () => ({ ...errorLines(one, "heading_deg"), yLabel: `${what.split(" ")[0]} [deg]`, unit: "deg", signed: true, wraps: true, least: 1e-2 });
+  return chartCard(one, titled(one, "Heading"), describe, "Positive is turned to the left of where it should be.");
 }
 
 const COMPONENTS = [["x_m", "x"], ["y_m", "y"], ["z_m", "z"], ["about_x_deg", "about x"], ["about_y_deg", "about y"], ["about_z_deg", "about z"]];
@@ -55,7 +60,10 @@ const COMPONENTS = [["x_m", "x"], ["y_m", "y"], ["z_m", "z"], ["about_x_deg", "a
 function componentsCard(one) {
   const rows = one.rows.filter((row) => row.components);
   if (!rows.length) return null;
-  let row = rows.findLast((other) => other.status === "ok") ?? rows[0];
+  // First the least consistent: its error beside what it states is what a reader wants explained.
+  const off = (other) => Math.abs(Math.log(other.metrics.nees_pose_mean ?? 1));
+  const good = rows.filter((other) => other.status === "ok");
+  let row = (good.length ? good : rows).reduce((a, b) => (off(b) >= off(a) ? b : a));
   let name = "x_m";
   const chooseRow = rows.length > 1 ? dropdown("of", rows.map((other) => [other.id, labelOf(other)]), row.id, (id) => {
     row = rows.find((other) => other.id === id);
@@ -71,7 +79,7 @@ function componentsCard(one) {
     const words = COMPONENTS.find(([key]) => key === name)[1];
     const side = (times) => sigma.map((value) => (value === null ? null : times * value));
     return {
-      lines: [{ row, t: t_s, x: t_s, y: error }], xLabel: "time [s]", yLabel: `${words}: ${one.error.what} [${unit}]`,
+      lines: [{ row, t: t_s, x: t_s, y: error }], xLabel: "time [s]", yLabel: `${words} [${unit}]`,
       unit, signed: true, least: 1e-3, level: 0, band: { x: t_s, low: side(-3), high: side(3) },
     };
   };
@@ -92,7 +100,7 @@ function neesCard(one) {
   });
   const describe = () => ({
     lines: rows.map((row) => ({ row, t: row.nees.t_s, x: row.nees.t_s, y: row.nees[part] })),
-    xLabel: "time [s]", yLabel: "NEES over its degrees of freedom [1]", unit: "", log: true, level: 1,
+    xLabel: "time [s]", yLabel: "NEES / its dimension", unit: "", log: true, level: 1,
     band: part === "pose" ? rows[0].nees.band : undefined,
   });
   return chartCard(one, title, describe, "Squared error over what the estimator stated for it: 1 is consistent, above the shaded " +
@@ -108,7 +116,7 @@ function nisCard(one) {
     const banded = (shown.length ? shown : rows)[0].nis;
     return {
       lines: rows.map((row) => ({ row, t: row.nis.t_s, x: row.nis.t_s, y: row.nis.per_dof, median: row.nis.median })),
-      xLabel: "time [s]", yLabel: "NIS over its degrees of freedom [1]", unit: "", log: true, level: 1, dots: true,
+      xLabel: "time [s]", yLabel: "NIS / its dimension", unit: "", log: true, level: 1, dots: true,
       band: { x: banded.t_s, low: banded.low, high: banded.high },
     };
   };

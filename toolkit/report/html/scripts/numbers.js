@@ -1,15 +1,14 @@
 const MISSING = "–";
 const MINUS = "−";
 
-/** Write a metric's value as the tables of `vislam compare` do: in five characters, in powers of ten where it needs more. */
+/** Write a metric's value as the tables of `vislam compare` do: three significant digits, its whole part in full. */
 function cellText(value, column) {
-  if (column.count && Math.abs(value) < 1e9) return value.toFixed(0).replace("-", MINUS);
-  // An error of a few centimetres needs three decimals to say anything.
-  for (let d = column.decimals + (Math.abs(value) < 0.1); d >= 0; d--) {
-    const text = value.toFixed(d);
-    if (text.length <= 5) return text.replace("-", MINUS);
-  }
-  return value.toExponential(0).replace("-", MINUS).replace("e+", "e");
+  const scaled = value * column.shown_in.factor;
+  const size = Math.abs(scaled);
+  if (size === 0 || (column.count && size < 1e9)) return scaled.toFixed(0).replace("-", MINUS);
+  if (size < 1e-3 || size >= 1e5) return scaled.toExponential(size < 1 ? 1 : 0).replaceAll("-", MINUS).replace("e+", "e");
+  const exponent = Math.floor(Math.log10(Number(size.toPrecision(3))));
+  return scaled.toFixed(Math.max(0, 2 - exponent)).replace("-", MINUS);
 }
 
 /** Write a number with three significant digits. */

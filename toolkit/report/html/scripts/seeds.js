@@ -3,8 +3,8 @@ function seedsCase(one, columns) {
   const cards = [stripCard(one, columns)];
   if (one.rows.some((row) => row.errors)) {
     const describe = () => ({ ...errorLines(one, "position_m"), xLabel: "time [s]", yLabel: "position error [m]", unit: "m", least: 1e-3 });
-    cards.push(chartCard(one, "Position error over the seeds", describe,
-      "Root mean square over the seeds that ended well at each frame; not aligned, but for the first pose."));
+    cards.push(chartCard(one, "Position error over the seeds, from the common start", describe,
+      "Root mean square over the seeds that ended well at each frame. All start from the same pose and nothing is fitted."));
   }
   const rows = one.rows.filter((row) => row.nees);
   if (rows.length) {
@@ -13,7 +13,7 @@ function seedsCase(one, columns) {
       const banded = (shown.length ? shown : rows)[0].nees;
       return {
         lines: rows.map((row) => ({ row, t: row.nees.t_s, x: row.nees.t_s, y: row.nees.pose })), xLabel: "time [s]",
-        yLabel: "mean pose NEES over 6 [1]", unit: "", log: true, level: 1,
+        yLabel: "mean pose NEES / 6", unit: "", log: true, level: 1,
         band: { x: banded.t_s, low: banded.low, high: banded.high },
       };
     };

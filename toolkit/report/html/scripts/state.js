@@ -67,10 +67,10 @@ function setZoom(caseId, range) {
 }
 
 const COLOURS = 7;
+const DASHES = { causal: [[7, 4], [2, 4], [1, 6]], final: [[], [9, 2, 2, 2], [14, 3]] };
 
-/** Return how a row's line is drawn: its colour, dashed where it knew the past only, dotted past the last colour. */
+/** Return how a row's line is drawn, as in the figures: its colour, dashed where it knew the past only; past the last colour otherwise. */
 function lookOf(row) {
-  const dashed = row.output === "causal";
-  const again = row.colour >= COLOURS;
-  return { colour: `--line-${row.colour % COLOURS}`, dash: again ? [2, 4] : dashed ? [7, 4] : [] };
+  const styles = DASHES[row.output === "causal" ? "causal" : "final"];
+  return { colour: `--line-${row.colour % COLOURS}`, dash: styles[Math.floor(row.colour / COLOURS) % styles.length] };
 }

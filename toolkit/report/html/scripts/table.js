@@ -43,7 +43,7 @@ function summaryTable(cases, columns, title) {
     const direction = current ? (sorting.descending ? "descending" : "ascending") : "none";
     const button = el("button", { type: "button", onclick: () => sort(column) },
       el("span", { text: column.name.replace(/(\d) (?=[ms]\b)/, "$1\u00a0") }),
-      column.unit && column.unit !== "1" ? el("span", { class: "unit", text: ` [${column.unit}]` }) : null,
+      column.unit && column.unit !== "1" ? el("span", { class: "unit", text: ` [${column.shown_in.name}]` }) : null,
       el("span", { class: "arrow", "aria-hidden": "true", text: { none: "↕", ascending: "↑", descending: "↓" }[direction] }));
     if (column.meaning) hintOn(button, column.meaning);
     const attributes = { scope: "col", class: column.text ? "word" : "number", "aria-sort": direction };
@@ -65,15 +65,21 @@ function summaryTable(cases, columns, title) {
     const cell = el("td", { class: isBest ? "number best" : "number", "data-value": number });
     cell.append(text);
     const std = seeds ? row.spreads[column.key].std : null;
-    if (std !== null && std > 0) cell.append(el("span", { class: "spread", text: ` ± ${Number(std.toPrecision(2))}` }));
+    if (std !== null && std > 0) cell.append(el("span", { class: "spread", text: ` ± ${Number((std * column.shown_in.factor).toPrecision(2))}` }));
     if (isBest) cell.append(el("span", { class: "unseen", text: " (best)" }));
-    const told = [seeds ? `mean of ${row.spreads[column.key].n} seeds: ${number}` : String(number), note].filter(Boolean);
+    const exact = `${number} ${column.unit}`.trim();
+    const told = [seeds ? `mean of ${row.spreads[column.key].n} seeds: ${exact}` : exact, note].filter(Boolean);
     hintOn(cell, told.join("; "));
     return cell;
   }
 
   function wordCell(row, column, i) {
-    if (i === 0) return el("th", { scope: "row", class: "word" }, swatch(row), el("span", { text: row.estimator }));
+    if (i === 0) {
+      // On a phone these words take the place of their columns, so that numbers are seen at once.
+      const rest = words.slice(1).map((other) => other.text(row)).filter((text) => text && text !== "ok");
+      return el("th", { scope: "row", class: "word" }, swatch(row), el("span", { text: row.estimator }),
+        el("small", { "aria-hidden": "true", text: [...rest, row.mark].filter(Boolean).join(", ") }));
+    }
     const text = column.text(row);
     if (column.name !== "status") return el("td", { class: "word", text });
     const mark = row.mark ? [" ", el("span", { class: "status mark", text: row.mark })] : [];
@@ -119,8 +125,8 @@ function summaryTable(cases, columns, title) {
 }
 
 /**
- * Return how the best value of each metric of each case prints, among the rows that ended well, where there is a choice;
- * all that print alike are best.
+ * Return how the best value of each metric of each case prints, among the rows that ended well; none where there is no
+ * choice, or where another that prints alike is worse.
  */
 function bestValues(rows, columns) {
   const distance = { least: (v) => Math.abs(v), most: (v) => -v, one: (v) => Math.abs(Math.log(Math.max(v, 1e-300))) };
@@ -131,7 +137,8 @@ function bestValues(rows, columns) {
       const values = ok.map((row) => row.metrics[column.key]).filter((v) => v !== null && v !== undefined);
       if (new Set(values.map((v) => cellText(v, column))).size < 2) continue;
       const least = values.reduce((a, b) => (distance[column.best](b) < distance[column.best](a) ? b : a));
-      best.set(`${id} ${column.key}`, cellText(least, column));
+      const text = cellText(least, column);
+      if (values.every((v) => v === least || cellText(v, column) !== text)) best.set(`${id} ${column.key}`, text);
     }
   }
   return best;
