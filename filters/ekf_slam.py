@@ -24,7 +24,7 @@ from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
-RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth, share, IMU matched"
+RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth"
 
 # With an IMU a landmark may have moved from its first estimate by this share of its distance before it is restarted.
 MOST_MOVED = 0.3

@@ -34,7 +34,7 @@ from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 110, "+ every state and landmark kept, bridge; one step a frame, old variables frozen"
+RUNG, CHANGE = 110, "+ every state and landmark kept; one step a frame, old variables frozen"
 RULES = {"window": "it keeps every state"}
 
 # A landmark tens of kilometres away never stops moving, although no pose moves with it: the last solve converges by

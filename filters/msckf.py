@@ -7,7 +7,7 @@ from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf",)
-RUNG, CHANGE = 60, "+ past poses, bridge; one update a track, at its end, by share; usual errors, 1 step"
+RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
 
 
 def build(setup: Setup) -> Estimator:

@@ -21,7 +21,7 @@ from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
-RUNG, CHANGE = 40, "+ right-invariant error, Jacobians at latest estimates, anchors; share with an IMU"
+RUNG, CHANGE = 40, "+ right-invariant error, Jacobians at latest estimates, anchors"
 
 
 def build(setup: Setup) -> Estimator:

@@ -28,7 +28,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
-RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept; no bridge"
+RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept"
 
 
 def build(setup: Setup) -> Estimator:

@@ -24,11 +24,12 @@ from itertools import pairwise
 import matplotlib.pyplot as plt
 import numpy as np
 from recordings import real
-from toolkit.track_errors import Card
 
 from toolkit import Result, compare
 from toolkit.estimator import ladder
+from toolkit.noise import Card
 from toolkit.report.card import card_lines
+from toolkit.report.comparison_table import noise_line
 from toolkit.report.messages import consistency_lines
 
 # %matplotlib inline
@@ -133,15 +134,13 @@ COLUMNS = "kitti_t_percent", "kitti_r_deg_per_m", "ate_yaw_m", "reproj held-out"
 recording, truth = real("ucsd/0027.npz"), real("ucsd/gt/0027.tum")
 if recording and truth:
     print("this ran on the real drive 0027, its first 400 frames, with ground truth")
-    SIMULATED = {"seeds": 3, "max_frames": 100}
     SOURCE = {"source": str(recording), "truth": truth, "max_frames": 400}
 else:
     print("0027 is not here: this ran on the simulation drive-realistic, 16 s of it at 5 Hz")
-    SIMULATED = {"seeds": 2, "max_frames": 40}
     SOURCE = {"source": "drive-realistic", "to_s": 16.0, "every": 2}
 
 # Each sighting counts in full, as where noise is white and every error is drawn anew.
-IN_FULL = {"noise": {"match_tracks": False}}
+IN_FULL = {"noise": {"track_weight": 1.0}}
 white = compare(**SOURCE, estimators=CHOSEN, settings=IN_FULL)
 white.table(*COLUMNS)
 
@@ -154,86 +153,53 @@ white.table(*COLUMNS)
 #
 # A tracker follows a patch from image to image and adds a little error at every step; and it has matched left and right
 # once, so that a track's disparity is off by the same amount for its whole life. The **card** of a recording says so.
-# It needs no truth: all poses and landmarks are fitted together with the noise that makes them most probable.
+# It needs no truth: on stretches of the recording all poses and landmarks are adjusted together, and the card describes
+# what is left of the sightings.
 
 # %%
-fitted = compare(**SOURCE, estimators=CHOSEN, settings={"noise": {"tracks": "fitted"}})  # we come to this below
-card = fitted.comparison.card
+measured = compare(**SOURCE, estimators=CHOSEN, settings={"card": True})
+card = measured.comparison.card
 print(*card_lines(card), sep="\n")
 
 # %% [markdown]
-# How far do two sightings of a track err apart? With white noise as far after one frame as after eight. With a random
-# walk ever farther. Beside it stands what an estimator would see if its assumption held: residuals of white noise that
-# do not know of each other.
+# How alike are the residuals of two sightings of one track? White errors would leave residuals that do not know of each
+# other (a little below zero, because the landmark was fitted to them).
 
 
 # %%
 def show_card(card: Card) -> None:
-    """Draw how errors along a track are correlated: the structure function with its fit, and the autocorrelation."""
-    names, colours = ("mean column", "disparity", "row"), ("#D55E00", "#0072B2", "#009E73")
-    lags = np.arange(1, len(card.structure_px2) + 1)
-    _, (apart, alike) = plt.subplots(1, 2, figsize=(10, 3.6))
-    for channel, (name, colour) in enumerate(zip(names, colours, strict=True)):
-        apart.plot(lags, np.sqrt(card.structure_px2[:, channel]), "o", color=colour, label=name)
-        apart.plot(lags, np.sqrt(card.fitted_px2[:, channel]), "-", color=colour)
-        alike.plot(lags, card.correlation[:, channel], "o-", color=colour, label=name)
-    apart.set(xlabel="frames apart", ylabel="spread [px]", title="spread of errors along a track; lines: fitted walk")
-    apart.set_ylim(bottom=0)
-    alike.axhline(0.0, color="#1a1a1a", linewidth=1)
-    alike.set(xlabel="frames apart", ylabel="correlation", title="correlation of residuals; black: if they were white")
-    alike.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    """Draw how the residuals along a track are correlated, by channel."""
+    _, axes = plt.subplots(figsize=(7, 3.2))
+    channels = ("mean column", "#D55E00"), ("disparity", "#0072B2"), ("row", "#009E73")
+    for (name, colour), values in zip(channels, card.correlation.T, strict=True):
+        axes.plot(np.arange(1, len(values) + 1), values, "o-", color=colour, label=name)
+    axes.axhline(0.0, color="#1a1a1a", linewidth=1)
+    axes.set(xlabel="frames apart", ylabel="correlation", title="residuals along a track; black: if they were white")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     plt.show()
 
 
 show_card(card)
 
-# %%
-for part, px in (("white", card.noise.white_px), ("walk", card.noise.walk_px), ("offset", card.noise.offset_px)):
-    print(f"{part:7}" + "  ".join(f"{name} {value:.2f} px" for name, value in zip("cdv", px, strict=True)))
-
 # %% [markdown]
+# An estimator that assumes white noise counts the twentieth sighting of a track for as much information as the second.
+# But most of it is the error of the one before, once more. It averages what does not average out, and its covariance
+# shrinks faster than its error. The smoother uses *all* sightings at once, so its covariance suffers most; a filter
+# that marginalises the past is spared a part.
+#
 # ## Weighted by their information
 #
-# An estimator can detect this correlation while it runs: white noise leaves uncorrelated residuals.
-# Filters with a window and smoothers measure the correlation, and give tracks less weight where there is one. That
-# is the default; above, `match_tracks` was off. The noise of the tracks need not be stated.
+# So how much a sighting counts is measured: once, before any estimator runs, and for all of them alike. That is the
+# default; above, every sighting counted in full. How it is measured is in the [page on real tracks](../docs/tracks.md).
 
 # %%
-matched = compare(**SOURCE, estimators=CHOSEN)
-matched.table(*COLUMNS)
-
-# %%
-for name, run in matched.runs.items():
-    for line in run.log:
-        if "correlated" in line:
-            print(f"{name:{width}}  {line}")
-
-# %% [markdown]
-# Each channel (c mean column, d disparity, v row) walks by about a tenth of a pixel a frame, beside which its white
-# noise, of a few hundredths, hardly counts.
-#
-# An estimator that assumes white noise counts the twentieth sighting of a track for as much information as the second.
-# But most of it is the error of the one before, once more. It averages what does not average out: its answer is worse
-# than it could be, and its covariance shrinks faster than its error. The smoother uses *all* sightings at once, so **it
-# suffers most**; a filter that marginalises the past is spared a part.
-#
-# ## With the fitted noise stated
-#
-# More can be stated: `noise.tracks=fitted` gives the fitted noise, with all of its parts, to every estimator that can
-# use it. The decoupled `ekf` cannot, nor can dead reckoning, so their lines stay as they are.
-
-# %%
-fitted.table(*COLUMNS)
-
-# %%
-for row in fitted.comparison.lines:
-    if row.value("nees_pose_mean") is None:
-        print(f"{row.estimator} has no NEES: {row.reason('nees_pose_mean')} ({'; '.join(row.run.log)})")
+print(noise_line(measured.comparison))
+measured.table(*COLUMNS)
 
 
 # %%
 def show_change(before: Result, after: Result, metrics: dict[str, str]) -> None:
-    """Draw a metric a panel: final answers of estimators with vision, white noise stated (open) and fitted (filled)."""
+    """Draw a metric a panel: final answers with vision, sightings in full (open) and weighted (filled)."""
     _, panels = plt.subplots(1, len(metrics), figsize=(10, 2.2), sharey=True)
     for axes, (key, words) in zip(panels, metrics.items(), strict=True):
         for name in CHOSEN[1:]:
@@ -249,48 +215,28 @@ def show_change(before: Result, after: Result, metrics: dict[str, str]) -> None:
 
 show_change(
     white,
-    fitted,
+    measured,
     {"kitti_t_percent": "KITTI drift [%]", "ate_yaw_m": "ATE, heading and position fitted [m]"},
 )
 
 # %%
 for name in CHOSEN:
-    old, new = (result.metrics[name, "final"]["kitti_t_percent"] for result in (white, fitted))
+    old, new = (result.metrics[name, "final"]["kitti_t_percent"] for result in (white, measured))
     if old and new and old != new:
         print(f"{name:{width}}  drift {old:.2f} % -> {new:.2f} %")
 
 # %% [markdown]
-# Where tracks err as the model has it, as in the simulation that stands in for 0027, both gain over white noise in
-# full. On 0027 itself both lose, the filter even its way: real errors have tails that no Gaussian has, the fitted noise
-# is that of the bulk of the tracks, and a gate by that noise rejects many good tracks. What to state to an estimator is
-# more than [the noise of the bulk](../docs/tracks.md), and to count all tracks for less, as above, did better on that
-# drive than the whole model.
-#
-# One drive is one draw of luck again. So the last step is a simulation with such tracks, where the truth is exact and
-# seeds can be repeated: the smoother once with white noise stated, and once with the walk and the offset that were
-# planted.
-
-# %%
-PLANTED = {"tracks": "correlated", "track_walk_px": 0.11, "track_offset_px": 0.9}
-errors_m = {}
-for stated, noise in {"white": IN_FULL["noise"], "as they are": PLANTED}.items():
-    again = compare("drive-realistic", "batch", **SIMULATED, settings={"noise": noise})
-    errors_m[stated] = np.array(again.comparison.rows[-1].values("ate_yaw_m"))
-    print(f"stated {stated:11}  mean ATE yaw {1000 * errors_m[stated].mean():.0f} mm")
-ratio = errors_m["as they are"] / errors_m["white"]
-print("as they are over white, seed by seed:", ", ".join(f"{one:.2f}" for one in ratio))
-
-# %% [markdown]
-# With the right noise stated, the smoother is more accurate.
+# On these 400 frames of 0027 the filter's drift halves and the smoother's hardly changes, while the error they state
+# comes much closer to the one they make: the NEES of both falls to a half and less. One drive is one draw of luck; the
+# [page on real tracks](../docs/tracks.md) has more of them.
 #
 # ## What it costs
 #
-# Processor time per frame on the drive, with white noise stated, the finish included, to one digit: it depends on the
-# machine.
+# Processor time per frame on the drive, the finish included, to one digit: it depends on the machine.
 
 # %%
-for run in white.runs.values():
-    ms = 1000 * run.timings.cpu_s / white.comparison.sequence.frame_count
+for run in measured.runs.values():
+    ms = 1000 * run.timings.cpu_s / measured.comparison.sequence.frame_count
     print(f"{run.estimator:{width}}  {float(f'{ms:.0e}'):g} ms")
 
 # %% [markdown]
@@ -300,11 +246,10 @@ for run in white.runs.values():
 # the end, uses the future. The first two a filter can have as well: a joint filter is as consistent as the smoother.
 # The third it can have in part, by iterating. The fourth it cannot.
 #
-# And it wins where the stated noise of its measurements is right. It uses them all with that noise, so it loses most by
-# a wrong one, and gains most from the right one.
+# And it wins where the noise of its measurements is right: it uses all of them with that noise.
 #
 # Try other seeds and lengths, and look at your own recording; each is one command:
 #
 #     vislam compare flight --estimators ladder --seeds 20 --max-frames 100
 #     vislam card my_drive.npz
-#     vislam compare my_drive.npz --set noise.tracks=fitted
+#     vislam compare my_drive.npz --set noise.track_weight=1

@@ -43,8 +43,7 @@ class Estimate:
     for d = 12, where no motion was measured: the turn rate, with the sign changed, then stands for a gyro bias.
     ``info`` holds diagnostics by name; the metrics understand ``nis``, ``nis_dof`` and, where a gate truncates the
     innovations, ``nis_expected``, what ``nis`` is on average in a consistent estimator (``nis_dof`` where it is not
-    given), and ``motion_noise_scale``, how many times the stated variance the noise of the motion up to the frame was
-    taken for (1 where it is not given).
+    given).
     """
 
     t_ns: int

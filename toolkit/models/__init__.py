@@ -6,7 +6,7 @@ belief, prediction), ``motion`` (what a motion model offers filters and graphs) 
 ``stacked_factors`` (Python factors of one form, evaluated at once), ``state_covariances`` (of all states of a graph),
 ``gating`` (thresholds and their sources) and ``noise`` (for files that state none).
 
-For some settings and recordings: ``correlated_noise`` (errors along tracks), ``gap_bridge`` (no common tracks),
-``moving_tracks`` (vehicles). From the tracks alone: ``camera_motion``. To judge an estimate: ``motion.predicted_steps``
-(its steps beside the measured motion) and ``corrections`` (tested against the covariance they take away).
+For a window that eliminates its landmarks: ``stereo_window``, ``reduced_vision``, ``window_solver``. From the tracks
+alone: ``camera_motion``. To judge an estimate: ``motion.predicted_steps`` (its steps beside the measured motion) and
+``corrections`` (tested against the covariance they take away).
 """

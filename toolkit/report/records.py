@@ -3,7 +3,7 @@
 Here are the records of ``report.json``, the contract ``vislam.report/1``: what a report draws and says beyond the
 scores (docs/report.md). It has two forms: of a comparison, and of one over seeds. Times ``t_s`` count from the first
 frame; numbers have six digits; what is not finite is null. The card of a recording in it is a document of its own, the
-contract ``vislam.card/1`` (docs/tracks.md). The scores are in ``score_records``, the manifest in ``manifest``, a check
+contract ``vislam.card/2`` (docs/tracks.md). The scores are in ``score_records``, the manifest in ``manifest``, a check
 in :mod:`toolkit.gate.verdict`; :mod:`toolkit.files.documents` reads and writes, :mod:`toolkit.report.schemas` writes
 docs/schemas.
 """

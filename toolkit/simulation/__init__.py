@@ -2,9 +2,9 @@
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
 ``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` plants faults in a
-recording, ``track_faults`` lasting errors of tracks; ``symmetries`` turn, mirror, delay or reverse one. ``filming``
-renders images instead of tracks, with ``surfaces`` (the visible world) and ``renderer``, and measures the errors of
-tracks made of them.
+recording, ``track_faults`` lasting errors of tracks by ``track_noise``; ``symmetries`` turn, mirror, delay or reverse
+one. ``filming`` renders images instead of tracks, with ``surfaces`` (the visible world) and ``renderer``, and measures
+the errors of tracks made of them.
 """
 
 from toolkit.simulation import faults, symmetries, track_faults
