@@ -79,7 +79,7 @@ def contests_of(rows: Sequence[Row], sequence: Recorded) -> tuple[Contest, ...]:
 
 
 def cheaper_near(contest: Contest, within: float, saves: float) -> Row | None:
-    """Return the cheapest row whose error is ``within`` a factor of the first's, if it ``saves`` a share of its time."""
+    """Return the cheapest row ``within`` a factor of the first's error, if it ``saves`` this share of the time."""
     first = contest.rows[0]
     limit, most = within * (first.value(contest.metric) or 0.0), (1.0 - saves) * (first.value(COST) or 0.0)
     near = [row for row in contest.rows[1:] if (row.value(contest.metric) or np.inf) <= limit and row.value(COST)]
@@ -113,7 +113,7 @@ def _accuracy(rows: Iterable[Row]) -> str:
 def _contest(
     question: Question, metric: str, rows: Iterable[Row], labels: tuple[str, ...], test: Compared
 ) -> Contest | None:
-    """Return the contest of the rows with these labels that have the metric, one an estimator; None of fewer than two."""
+    """Return the contest of the rows with a label that have the metric, one an estimator; None of fewer than two."""
     scored = [row for row in rows if row.label in labels and row.value(metric) is not None]
     ranked = sorted(scored, key=lambda row: row.value(metric) or 0.0)
     best_of = {row.estimator: row for row in reversed(ranked)}

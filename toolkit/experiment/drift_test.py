@@ -62,7 +62,9 @@ def less_drift(one: Matched, other: Matched) -> Advantage | None:
     if count < FEWEST_STRETCHES:
         return None
     ends = _ends(one.path_m[mine], count)
-    drifts = [_drift(pairs.truth[rows[ends]], pairs.estimate[rows[ends]]) for pairs, rows in ((one, mine), (other, its))]
+    drifts = [
+        _drift(pairs.truth[rows[ends]], pairs.estimate[rows[ends]]) for pairs, rows in ((one, mine), (other, its))
+    ]
     if any(drift is None for drift in drifts):
         return None
     return _ratio(*(drift for drift in drifts if drift is not None))

@@ -4,7 +4,7 @@ Only differences that a paired test supports are called differences (:mod:`toolk
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import COST, HELD_OUT, Contest, cheaper_near
@@ -35,29 +35,23 @@ def main_contest(comparison: Comparison) -> Contest | None:
 
 def listed(names: Iterable[str]) -> str:
     """Return names as in a sentence: "a", "a and b", "a, b and c", "a, b, c and 4 more"."""
-    given = list(dict.fromkeys(names))
+    given = list(dict.fromkeys(names)) or [""]
     if len(given) > _MOST_NAMES:
         given = [*given[: _MOST_NAMES - 1], f"{len(given) - _MOST_NAMES + 1} more"]
     return " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
 
 
-def short(value: float) -> str:
-    """Return a number with three significant digits, without powers of ten up to a million."""
-    if value and abs(value) < 1e6:
-        decimals = max(0, 2 - math.floor(math.log10(abs(value))))
-        return f"{value:.{decimals}f}" if decimals <= 6 else f"{value:.2g}"
-    return f"{value:.3g}"
+def short(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, without powers of ten up to a million."""
+    if not value or abs(value) >= 1e6 or abs(value) < 1e-4:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{max(0, decimals)}f}"
 
 
 def advantage_text(found: Advantage) -> str:
     """Return a factor with its interval, as in "2.2 times (99 %: 1.4 to 3.7)"."""
-    return f"{found.ratio:.3g} times ({CONFIDENCE:.0%}: {found.low:.3g} to {found.high:.3g})".replace("%", " %")
-
-
-def figures(rows: Iterable[Row], metric: str) -> str:
-    """Return the values of rows in a metric with its unit, as in "0.23 and 0.26 m"."""
-    values = " and ".join(short(value) for row in rows if (value := row.value(metric)) is not None)
-    return f"{values} {metrics_called((metric,))[0].unit}"
+    return f"{short(found.ratio)} times ({100 * CONFIDENCE:.0f} %: {short(found.low)} to {short(found.high)})"
 
 
 def _of_few(comparison: Comparison) -> str:
@@ -69,48 +63,58 @@ def _of_few(comparison: Comparison) -> str:
 
 
 def _accuracy(contest: Contest, over_seeds: bool) -> str:
+    """Say who is most accurate, or that nobody is by more than chance, and how much worse another is."""
     first, leaders = contest.rows[0], contest.leaders
-    name = metrics_called((contest.metric,))[0].name
-    how = "error" if over_seeds else "median error" if contest.metric == HELD_OUT else "drift"
-    beaten = ""
-    if contest.worse:
-        row, found = contest.worse[0]
-        beaten = f"{row.estimator}'s {how} is {advantage_text(found)} as large"
-    if len(leaders) == 1 and beaten:
-        row = contest.worse[0][0]
+    name = metrics_called((contest.metric,))[0].column
+    if len(leaders) == 1:
         claim = "predicts withheld tracks best" if contest.metric == HELD_OUT else "is most accurate"
-        return f"{first.estimator} {claim} ({name} {figures((first, row), contest.metric)}); {beaten}."
-    apart = f"{name} {figures(leaders[:2], contest.metric)}" if len(leaders) == 2 else _range(leaders, contest.metric)
-    seeds = f"{len(first.outcomes)} seeds" if over_seeds else "one run"
-    return f"No clear winner between {listed(row.estimator for row in leaders)} ({apart}, {seeds})" + (
-        f"; {beaten}." if beaten else "."
-    )
+        opening = f"{first.estimator} {claim} ({name} {_with_unit(contest, first)}"
+    else:
+        least = short(first.value(contest.metric) or 0.0)
+        given = f"{least} to {_with_unit(contest, leaders[-1])}"
+        opening = f"No clear winner between {listed(row.estimator for row in leaders)} ({name} {given}"
+    runs = f"{len(first.outcomes)} seeds" if over_seeds else "one run"
+    return f"{opening}, {runs}){_beaten(contest, over_seeds)}."
 
 
-def _range(rows: tuple[Row, ...], metric: str) -> str:
-    """Return a metric of ranked rows from the least to the largest."""
-    known = metrics_called((metric,))[0]
-    return f"{known.name} {short(rows[0].value(metric) or 0.0)} to {short(rows[-1].value(metric) or 0.0)} {known.unit}"
+def _beaten(contest: Contest, over_seeds: bool) -> str:
+    """Say how much worse the next row is that is worse by more than chance, and not nearly as good; or nothing."""
+    if not contest.worse:
+        return ""
+    far = _NEAR * (contest.rows[0].value(contest.metric) or 0.0)
+    worse = [(row, found) for row, found in contest.worse if (row.value(contest.metric) or 0.0) > far]
+    row, found = (worse or contest.worse)[0]
+    does = "errs" if over_seeds or contest.metric == HELD_OUT else "drifts"
+    return f"; {row.estimator} ({_with_unit(contest, row)}) {does} {advantage_text(found)} as much"
+
+
+def _with_unit(contest: Contest, row: Row) -> str:
+    return f"{short(row.value(contest.metric) or 0.0)} {metrics_called((contest.metric,))[0].unit}"
 
 
 def _limits(contest: Contest) -> str:
     if contest.metric != HELD_OUT:
         return ""
-    return "Withheld tracks show errors over a few frames; the distance from the true path is unknown."
+    return "Withheld tracks show errors over a few frames, not the distance from the true path."
 
 
 def _trust(comparison: Comparison) -> str:
     """Say whose stated uncertainty can be trusted, and by how much the worst other errs more than it states."""
-    judged = [row for row in comparison.lines if row.consistency is not None and row.counts["ok"]]
-    sound = [row.estimator for row in judged if not row.mark]
+    ended = [row for row in comparison.lines if row.counts["ok"]]
+    judged = [row for row in ended if row.consistency is not None]
     if not judged:
         return ""
-    rest = [row for row in judged if row.mark]
-    parts = [f"Trust the stated uncertainty of {listed(sound)}" if sound else "Trust nobody's stated uncertainty"]
-    worst = max(rest, key=_overconfidence, default=None)
-    if worst is not None and _overconfidence(worst) > 1.0:
-        parts.append(f"{worst.estimator} errs {_overconfidence(worst):.2g} times what it states")
-    return "; ".join(parts) + "."
+    sound = [row.estimator for row in judged if not row.mark]
+    untested = listed(row.estimator for row in ended if row.consistency is None)
+    if sound:
+        trusted = f"Trust the stated uncertainty of {listed(sound)}"
+    elif untested:
+        trusted = f"Trust nobody's stated uncertainty (untested: {untested})"
+    else:
+        trusted = "Trust nobody's stated uncertainty"
+    worst = max(judged, key=_overconfidence)
+    errs = _overconfidence(worst)
+    return trusted + (f"; {worst.estimator} errs {short(errs, 2)} times what it states." if errs else ".")
 
 
 def _overconfidence(row: Row) -> float:
@@ -126,14 +130,11 @@ def _cost(contest: Contest) -> str:
         return ""
     if near is not None:
         more = 100.0 * ((near.value(contest.metric) or 0.0) / (first.value(contest.metric) or 1.0) - 1.0)
-        share = (near.value(COST) or 0.0) / cost
-        return f"{near.estimator} comes within {max(1, math.ceil(more))} % of it in {share:.2g} of the time."
+        share = short((near.value(COST) or 0.0) / cost, 2)
+        return f"{near.estimator} comes within {max(1, math.ceil(more))} % of {first.estimator} in {share} of its time."
     other = next((row for row, _ in contest.worse if row.value(COST)), None)
     if other is None:
         return ""
-    return f"{first.estimator} takes {cost / (other.value(COST) or cost):.2g} times the time of {other.estimator}."
-
-
-def verdict_paragraphs(comparison: Comparison) -> Iterator[str]:
-    """Yield the verdict as a section of a report."""
-    yield verdict(comparison)
+    return (
+        f"{first.estimator} takes {short(cost / (other.value(COST) or cost), 2)} times the time of {other.estimator}."
+    )
