@@ -24,8 +24,8 @@ from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_sec
 from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.report.verdict import verdict
 
-# Notes below the printed table, the most harmful ones; the report has all.
-_MOST_NOTES = 3
+# Notes below the printed table, and lines of them with the verdict's; the report has all notes.
+_MOST_NOTES, _MOST_LINES = 3, 7
 
 _READ_BEFORE = """\
 Causal and held-out describe what an estimator is given. Before its first packet, the same for all: with raw IMU
@@ -89,13 +89,26 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
     """
     lines = [filled(entry, width) for entry in header_lines(comparison, columns)]
     lines += ["", as_text(comparison_table(comparison, columns)), "", filled(verdict(comparison), width, further="")]
-    notes = list(note_lines(comparison, columns))
-    lines += section("notes", notes[:_MOST_NOTES], width)
+    lines += section("notes", _most_harmful(list(note_lines(comparison, columns)), verdict(comparison)), width)
     if comparison.card is not None:
         lines += section("card", card_lines(comparison.card), width)
-    if notes[_MOST_NOTES:]:
-        lines += [f"{len(notes) - _MOST_NOTES} more in report.md"]
     return "\n".join(lines)
+
+
+def _most_harmful(notes: list[str], above: str) -> list[str]:
+    """Return the first notes, as many as fit with what is above them, the last one with the number of the others."""
+    shown: list[str] = []
+    room = _MOST_LINES - _line_count([above])
+    for i, note in enumerate(notes[:_MOST_NOTES], start=1):
+        left = f" ({len(notes) - i} more in report.md)" if notes[i:] else ""
+        if shown and _line_count([*notes[: i - 1], note + left]) > room:
+            break
+        shown = [*notes[: i - 1], note + left]
+    return shown
+
+
+def _line_count(entries: list[str]) -> int:
+    return "\n".join(section("notes", entries, WIDTH)).count("\n") + 1
 
 
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:

@@ -113,9 +113,10 @@ def _faults(comparison: Comparison) -> Iterator[str]:
         if not (found.blocking or found.warning):
             continue
         spans = [elapsed_s(np.array(span)).tolist() for span in found.spans_ns]
-        when = f" at {spans[0][0]:.0f}-{spans[0][1]:.0f} s{' and later' if spans[1:] else ''}" if spans else ""
+        more = f" (first of {len(spans)})" if spans[1:] else ""
+        when = f"{spans[0][0]:.0f}-{spans[0][1]:.0f} s{more}" if spans else "every result"
         what = re.split("[,:;]", summaries.get(found.fault, found.detail))[0]
-        yield f"{found.fault}{when}: {what}; distrust {'results there' if spans else 'every result'}"
+        yield f"{found.fault}: {what}; distrust {when}"
 
 
 def log_lines(comparison: Comparison) -> Iterator[str]:
@@ -159,8 +160,9 @@ def _contradicted(comparison: Comparison) -> Iterator[str]:
     rows = [row for row in comparison.lines if row.mark == "contradicted"]
     found = [(_name_of(row), one) for row in rows if (one := row.consistency) is not None]
     if found:
-        given = listed(f"{name} (trend {_figure(one.mean)}, limit {_figure(one.high)})" for name, one in found)
-        yield f"contradicted: tracks push {given} one way all the time; check calibration and time stamps"
+        names, trends = listed(name for name, _ in found), listed(_figure(one.mean) for _, one in found)
+        limit = _figure(max(one.high for _, one in found))
+        yield f"contradicted: tracks push {names} one way, trend {trends} (limit {limit}); check calibration and stamps"
 
 
 def _marks(comparison: Comparison) -> Iterator[str]:
