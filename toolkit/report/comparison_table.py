@@ -178,6 +178,7 @@ def rules_line(comparison: Comparison) -> str:
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outlier_summary(settings.outliers)}"
         f"{_track_noise(settings.noise)}{_optional_parts(settings.noise)}"
+        f"{'; started from the truth' if settings.start == 'truth' else ''}"
     )
 
 

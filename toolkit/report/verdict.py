@@ -132,9 +132,6 @@ def _cost(contest: Contest) -> str:
         more = 100.0 * ((near.value(contest.metric) or 0.0) / (first.value(contest.metric) or 1.0) - 1.0)
         share = short((near.value(COST) or 0.0) / cost, 2)
         return f"{near.estimator} comes within {max(1, math.ceil(more))} % of {first.estimator} in {share} of its time."
-    other = next((row for row, _ in contest.worse if (row.value(COST) or cost) < cost), None)
-    if other is None:
-        return ""
-    return (
-        f"{first.estimator} takes {short(cost / (other.value(COST) or cost), 2)} times the time of {other.estimator}."
-    )
+    other = contest.worse[0][0] if contest.worse else first
+    times = cost / (other.value(COST) or cost)
+    return f"{first.estimator} takes {short(times, 2)} times the time of {other.estimator}." if times > 1.0 else ""
