@@ -321,7 +321,7 @@ def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[s
         for reason, affected in by_reason.items():
             empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
     for (whose, reason), names in empty.items():
-        yield f"no {', '.join(names)}{whose}: {reason}"
+        yield f"no {listed(names)}{whose}: {reason}"
     for name, why in unavailable().items():
         yield f"the metrics of {name} are unavailable: {why}"
 
