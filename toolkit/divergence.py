@@ -63,7 +63,7 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     if far.size == 0 or far.mean() <= MOST_FAR_STEPS:
         return None
     return (
-        f"{100.0 * far.mean():.0f} % of its steps contradict the measured motion by more than chance allows "
+        f"{100.0 * far.mean():.0f} % of its steps contradict the measured motion "
         f"(at most {100.0 * MOST_FAR_STEPS:.0f} % do in a run that works)"
     )
 

@@ -38,7 +38,7 @@ import numpy as np
 from toolkit.errors import VislamError
 from toolkit.estimate import Output, Run, Status
 from toolkit.experiment.comparison import Row, consistency_of
-from toolkit.experiment.disagreement import MotionTest
+from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
 from toolkit.metrics import Evaluation, ate, score_run
@@ -243,15 +243,14 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
             outcome = outcome_of(run, prepared.sequence, 0)
             rows[name] = [row for row in (Row(output, (outcome,)) for output in OUTPUTS) if not row.repeats_causal]
             lines[name] = _scored(one, run, outcome, prepared, replace(prepared.sequence, truth=recorded.truth))
-    contradicting = {name for names in comparisons(scenario) for name in _contradicting_or_contradicted(rows, names)}
+    contradicting = {name for names in comparisons(scenario) for name in _far_from_motion(rows, names)}
     for name, line in lines.items():
         yield replace(line, contradicts=name in contradicting)
 
 
-def _contradicting_or_contradicted(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
-    """Return of the estimators of a comparison who parts from the measured motion, or rests on one in doubt."""
-    test = MotionTest.of(row for name in names for row in rows.get(name, ()))
-    return {one.row.estimator for one in test.too_far} | set(test.uncorrected if test.is_contradicted else ())
+def _far_from_motion(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
+    """Return of the estimators of a comparison who is too far from the measured motion."""
+    return {one.row.estimator for one in too_far(row for name in names for row in rows.get(name, ()))}
 
 
 def _unless_refused(make: Callable[[], Result]) -> Result | str:

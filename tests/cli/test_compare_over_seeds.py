@@ -23,7 +23,7 @@ def test_a_run_directory_over_seeds(
     assert vislam("compare", "drive", *QUICK, "--seeds", "3", "--seed", "1", "--workers", "1", "--out", "run") == 0
     messages = capsys.readouterr()
     assert messages.err == ""
-    assert "results: run\n" in messages.out
+    assert "results: run;" in messages.out
     document = read_seeds(Path("run/seeds.json"))
     assert document.seeds == (1, 2, 3)
     assert len(set(document.hashes)) == 3
@@ -82,7 +82,7 @@ def test_the_table_has_the_change_of_each_rung_once(
     monkeypatch.setattr(estimator, "ladder", lambda: lowest)
     words = ("--estimators", "ladder", "--max-frames", "10", "--workers", "1", "--out", "run")
     assert vislam("compare", "drive", *words) == 0
-    table = capsys.readouterr().out.partition("start:")[0]
+    table = capsys.readouterr().out.partition("notes:")[0]
     for entry in lowest:
         assert table.count(entry.change()) == 1
     report = Path("run/report.md").read_text()

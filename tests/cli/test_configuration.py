@@ -177,7 +177,7 @@ def test_without_words_the_default_sequences_and_estimators_are_compared(vislam:
 
 def table(reported: str) -> list[str]:
     """Return the lines of a printed table, its headings with it."""
-    return reported.partition("start:")[0].partition("\n\n")[2].strip().splitlines()
+    return reported.partition("\n\n")[2].partition("\n\n")[0].strip().splitlines()
 
 
 def test_columns_are_those_requested(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,7 +53,7 @@ def test_a_wrong_command_line_is_2(vislam: Vislam, one_line: OneLine, words: tup
 @pytest.mark.usefixtures("unrendered")
 def test_a_run_that_is_marked_overconfident_ends_with_0(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     assert vislam("compare", "drive", "--estimators", "ekf", "--max-frames", "60", "--workers", "1") == 0
-    assert "ekf is overconfident" in capsys.readouterr().out
+    assert "overconfident: ekf" in capsys.readouterr().out
 
 
 def test_a_recording_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
@@ -128,7 +128,7 @@ def test_nothing_but_results_is_written_when_all_is_well(vislam: Vislam, capsys:
     assert vislam(*QUICK, "--out", "run") == 0
     messages = capsys.readouterr()
     assert messages.err == ""
-    assert "results: run\n" in messages.out
+    assert "results: run; as a page: vislam report run\n" in messages.out
     assert [path.name for path in Path().iterdir()] == ["run"]
 
 

@@ -63,7 +63,7 @@ def test_killed_in_the_middle_and_repeated_equals_uninterrupted(
     assert len(ended) == 2
     assert [path.name for path in Path("run").iterdir()] == ["outcomes.jsonl"]
     assert vislam(*words, "--out", "run") == 0
-    assert f"results: run ({len(ended)} of 6 runs were there)\n" in capsys.readouterr().out
+    assert f"results: run ({len(ended)} of 6 runs were there)" in capsys.readouterr().out
     assert lines("run")[: len(ended)] == ended
     assert len(lines("run")) == 6
     assert vislam(*words, "--out", "other") == 0

@@ -1,4 +1,4 @@
-"""Estimators of one comparison that disagree about the measured motion are reported, and those that use it alone."""
+"""Estimators of one comparison that are too far from the measured motion are reported."""
 
 from dataclasses import replace
 
@@ -7,14 +7,13 @@ import pytest
 
 from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.disagreement import FARTHEST, FarthestPose, MotionTest, farthest
+from toolkit.experiment.disagreement import FARTHEST, FarthestPose, farthest, too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Outcome, Scored, Unit, outcome_of, run_estimator
 from toolkit.geometry import Array, se3_exp
 from toolkit.metrics import Scores
 from toolkit.metrics.correction_trend import LIMIT, NOTHING_CORRECTED, TREND
 from toolkit.progress import SILENT
-from toolkit.report.messages import motion_test_lines
 from toolkit.sequence import Sequence
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, faults, simulate
@@ -64,37 +63,10 @@ def test_without_a_covariance_or_over_seeds_nobody_parts() -> None:
     poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
     far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
     motion = row("dead-reckoning", poses, cov)
-    assert MotionTest.of([motion, row("a", far, cov, 1.0)]).too_far
-    assert not MotionTest.of([motion, row("a", far, None, 1.0)]).too_far
+    assert too_far([motion, row("a", far, cov, 1.0)])
+    assert not too_far([motion, row("a", far, None, 1.0)])
     outcome = motion.outcomes[0]
-    assert not MotionTest.of([Row("causal", (outcome, replace(outcome, seed=1))), row("a", far, cov, 1.0)]).too_far
-
-
-@pytest.mark.parametrize(
-    ("trends", "doubted"), [((5.0,), True), ((5.0, 1.0), True), ((5.0, 1.0, 1.0), False), ((1.0,), False), ((), False)]
-)
-def test_the_motion_is_contradicted_where_half_of_those_that_use_vision_contradict_it(
-    trends: tuple[float, ...], doubted: bool
-) -> None:
-    rows = [row(f"filter-{i}", trend=trend) for i, trend in enumerate(trends)]
-    test = MotionTest.of([row("dead-reckoning"), *rows])
-    assert (test.uncorrected, test.is_contradicted) == (("dead-reckoning",), doubted)
-    assert not MotionTest.of(rows).is_contradicted
-    assert len(list(motion_test_lines(test))) == doubted
-
-
-def test_one_that_differs_and_whose_corrections_cannot_be_tested_does_not_count_against_the_motion() -> None:
-    poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
-    far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
-    held = row("seed-ekf", far, cov)
-    scored = held.outcomes[0].outputs["causal"]
-    notes = replace(scored, scores=Scores(scored.scores.values, {TREND: "the estimator does not estimate biases"}))
-    held = Row("causal", (replace(held.outcomes[0], outputs={"causal": notes}),))
-    motion = row("dead-reckoning", poses, cov)
-    test = MotionTest.of([motion, held])
-    assert [one.row.estimator for one in test.too_far] == ["seed-ekf"]
-    assert not test.is_contradicted
-    assert MotionTest.of([motion, held, row("a", far, cov, 1.0)]).is_contradicted
+    assert not too_far([Row("causal", (outcome, replace(outcome, seed=1))), row("a", far, cov, 1.0)])
 
 
 def rows_of(sequence: Sequence, noise: Noise) -> list[Row]:
@@ -107,17 +79,8 @@ def _row_of(name: str, prepared: Prepared) -> Row:
     return Row("causal", (outcome_of(run, prepared.sequence, 0),))
 
 
-def test_an_odometer_that_slips_is_reported_of_dead_reckoning_too_and_a_sound_one_of_nobody() -> None:
+def test_an_odometer_that_slips_parts_from_estimators_that_see_it_and_a_sound_one_from_nobody() -> None:
     sound, as_stated = simulate(replace(DRIVE, duration_s=8.0), 5), Noise(motion_scale=1.0)
-    for noise in (Noise(), as_stated):
-        assert not any(True for _ in motion_test_lines(MotionTest.of(rows_of(sound, noise))))
-    slips = faults.disturbed_motion(sound, 0.8, 5)
-    # With its noise as measured, four times as large, no estimate is too far from the motion alone.
-    assert MotionTest.of(rows_of(slips, Noise())).is_contradicted
-    slipping = MotionTest.of(rows_of(slips, as_stated))
-    assert (slipping.uncorrected, slipping.is_contradicted) == (("dead-reckoning",), True)
-    assert set(slipping.contradicting) <= {"ekf-slam", "msckf"} == set(slipping.tested)
-    assert "seed-ekf" in {one.row.estimator for one in slipping.too_far}
-    too_far, contradicted = motion_test_lines(slipping)
-    assert "vision and the measured motion alone disagree" in too_far
-    assert contradicted.startswith("dead-reckoning: uses only the measured motion and the start, which ")
+    assert not any(too_far(rows_of(sound, noise)) for noise in (Noise(), as_stated))
+    slipping = rows_of(faults.disturbed_motion(sound, 0.8, 5), as_stated)
+    assert "seed-ekf" in {one.row.estimator for one in too_far(slipping)}

@@ -197,7 +197,7 @@ def test_a_broken_document_is_refused_with_the_place(
 def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) -> None:
     for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
-        assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
+        assert "broken failed under seeds 3, 4, 5 and 6: failed after 0 estimates: no gauge" in text
         assert "overconfident" in " ".join(text.split())
     assert max(map(len, comparison_text(over).splitlines())) <= 100
 

@@ -203,6 +203,20 @@ def test_where_little_is_seen_the_noise_is_as_stated_and_all_figures_are_finite(
     assert bool(measured.why_not) == (measured.tracks.pairs == 0)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("wild_px", [1e5, 1e155, 1e300, -1e300])
+def test_wild_values_end_nothing_and_change_little_or_are_told(drive: Sequence, wild_px: float) -> None:
+    walking = track_walk(drive, 0.6, 1)
+    uv_px = walking.observations.uv_px.copy()
+    uv_px[200::1000] = wild_px * np.array([1.0, 0.5, 1.0])
+    uv_px[500::1000, 0] = wild_px
+    found = measured_noise(replace(walking, observations=replace(walking.observations, uv_px=uv_px)))
+    if wild_px == 1e5:
+        assert found.tracks.value == pytest.approx(measured_noise(walking).tracks.value, rel=0.3)
+    else:  # one in every stretch, and none has a solution: the audit drops such values
+        assert "do not determine the motion" in found.why_not
+
+
 @pytest.mark.parametrize(("tracks", "frames", "reason"), [(0, 15, "no tracks"), (50, 7, "7 frames are too few")])
 def test_a_reason_is_given_where_nothing_can_be_measured(
     drive: Sequence, tracks: int, frames: int, reason: str

@@ -15,10 +15,10 @@ from toolkit.estimate import STATUS_MEANING, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.metrics import Scores
-from toolkit.report import messages
 from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.payload import evenly, payload_of, running_median, with_peaks
+from toolkit.report.records import ContestRecord, Rival
 from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.report.schemas import schema_files
 
@@ -149,13 +149,12 @@ def test_every_script_is_part_of_the_page() -> None:
     assert {path.stem for path in (Path(folder) / "scripts").iterdir()} == set(SCRIPTS)
 
 
-def test_a_status_means_the_same_on_the_page_in_the_notes_and_in_the_documents(page: str) -> None:
+def test_a_status_means_the_same_on_the_page_and_in_the_documents(page: str) -> None:
     assert list(STATUS_MEANING) == list(get_args(Status))
     each = "; ".join(f"{status}: {meaning}" for status, meaning in STATUS_MEANING.items())
     assert f'STATUS_MEANING = "{each}. ' in page
     for status, meaning in STATUS_MEANING.items():
-        of_the_notes, of_the_page = f"{status}: it {meaning}. ", f'{status}: "{status}: it {meaning}'
-        assert (status == "ok") or (messages._STATUS[status].startswith(of_the_notes) and of_the_page in page)
+        assert (status == "ok") or f'{status}: "{status}: it {meaning}' in page
     described = "; ".join(STATUS_MEANING.values())
     documented = (Path(__file__).parents[2] / "docs/metrics-json.md").read_text(encoding="utf-8")
     assert f'| `status` | `"ok"`, `"diverged"` or `"failed"` | {described} |' in documented
@@ -201,35 +200,64 @@ def test_evenly_spread_indices_reach_both_ends(count: int, most: int) -> None:
     assert kept.tolist()[-1:] == [count - 1][:count]
 
 
-def _highlighted(status: str = "ok", coverage: float = 100.0, ate: float | None = 1.0) -> Json:
-    metrics = {"ate_se3_m": ate, "coverage_percent": coverage, "heldout_reproj_median_px": None, "total_s": None}
-    return {"status": status, "output": "both", "metrics": metrics}
+def _row(name: str, **said: object) -> Json:
+    return {
+        "id": name,
+        "estimator": name,
+        "output": "both",
+        "mark": "",
+        "judged": True,
+        "good": True,
+        "metrics": {},
+    } | said
 
 
-def test_an_answer_comes_from_runs_that_are_ok_and_whole() -> None:
-    rows = [
-        {**_highlighted(ate=3.0), "id": "a", "estimator": "whole"},
-        {**_highlighted(ate=0.1, coverage=40.0), "id": "b", "estimator": "half"},
-        {**_highlighted(ate=0.2, status="diverged"), "id": "c", "estimator": "astray"},
-        {**_highlighted(ate=4.0), "id": "d", "estimator": "other"},
-    ]
-    first = highlights(rows, "twist")[0]
-    assert (first["answer"], first["row"]) == ("whole", "a")
-    assert first["next"] == "next: other, 4 m"
-    assert highlights([{**_highlighted(ate=None), "id": "a", "estimator": "mute"}], "twist") == []
+def _contest(winner: str | None, leaders: tuple[str, ...]) -> ContestRecord:
+    rivals = (
+        Rival(estimator="one", output="causal", value=3.0, ratio=None, interval=None),
+        Rival(estimator="other", output="causal", value=4.0, ratio=1.3, interval=(0.9, 1.8)),
+    )
+    by = "stretches of the path"
+    return ContestRecord(
+        question="accuracy in the end", metric="ate_yaw_m", by=by, rivals=rivals, leaders=leaders, winner=winner
+    )
 
 
-def _with_figures(name: str, **figures: float | None) -> Json:
-    row = _highlighted(ate=None)
-    return {**row, "id": name, "estimator": name, "metrics": row["metrics"] | figures}
+@pytest.mark.parametrize(
+    ("winner", "leaders", "mark", "answer", "row"),
+    [
+        ("one", ("one",), "", "one", "one"),
+        (None, ("one", "other"), "", "no clear winner", None),
+        (None, ("one",), "overconfident", "no winner", None),
+    ],
+)
+def test_a_card_names_whom_the_contest_does_and_a_marked_row_wins_nothing(
+    winner: str | None, leaders: tuple[str, ...], mark: str, answer: str, row: str | None
+) -> None:
+    card = highlights([_contest(winner, leaders)], [_row("one", mark=mark), _row("other")], "one run")[0]
+    assert (card["answer"], card["row"]) == (answer, row)
+    assert "3.00 m ATE yaw" in card["detail"] or "33 % apart, one run" in card["detail"]
+    assert "1.30 times" in card["next"]
 
 
-def test_most_honest_is_a_contest_of_nees_between_estimators() -> None:
-    one, other = _with_figures("one", nees_pose_mean=3.0), _with_figures("other", nees_pose_mean=0.5)
-    assert [tile["answer"] for tile in highlights([one, other], "twist")] == ["other"]
-    assert highlights([one], "twist") == []
-    assert highlights([one, {**one, "id": "its final answer"}], "twist") == []
-    assert highlights([_with_figures("one", nis_mean=1.0), _with_figures("other", nis_mean=2.0)], "twist") == []
+def test_uncertainty_to_trust_is_that_of_every_row_without_a_mark() -> None:
+    rows = [_row("one"), _row("other"), _row("sure", mark="overconfident"), _row("mute", judged=False)]
+    (card,) = highlights((), rows, "one run")
+    assert card["answer"] == "one and other"
+    assert "sure is overconfident" in card["detail"]
+    assert highlights((), [_row("mute", judged=False)], "one run") == []
+
+
+def test_nobody_is_fastest_by_what_a_processor_scatters() -> None:
+    def fastest(first_ms: float, mark: str = "") -> str | None:
+        costs = {"one": first_ms, "other": 2.0, "last": 3.0}
+        rows = [_row(name, judged=False, metrics={"frame_cpu_ms_mean": cost}) for name, cost in costs.items()]
+        rows[0]["mark"] = mark
+        return highlights((), rows, "one run")[0]["answer"]
+
+    assert fastest(1.0) == "one"
+    assert fastest(1.8) == "no clear winner"
+    assert fastest(0.1, mark="timid") == "other"
 
 
 @pytest.mark.usefixtures("unrendered")

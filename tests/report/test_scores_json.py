@@ -79,7 +79,7 @@ def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
     assert built["runs"][0]["consistency"] == {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1}
     assert "consistency" not in built["runs"][-1]  # it failed without an answer
     words = [line for line in note_lines(timid) if "timid" in line]
-    assert all(part in words[0] for part in ("steady", "timid", "NEES", "0.100", "2.41"))
+    assert all(part in words[0] for part in ("steady", "NEES", "0.100", "2.41"))
 
 
 def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimator(comparison: Comparison) -> None:
@@ -108,14 +108,13 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
         "band": [0.0, 4.0],
     }
     words = [line for line in note_lines(leaning) if "contradicted" in line]
-    assert words[0].startswith("steady is contradicted: the corrections by its tracks have one direction, 5.2")
-    assert "by chance at most 4.00" in words[0]
+    assert all(text in words[0] for text in ("steady", "trend 5.2", "limit 4.00", "check calibration"))
 
 
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
     comparison: Comparison, rescored: Rescored
 ) -> None:
-    harm = "explains withheld tracks worse than dead reckoning: its reprojection error is 3.00 +- 0.10 times"
+    harm = "explains withheld tracks worse than dead reckoning, with 3.00 +- 0.10 times its error"
 
     def given(row: Row) -> Scores:
         is_first = row.estimator == comparison.lines[0].estimator
@@ -135,7 +134,7 @@ def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Compari
     assert words(91.0) == []
     (line,) = words(55.0)
     assert "steady 45 %" in line
-    assert "calibration, time stamps or noise" in line
+    assert "calibration" in line
 
 
 def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:

@@ -16,7 +16,9 @@ from toolkit.metrics import Scores, known_metrics
 from toolkit.report import prose
 from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.messages import note_lines
 from toolkit.report.table import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
@@ -206,39 +208,43 @@ def test_columns_are_aligned(comparison: Comparison) -> None:
 
 
 def test_columns_without_any_value_are_dropped_and_explained(without_truth: Comparison) -> None:
-    text = comparison_text(without_truth)
-    table, _, prose = text.partition("start:")
-    assert "SE(3)" not in table
-    assert "ATE SE(3)" in prose
-    assert "no ground truth" in prose
+    assert "SE(3)" not in comparison_text(without_truth).partition("\n\n")[2].partition("\n\n")[0]
+    notes = report_text(without_truth, {}).partition("## Notes")[2]
+    assert "ATE SE(3)" in notes
+    assert "no ground truth" in notes
 
 
 def test_diverged_and_failed_runs_are_explained(comparison: Comparison) -> None:
     for text in (comparison_text(comparison), report_text(comparison, {})):
-        assert "astray diverged: it ran to the end" in text
-        assert "broken failed: it could not go on" in text
-        assert "the solve did not converge" in text
+        assert "astray diverged: left the road" in text
+        assert "broken failed: the solve did not converge" in text
 
 
-def test_audit_start_and_facts_are_reported(comparison: Comparison) -> None:
-    for text in (comparison_text(comparison), report_text(comparison, {})):
-        words = " ".join(text.split())
-        assert comparison.findings[0].detail in words
-        assert "not decidable: time-offset, twist-lag: too little change of rotation" in words
-        assert comparison.prior.source in words
-        assert all(fact in words for fact in comparison.sequence.provenance.facts)
+def test_the_report_has_the_audit_the_start_and_the_facts(comparison: Comparison) -> None:
+    words = " ".join(report_text(comparison, {}).split())
+    assert comparison.findings[0].detail in words
+    assert "not decidable: time-offset, twist-lag: too little change of rotation" in words
+    assert comparison.prior.source in words
+    assert all(fact in words for fact in comparison.sequence.provenance.facts)
 
 
-def test_a_warning_of_the_audit_stands_above_the_table_whatever_the_status(comparison: Comparison) -> None:
-    warning = Finding("conflict", 1, False, "vision and odometry disagree at 41-50 s", False, warning=True)
-    for text in (
-        comparison_text(replace(comparison, findings=(warning,))),
-        report_text(replace(comparison, findings=(warning,)), {}),
-    ):
-        above, below = text.split("estimator", 1)
-        assert "with the findings of the audit: conflict" in " ".join(above.split())
-        assert "disagree at 41-50 s" in below
-    assert "findings of the audit:" not in comparison_text(comparison)
+def test_a_warning_of_the_audit_is_a_note_with_its_times(without_truth: Comparison) -> None:
+    start_ns = int(without_truth.sequence.frames_t_ns[0])
+    spans_ns = ((start_ns + 2 * NS_PER_S, start_ns + 5 * NS_PER_S),)
+    warning = Finding("conflict", 1, False, "they disagree", False, warning=True, spans_ns=spans_ns)
+    warned = replace(without_truth, findings=(warning,))
+    for text in (comparison_text(warned), report_text(warned, {})):
+        assert "conflict: vision and the measured motion disagree" in text
+        assert "distrust 2-5 s" in text
+    assert "distrust" not in comparison_text(without_truth)
+
+
+def test_below_the_table_stand_the_verdict_and_the_most_harmful_notes_and_no_more(comparison: Comparison) -> None:
+    below = comparison_text(comparison).split("\n\n")[-1].splitlines()
+    assert below[0].startswith("Nothing to compare") or "steady" in below[0]
+    assert len(below) <= 7
+    assert any("astray diverged" in line for line in below)
+    assert f"{len(list(note_lines(comparison))) - 3} more in report.md" in below[-1] + below[-2]
 
 
 def test_a_recording_without_image_features_says_so(comparison: Comparison) -> None:

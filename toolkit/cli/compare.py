@@ -172,7 +172,8 @@ def compare(options: argparse.Namespace) -> int:
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())
             elif not options.quiet:
-                print_above(f"\nresults: {printable(str(directory))}{found}\n")
+                where = printable(str(directory))
+                print_above(f"results: {where}{found}; as a page: vislam report {shlex.quote(where)}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
 

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from toolkit.experiment.contests import Contest, contests_of
 from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean_nees, quantiles_of_all, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
@@ -301,6 +302,11 @@ class Comparison:
     def lines(self) -> tuple[Row, ...]:
         """The rows to print: a final answer that only repeats the causal one has no line of its own."""
         return tuple(row for row in self.rows if not row.repeats_causal)
+
+    @cached_property
+    def contests(self) -> tuple[Contest, ...]:
+        """What the lines can be ranked by, with tests of whether the first is better by more than chance."""
+        return contests_of(self.lines, self.sequence)
 
     @property
     def all_ok(self) -> bool:

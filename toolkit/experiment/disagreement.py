@@ -1,19 +1,14 @@
-"""Finds estimators of one comparison that contradict the measured motion, which no single run of them can show.
+"""Finds estimators whose trajectory contradicts the measured motion, which no single run of them can show.
 
-An estimator that uses no vision has no innovations: nothing in its run shows wheel slip or a wrong start. Estimators
-that correct the same motion by vision can contradict it in two ways. First, their trajectory may differ from it by
-more than the covariances of both allow. The covariance of the difference is assumed to be the sum of both; it is at
-most that, because estimators of the same motion from the same start share errors, which are then not negatively
-correlated.
-Second, their corrections may have a trend (:mod:`toolkit.metrics.correction_trend`). A difference of two estimates
-shows that one of them is inconsistent, not which (Hausman 1978, "Specification tests in econometrics"). Estimators
-whose corrections can be tested count: where half of them contradict the motion, the estimators that use it alone are
-reported. An estimator that keeps its biases fixed differs from a correct motion by these biases, and does not count.
+Wheel slip or a wrong start show where an estimator that corrects the measured motion by vision differs from one that
+uses it alone by more than the covariances of both allow. The covariance of the difference is assumed to be the sum of
+both; it is at most that, because estimators of the same motion from the same start share errors, which are then not
+negatively correlated. A difference of two estimates shows that one of them is inconsistent, not which (Hausman 1978,
+"Specification tests in econometrics").
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -45,44 +40,19 @@ class FarthestPose(NamedTuple):
     squared: float
 
 
-@dataclass(frozen=True, eq=False)
-class MotionTest:
-    """Estimators that do not correct the measured motion, those that test it, and the evidence against the motion.
+def too_far(rows: Iterable[Row]) -> tuple[FarthestPose, ...]:
+    """Return the rows that are farther from one that corrects nothing than chance allows; none over seeds.
 
-    ``uncorrected`` are the former, ``tested`` those whose corrections can be tested, ``too_far`` the rows
-    that are too far from the motion, ``with_trend`` the estimators whose corrections have a trend.
+    Over seeds no runs are kept.
     """
-
-    uncorrected: tuple[str, ...]
-    tested: tuple[str, ...]
-    too_far: tuple[FarthestPose, ...]
-    with_trend: tuple[str, ...]
-
-    @classmethod
-    def of(cls, rows: Iterable[Row]) -> Self:
-        """Compare the rows of a comparison; over seeds no runs are kept, and ``too_far`` is empty."""
-        rows = [row for row in rows if row.answered]
-        uncorrected = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
-        others = [row for row in rows if row.estimator not in (one.estimator for one in uncorrected)]
-        motion = _trajectory(uncorrected[0]) if uncorrected else None
-        apart = [] if motion is None else [farthest(row, motion) for row in others]
-        return cls(
-            _names(uncorrected),
-            _names(row for row in others if row.value(TREND) is not None),
-            tuple(one for one in apart if one is not None and one.squared > FARTHEST),
-            _names(row for row in others if row.mark == "contradicted"),
-        )
-
-    @property
-    def contradicting(self) -> tuple[str, ...]:
-        """Return the tested estimators that contradict the measured motion."""
-        too_far = {one.row.estimator for one in self.too_far}
-        return tuple(name for name in self.tested if name in too_far or name in self.with_trend)
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Say whether at least half of the tested estimators contradict the motion, and others use it alone."""
-        return bool(self.uncorrected and self.contradicting and 2 * len(self.contradicting) >= len(self.tested))
+    rows = [row for row in rows if row.answered]
+    uncorrected = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
+    motion = _trajectory(uncorrected[0]) if uncorrected else None
+    if motion is None:
+        return ()
+    names = {row.estimator for row in uncorrected}
+    apart = (farthest(row, motion) for row in rows if row.estimator not in names)
+    return tuple(one for one in apart if one is not None and one.squared > FARTHEST)
 
 
 def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
@@ -101,10 +71,6 @@ def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
     t_s = (motion.t_ns[mine][known][k] - motion.t_ns[0]) / NS_PER_S
     distance_m, angle = np.linalg.norm(apart[known][k, POSITION]), np.linalg.norm(apart[known][k, ROTATION])
     return FarthestPose(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
-
-
-def _names(rows: Iterable[Row]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(row.estimator for row in rows))
 
 
 def _trajectory(row: Row) -> Trajectory | None:

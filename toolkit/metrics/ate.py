@@ -58,20 +58,13 @@ METRICS = (
 # start. A straight path leaves the roll undetermined, which then explains nothing.
 _TILTED_DEG, _EXPLAINED = 1.0, 0.5
 _DISAGREE = (
-    "the estimate's vertical and the truth's differ by about {:.0f} deg, which is most of this error and is in "
-    "end_drift_percent too; if the truth's world is not level, compare ate_se3_m"
+    "most of it is a vertical {:.0f} deg off the truth's; if the truth's world is not level, compare ATE SE(3) instead"
 )
-_UNMEASURED = (
-    "without a measured vertical the tilt of the estimator's world, its first frame, against the truth's depends on "
-    "where it begins, and is most of this error; compare ate_se3_m"
-)
+_UNMEASURED = "most of it is the tilt of the first frame, which nothing measured; compare ATE SE(3) instead"
 # A remark is made where the scale is wrong by this share, and positions fit this many times as well with another one.
 _LEAST_SCALE, _TIMES_BETTER = 0.02, 3.0
 _LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "miles": 1609.344, "kilometres": 1000.0}
-_SCALED = (
-    "its positions fit the truth's to {:.3g} m once they are multiplied by {:.4g}{}: another unit, a scale that "
-    "was not observed, or a baseline, focal length or wheels that are off"
-)
+_SCALED = "its positions fit to {:.3g} m when multiplied by {:.4g}{}: check units, baseline, focal length and wheels"
 _ON_A_LINE = "the positions lie on a line or in a point, so the rotation about it is not determined"
 
 

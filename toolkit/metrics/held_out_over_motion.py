@@ -29,8 +29,8 @@ _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
 # with an IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at these runs.
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
-_OF_CAUSAL = ": it corrects itself by as much later, or uses wrong tracks"
-_OF_FINAL = ": its corrections by vision increased the error"
+_OF_CAUSAL = ": look for wrong tracks, or corrections it takes back later"
+_OF_FINAL = ": look for wrong tracks or a wrong calibration"
 METRICS = (
     Metric(
         RATIO,
@@ -130,10 +130,7 @@ def _harm(paired: _Paired, kind: str) -> str:
         notes.append(f"{np.exp(of_stretch[worst][0]):.2g} times at {edges[worst]:.0f}-{edges[worst + 1]:.0f} s")
     if not notes:
         return ""
-    return (
-        f"explains withheld tracks worse than dead reckoning: its reprojection error is {', '.join(notes)} that of "
-        "the measured motion alone"
-    )
+    return f"explains withheld tracks worse than dead reckoning, with {', '.join(notes)} its error"
 
 
 def _mean(values: Array) -> tuple[float, float]:

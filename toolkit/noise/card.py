@@ -67,6 +67,7 @@ class Card:
         return self.weight.correlation > 0.0
 
 
+@np.errstate(all="ignore")  # as in the measurement
 def card_of(sequence: Sequence) -> Card:
     """Return the card of a sequence; raises DataError where it cannot be run or its tracks are too few."""
     check_runnable(sequence)

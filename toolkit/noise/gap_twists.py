@@ -25,6 +25,7 @@ _MOST_SIGMAS = 3.0
 _ROUNDS = 5
 
 
+@np.errstate(all="ignore")  # wild values overflow, and say nothing of a twist
 def with_gap_twists(sequence: Sequence) -> Sequence:
     """Return a recording with measured twists improved in the intervals that no visible track leads across.
 

@@ -35,6 +35,7 @@ class MeasuredNoise:
     why_not: str = ""
 
 
+@np.errstate(all="ignore")  # wild values overflow: their stretch has no solution, or they are outliers
 def measured_noise(sequence: Sequence) -> MeasuredNoise:
     """Return the weight of tracks and the factor on the motion's noise of a recording.
 

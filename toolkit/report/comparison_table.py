@@ -26,10 +26,6 @@ _LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 # The columns of a table: None for the usual ones, "all", or metrics by key or name.
 Columns = None | Literal["all"] | tuple[str, ...]
 _MOTION = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}
-_WITHOUT_TRUTH = (
-    "without ground truth the table shows the reprojection error of tracks that no estimator was given (held-out) "
-    "and the cost, the notes whether innovations fit the covariance; the distance from the true path is unknown"
-)
 
 
 class _Column(NamedTuple):
@@ -167,10 +163,7 @@ def sequence_line(sequence: Sequence) -> str:
 
 
 def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what stands above a table: the recording, pairs and coverage the rows share, the common rules, warnings.
-
-    The warnings are the audit's: they hold for every row, whatever its status.
-    """
+    """Yield what stands above a table: the recording, pairs and coverage the rows share, the common rules."""
     seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
     yield sequence_line(comparison.sequence) + seeds
     shared = ", ".join(shared_values(comparison, columns))
@@ -179,11 +172,6 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
     yield rules_line(comparison)
     if len(comparison.sequence.observations):
         yield noise_line(comparison)
-    warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
-    if warnings:
-        yield f"read every result, whatever its status, with the findings of the audit: {', '.join(warnings)}"
-    if comparison.sequence.truth is None and len(comparison.sequence.observations):
-        yield _WITHOUT_TRUTH
 
 
 def rules_line(comparison: Comparison) -> str:
@@ -196,6 +184,7 @@ def rules_line(comparison: Comparison) -> str:
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outlier_summary(settings.outliers)}"
         f"{'' if settings.noise.bridge_gaps else '; gaps between tracks not bridged'}"
+        f"{'; started from the truth' if settings.start == 'truth' else ''}"
     )
 
 

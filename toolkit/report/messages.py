@@ -1,13 +1,15 @@
 """Messages that explain the numbers: statuses, findings, and the reasons for missing metrics."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from toolkit.audit import Finding
-from toolkit.estimate import STATUS_MEANING
+import numpy as np
+
+from toolkit.audit import Finding, faults
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.disagreement import FARTHEST, FarthestPose, MotionTest
+from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
@@ -15,38 +17,29 @@ from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
 from toolkit.report.table import cell, number
+from toolkit.report.verdict import listed
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
+# What a mark says, and what to do about it.
 _MARK = {
     "overconfident": "overconfident, its errors are larger than its covariance states",
     "timid": "timid, its errors are smaller than its covariance states",
     "heavy-tailed": "heavy-tailed, its innovations have no single covariance",
     "contradicted": "contradicted, the corrections by its tracks have one direction",
 }
-_TAILS = (
-    "; and yet its gate rejected many: most innovations are smaller than stated and some far larger, which no single "
-    "noise of pixels describes"
-)
-# Log lines shown of an estimator: one that recovers in every frame must not hide the rest; metrics.json has its whole
-# log.
-_LOG_ENTRIES = 4
+_REMEDY = {
+    "overconfident": "do not use its covariance",
+    "heavy-tailed": "look for mismatched tracks",
+    "timid": "its covariance is too large",
+}
 
 # Estimators whose difference takes more seeds than these to find count as equal.
 _MOST_SEEDS = 10_000
 
-# Remarks on these stand beside the table, the others at the end of the report only.
+# Remarks on these are notes, the others stand at the end of the report only.
 _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
-_STATUS = {
-    "diverged": (
-        f"diverged: it {STATUS_MEANING['diverged']}. That is a result, not a crash: its scores are those of the whole "
-        "trajectory, and its figure shows where it went."
-    ),
-    "failed": (
-        f"failed: it {STATUS_MEANING['failed']}. What it had estimated until then, if anything, is kept and scored."
-    ),
-}
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
@@ -77,27 +70,48 @@ def outcome(finding: Finding) -> str:
 
 
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what must be known before a table is believed: how runs ended, remarks on errors, what is missing."""
+    """Yield what must be known before a table is believed, the most harmful first.
+
+    First what makes results void: runs that did not end well, faults of the recording, vision that contradicts the
+    motion. Then doubts about an estimator, about its stated uncertainty, about single numbers, and what is missing.
+    """
+    yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
     if not len(comparison.sequence.observations):
         yield _BLIND
-    yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
-    yield from _marks(comparison)
-    yield from _refusals(comparison)
+    yield from _faults(comparison)
+    yield from _far_from_motion(comparison)
     yield from _harm_by_vision(comparison)
-    yield from motion_test_lines(MotionTest.of(comparison.lines))
+    yield from _contradicted(comparison)
+    yield from _refusals(comparison)
     yield from truth_lines(comparison)
+    yield from _marks(comparison)
     yield from missing_lines(comparison, columns)
 
 
 def _ends(comparison: Comparison) -> Iterator[str]:
-    """Yield an explanation of every run that did not end well, and the log of each run."""
+    """Yield an explanation of every run that did not end well."""
+    for outcome in comparison.outcomes:
+        if outcome.status != "ok":
+            yield f"{outcome.estimator} {outcome.status}{f': {outcome.why}' if outcome.why else ''}"
+
+
+def _faults(comparison: Comparison) -> Iterator[str]:
+    """Yield a line for each fault that is left in the recording and may spoil results, with its times."""
+    summaries, elapsed_s = faults(), comparison.sequence.elapsed_s
+    for found in sorted(comparison.findings, key=lambda finding: not finding.blocking):
+        if not (found.blocking or found.warning):
+            continue
+        spans = [elapsed_s(np.array(span)).tolist() for span in found.spans_ns]
+        more = f" (first of {len(spans)})" if spans[1:] else ""
+        when = f"{spans[0][0]:.0f}-{spans[0][1]:.0f} s{more}" if spans else "every result"
+        what = re.split("[,:;]", summaries.get(found.fault, found.detail))[0]
+        yield f"{found.fault}: {what}; distrust {when}"
+
+
+def log_lines(comparison: Comparison) -> Iterator[str]:
+    """Yield what each run had to recover from, and what it measured of the recording, in its own words."""
     for run in comparison.runs:
-        if run.status in _STATUS:
-            yield f"{run.estimator} {_STATUS[run.status]}"
-        for entry in run.log[:_LOG_ENTRIES]:
-            yield f"{run.estimator}: {' '.join(entry.split())}"
-        if len(run.log) > _LOG_ENTRIES:
-            yield f"{run.estimator}: {len(run.log) - _LOG_ENTRIES} more entries are in the log in metrics.json"
+        yield from (f"{run.estimator}: {' '.join(entry.split())}" for entry in run.log)
 
 
 def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
@@ -109,7 +123,7 @@ def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
                 why = f": {bad[0].why}" if bad[0].why else ""
                 yield f"{estimator} {status} under {_seeds(o.seed for o in bad)}{why}"
     if not comparison.all_ok:
-        yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
+        yield "means are over the runs that ended well; seeds.json has every run"
         yield from _medians_of_all(comparison)
 
 
@@ -126,32 +140,31 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
             median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
             listed.append(f"{_name_of(row)} {median} ({ended})")
     if listed:
-        what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
+        what = f"median {metric.name} with bad runs as infinitely bad"
         yield f"{what}: {'; '.join(listed)}"
 
 
+def _contradicted(comparison: Comparison) -> Iterator[str]:
+    """Yield a line for the rows whose corrections have one direction, with their trend and its limit by chance."""
+    rows = [row for row in comparison.lines if row.mark == "contradicted"]
+    found = [(_name_of(row), one) for row in rows if (one := row.consistency) is not None]
+    if found:
+        names, trends = listed(name for name, _ in found), listed(_figure(one.mean) for _, one in found)
+        limit = _figure(max(one.high for _, one in found))
+        yield f"contradicted: tracks push {names} one way, trend {trends} (limit {limit}); check calibration and stamps"
+
+
 def _marks(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each row whose stated uncertainty is marked: by which figure, against which band."""
+    """Yield a line for the rows of each other mark: by which figures, against which band."""
+    by_band: dict[tuple[str, str, str], list[tuple[Row, str]]] = {}
     for row in comparison.lines:
         found = row.consistency
-        if found is not None and row.mark:
-            name = metrics_called((found.metric,))[0].name
-            if row.mark == "contradicted":
-                yield f"{_name_of(row)} is contradicted: {_trend_text(found.mean, found.high)}"
-                continue
-            yield (
-                f"{_name_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
-                f"{_figure(found.high)} contains 95 % of consistent estimators however correlated their errors"
-                f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
-            )
-
-
-def _trend_text(trend: float, limit: float) -> str:
-    return (
-        f"the corrections by its tracks have one direction, {_figure(trend)} times as large (squared) as its "
-        f"covariance and the measured motion allow, by chance at most {_figure(limit)}; look for an error that all "
-        "tracks share, as of calibration, motion or time stamps"
-    )
+        if found is not None and row.mark in _REMEDY:
+            name, band = metrics_called((found.metric,))[0].name, f"{_figure(found.low)} to {_figure(found.high)}"
+            by_band.setdefault((row.mark, name, band), []).append((row, _figure(found.mean)))
+    for (mark, name, band), marked in sorted(by_band.items(), key=lambda item: list(_REMEDY).index(item[0][0])):
+        names, values = listed(_name_of(row) for row, _ in marked), listed(value for _, value in marked)
+        yield f"{mark}: {names}, {name} {values} (consistent: {band}); {_REMEDY[mark]}"
 
 
 def _refusals(comparison: Comparison) -> Iterator[str]:
@@ -159,11 +172,8 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
     accepted = {row.estimator: row.value(ACCEPTED) for row in comparison.rows if row.output == "causal"}
     refused = {name: 100.0 - share for name, share in accepted.items() if share is not None and refuses_much(share)}
     if refused:
-        listed = ", ".join(f"{name} {share:.0f} %" for name, share in refused.items())
-        yield (
-            f"the outlier gate rejected many of the measurements it tested ({listed}): many mismatches, or a wrong "
-            "model of calibration, time stamps or noise"
-        )
+        given = listed(f"{name} {share:.0f} %" for name, share in refused.items())
+        yield f"the outlier gate rejected much ({given}): look for mismatches, or a wrong calibration or noise"
 
 
 def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
@@ -177,25 +187,17 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
             yield f"{_name_of(row)} {harmed[0][1]}"
 
 
-def motion_test_lines(test: MotionTest) -> Iterator[str]:
-    """Yield a line for estimators too far from the measured motion, and one for those that use it alone."""
-    if test.too_far:
-        listed = "; ".join(f"{_name_of(one.row)} by {_distance_text(one)}" for one in test.too_far)
+def _far_from_motion(comparison: Comparison) -> Iterator[str]:
+    """Yield a line on the estimator that is farthest from the measured motion, where any is too far."""
+    found = too_far(comparison.lines)
+    if found:
+        worst = max(found, key=lambda one: one.squared)
+        apart = f"{_figure(worst.distance_m)} m and {_figure(worst.angle_deg)} deg apart at {worst.t_s:.0f} s"
+        more = f" (and {len(found) - 1} more)" if found[1:] else ""
         yield (
-            "vision and the measured motion alone disagree: their estimates differ by more than their covariances "
-            f"allow, which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
+            f"{_name_of(worst.row)}{more} and the measured motion disagree, {apart}: look for slip, moving objects or "
+            "a wrong calibration"
         )
-    if test.is_contradicted:
-        names, count = ", ".join(test.contradicting), f"{len(test.contradicting)} of {len(test.tested)}"
-        yield (
-            f"{', '.join(test.uncorrected)}: uses only the measured motion and the start, which {count} that "
-            f"correct it by vision contradict ({names})"
-        )
-
-
-def _distance_text(one: FarthestPose) -> str:
-    apart = f"{_figure(one.distance_m)} m and {_figure(one.angle_deg)} deg"
-    return f"{apart} at {one.t_s:.0f} s, {_figure(one.squared)} times"
 
 
 def _remark_on(key: str, scored: Scored | None) -> str:
@@ -211,9 +213,9 @@ def _name_of(row: Row) -> str:
 
 
 def _seeds(seeds: Iterable[int]) -> str:
-    """Name seeds: "seed 3", "seeds 3, 5"."""
+    """Name seeds: "seed 3", "seeds 3 and 5"."""
     given = list(map(str, seeds))
-    return f"seed{'s' if len(given) > 1 else ''} {', '.join(given)}"
+    return f"seed{'s' if len(given) > 1 else ''} {listed(given)}"
 
 
 def _figure(value: float) -> str:
@@ -308,7 +310,7 @@ def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[s
         for reason, affected in by_reason.items():
             empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
     for (whose, reason), names in empty.items():
-        yield f"no {', '.join(names)}{whose}: {reason}"
+        yield f"no {listed(names)}{whose}: {reason}"
     for name, why in unavailable().items():
         yield f"the metrics of {name} are unavailable: {why}"
 

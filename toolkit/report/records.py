@@ -16,6 +16,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.estimate import Output
+from toolkit.experiment.contests import Question
 from toolkit.files.documents import read
 from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
 from toolkit.report.manifest import Manifest
@@ -220,10 +221,41 @@ class AuditMessage(Struct, frozen=True, kw_only=True):
     detail: str
 
 
+class Rival(Struct, frozen=True, kw_only=True):
+    """A row of a contest; of the first one, its advantage is null."""
+
+    estimator: str
+    output: Output
+    value: Annotated[float, Meta(description="of the metric; over seeds the mean")]
+    ratio: Annotated[float | None, Meta(description="how many times as much it drifts, or errs, as the first")]
+    interval: Annotated[tuple[float, float] | None, Meta(description="99 % of the ratio; null with too few data")]
+
+
+class ContestRecord(Struct, frozen=True, kw_only=True):
+    """Rows ranked by an error, and whether any is better than all others by more than chance."""
+
+    question: Question
+    metric: Annotated[str, Meta(description="key of the error they are ranked by")]
+    by: Annotated[str, Meta(description="what the test is over: stretches of the path or of time, or seeds")]
+    rivals: Annotated[tuple[Rival, ...], Meta(description="from the least error up")]
+    leaders: Annotated[tuple[str, ...], Meta(description="estimators that may be the best; one where it is decided")]
+    winner: Annotated[
+        str | None, Meta(description="the only leader, unless its stated uncertainty is marked; else null")
+    ]
+
+
+VerdictText = Annotated[str, Meta(description="in words; absent before it was added")] | UnsetType
+Contests = (
+    Annotated[tuple[ContestRecord, ...], Meta(description="who wins, or that nobody does; absent before it was added")]
+    | UnsetType
+)
+
+
 class Messages(Struct, frozen=True, kw_only=True):
     """What the report says."""
 
     sequence: Annotated[str, Meta(description="the recording in a line")]
+    verdict: VerdictText = UNSET
     notes: tuple[str, ...]
     remarks: tuple[str, ...]
     start: str
@@ -249,6 +281,7 @@ class Report(Struct, frozen=True, kw_only=True):
     frames: Annotated[
         tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
     ] = UNSET
+    contests: Contests = UNSET
 
 
 class MeanNeesSeries(_Columns, frozen=True, kw_only=True):
@@ -274,6 +307,10 @@ class SeedsMessages(Struct, frozen=True, kw_only=True):
     """What the report over seeds says."""
 
     sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
+    verdict: VerdictText = UNSET
+    pairs: Annotated[
+        tuple[str, ...] | UnsetType, Meta(description="how each differs from the best; absent before it was added")
+    ] = UNSET
     notes: tuple[str, ...]
     verdicts: Annotated[tuple[str, ...], Meta(description="which estimators are overconfident")]
     start: str
@@ -286,6 +323,7 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
     t_s: Annotated[Times, Meta(description="of the frames")]
     runs: Annotated[tuple[DrawnOverSeeds, ...], Meta(description="one for each of seeds.json, in its order")]
     words: SeedsMessages
+    contests: Contests = UNSET
 
     def __post_init__(self) -> None:
         for i, run in enumerate(self.runs):

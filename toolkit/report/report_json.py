@@ -8,6 +8,7 @@ from msgspec import UNSET, UnsetType
 
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.experiment.contests import Contest
 from toolkit.files.documents import number, numbers, of_attributes, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
@@ -30,12 +31,14 @@ from toolkit.report.messages import (
     consistency_lines,
     note_lines,
     outcome,
+    paired_lines,
     remark_lines,
 )
 from toolkit.report.records import (
     AuditMessage,
     CameraFrame,
     ComponentSeries,
+    ContestRecord,
     DrawnMap,
     DrawnOverSeeds,
     DrawnRun,
@@ -46,11 +49,13 @@ from toolkit.report.records import (
     NeesSeries,
     NisSeries,
     Report,
+    Rival,
     SeedsMessages,
     SeedsReport,
     StepTimes,
     Vector,
 )
+from toolkit.report.verdict import verdict
 from toolkit.sequence import Sequence
 
 TRUTH_FILE = "trajectories/truth.tum"
@@ -84,6 +89,7 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         words=_messages(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
         frames=frames or UNSET,
+        contests=tuple(_contest(one) for one in comparison.contests),
     )
 
 
@@ -95,10 +101,34 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
         runs=tuple(_over_seeds(group) for group in over.rows),
         words=SeedsMessages(
             sequence="; ".join(header_lines(over)),
+            verdict=verdict(over),
+            pairs=tuple(paired_lines(over)),
             notes=tuple(note_lines(over)),
             verdicts=tuple(consistency_lines(over)),
             start=over.prior.source,
         ),
+        contests=tuple(_contest(one) for one in over.contests),
+    )
+
+
+def _contest(contest: Contest) -> ContestRecord:
+    found = (None, *contest.advantages)
+    return ContestRecord(
+        question=contest.question,
+        metric=contest.metric,
+        by=next((one.parts for one in contest.advantages if one is not None), "nothing: too few data"),
+        rivals=tuple(
+            Rival(
+                estimator=row.estimator,
+                output=row.output,
+                value=row.value(contest.metric) or 0.0,
+                ratio=None if one is None else rounded(one.ratio),
+                interval=None if one is None else (rounded(one.low), rounded(one.high)),
+            )
+            for row, one in zip(contest.rows, found, strict=True)
+        ),
+        leaders=tuple(row.estimator for row in contest.leaders),
+        winner=None if contest.winner is None else contest.winner.estimator,
     )
 
 
@@ -117,6 +147,7 @@ def _same_line(row: Row, other: Row) -> bool:
 def _messages(comparison: Comparison) -> Messages:
     return Messages(
         sequence=f"{sequence_line(comparison.sequence)}; {noise_line(comparison)}",
+        verdict=verdict(comparison),
         notes=tuple(note_lines(comparison)),
         remarks=tuple(remark_lines(comparison)),
         start=comparison.prior.source,

@@ -7,8 +7,6 @@ draw white noise alone, and most estimators assume it.
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from toolkit.arrays import freeze_arrays
 from toolkit.geometry import Array
 
@@ -29,20 +27,6 @@ class TrackNoise:
     def __post_init__(self) -> None:
         freeze_arrays(self, white_px=(3,), walk_px=(3,), offset_px=(3,))
 
-    @property
-    def is_correlated(self) -> bool:
-        """Say whether the errors of a track are correlated at all."""
-        return bool(self.walk_px.any() or self.offset_px.any())
-
     def scaled(self, factor: float) -> "TrackNoise":
         """Return the noise with all its standard deviations multiplied."""
         return TrackNoise(factor * self.white_px, factor * self.walk_px, factor * self.offset_px)
-
-    def cov(self, ages: Array) -> Array:
-        """Return the covariance (..., 3, n, n) px^2, a channel each, of sightings of a track with ages (..., n) frames.
-
-        The age of a sighting is the number of frames since the track's first one.
-        """
-        younger = np.minimum(ages[..., :, None], ages[..., None, :])[..., None, :, :]
-        white, walk, offset = (sd[:, None, None] ** 2 for sd in (self.white_px, self.walk_px, self.offset_px))
-        return np.asarray(white * np.eye(ages.shape[-1]) + walk * younger + offset)

@@ -1,95 +1,95 @@
-"""The answers a reader looks for first: the most accurate estimator, the most consistent one, the fastest one."""
+"""The answers a reader looks for first, as cards: who is most accurate, whose uncertainty to trust, who is fastest.
 
-import math
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+A card names a winner only where the run directory's contests do; a row with a mark wins nothing.
+"""
 
-# Rows that answered less than the best by more than this are left out: their errors are of a part of the recording.
-_COVERAGE_MARGIN_PERCENT = 5.0
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from toolkit.metrics import metrics_called
+from toolkit.report.records import ContestRecord, Rival
+from toolkit.report.verdict import listed, short
 
 Row = dict[str, Any]
+_TITLES = {
+    "accuracy at each frame": "Most accurate at each frame (causal)",
+    "accuracy in the end": "Most accurate in the end (final)",
+    "withheld tracks": "Best on withheld tracks",
+}
+_UNDECIDED = "no clear winner"
+_COST = "frame_cpu_ms_mean"
+# The processor time of one run scatters: nobody is called faster by less than this factor.
+_FASTER = 1.5
 
 
-class _Question(NamedTuple):
-    """A question: its text, the outputs it is about, its metric (the first that any row has), unit, and answer.
+def highlights(contests: Sequence[ContestRecord], rows: Sequence[Row], runs: str) -> list[dict[str, str | None]]:
+    """Return a card for each question: its text, the answer, the answer's row or None, the figures and the next.
 
-    A ``contest`` has no answer where only one estimator has the metric.
+    ``rows`` are those of the page's table; ``runs`` says over how many runs a contest is, as in "one run".
     """
-
-    question_text: str
-    outputs: tuple[str, ...]
-    keys: tuple[str, ...]
-    unit: str
-    answer_text: Callable[[str, float], str]
-    distance: Callable[[float], float] = abs
-    contest: bool = False
+    return [*(_of_contest(contest, rows, runs) for contest in contests), *_uncertainty(rows), *_fastest(rows)]
 
 
-def _from_one(value: float) -> float:
-    return abs(math.log(value)) if value > 0.0 else math.inf
+def _card(question: str, answer: str, detail: str, after: str = "", row: Row | None = None) -> dict[str, str | None]:
+    return {
+        "question": question,
+        "answer": answer,
+        "row": None if row is None else row["id"],
+        "detail": detail,
+        "next": after,
+    }
 
 
-def _short(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}" if abs(value) < 1e6 else f"{value:.0e}"
+def _of_contest(contest: ContestRecord, rows: Sequence[Row], runs: str) -> dict[str, str | None]:
+    first, second = contest.rivals[:2]
+    question, row = _TITLES[contest.question], _row_of(first, rows)
+    after = f"{_figure(second, contest)}, {second.estimator}{_how_much(second, contest)}"
+    if contest.winner is not None:
+        return _card(question, first.estimator, _figure(first, contest), f"next: {after}", row)
+    if len(contest.leaders) == 1:
+        mark = "" if row is None else row["mark"]
+        leads = f"{first.estimator} leads with {_figure(first, contest)}, but is {mark}"
+        return _card(question, "no winner", leads, f"next: {after}")
+    last = next(one for one in reversed(contest.rivals) if one.estimator in contest.leaders)
+    apart = 100.0 * (last.value / first.value - 1.0) if first.value else 0.0
+    return _card(question, _UNDECIDED, f"{listed(contest.leaders)}: {short(apart, 2)} % apart, {runs}", after)
 
 
-def _error(key: str, value: float) -> str:
-    return f"{_short(value)} m ATE, {'yaw and position' if key == 'ate_yaw_m' else 'SE(3)'} aligned"
+def _figure(rival: Rival, contest: ContestRecord) -> str:
+    known = metrics_called((contest.metric,))[0]
+    return f"{short(rival.value)} {known.unit} {known.column}"
 
 
-def _held_out(_: str, value: float) -> str:
-    return f"{_short(value)} px off the median withheld sighting"
+def _how_much(rival: Rival, contest: ContestRecord) -> str:
+    if rival.ratio is None or rival.interval is None:
+        return ""
+    low, high = map(short, rival.interval)
+    return f"; {short(rival.ratio)} times as much (99 %: {low} to {high}) over {contest.by}"
 
 
-def _consistency(_: str, value: float) -> str:
-    return f"mean pose NEES {_short(value)}; 1 is consistent, more is overconfident"
+def _row_of(rival: Rival, rows: Sequence[Row]) -> Row | None:
+    outputs = (rival.output, "both")
+    return next((row for row in rows if row["estimator"] == rival.estimator and row["output"] in outputs), None)
 
 
-def _time(_: str, value: float) -> str:
-    return f"{_short(value)} s for the whole recording"
+def _uncertainty(rows: Sequence[Row]) -> Iterator[dict[str, str | None]]:
+    """Yield whose stated uncertainty can be trusted, where any is tested; that is no contest."""
+    tested = [row for row in rows if row["judged"]]
+    if tested:
+        sound = [row["estimator"] for row in tested if not row["mark"] and row["good"]]
+        marked = [f"{row['estimator']} is {row['mark']}" for row in tested if row["mark"]]
+        yield _card("Stated uncertainty to trust", listed(sound) if sound else "nobody's", listed(marked))
 
 
-def highlights(rows: list[Row], motion: str) -> list[dict[str, str]]:
-    """Return question, answer (the estimator), its figure and the runner-up, for what the rows have figures for.
-
-    Only runs that ended well and answered for as much of the recording as the best one can be an answer.
-    """
-    ate = ("ate_yaw_m",) if motion == "imu" else ("ate_se3_m",)
-    everyone = ("causal", "both", "final")
-    questions = (
-        _Question("Most accurate at each frame (causal)", ("causal", "both"), ate, " m", _error),
-        _Question("Most accurate in the end (final)", ("final", "both"), ate, " m", _error),
-        _Question("Best on withheld tracks", everyone, ("heldout_reproj_median_px",), " px", _held_out),
-        _Question("Best stated uncertainty", everyone, ("nees_pose_mean",), "", _consistency, _from_one, contest=True),
-        _Question("Fastest", everyone, ("total_s",), " s", _time),
-    )
-    eligible = list(_eligible(rows))
-    return [answer for question in questions if (answer := _answer(question, eligible)) is not None]
-
-
-def _eligible(rows: list[Row]) -> Iterator[Row]:
-    good = [row for row in rows if row["status"] == "ok"]
-    most = max((row["metrics"].get("coverage_percent") or 0.0 for row in good), default=0.0)
-    for row in good:
-        if (row["metrics"].get("coverage_percent") or 0.0) >= most - _COVERAGE_MARGIN_PERCENT:
-            yield row
-
-
-def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
-    scored = [row for row in rows if row["output"] in question.outputs]
-    for key in question.keys:
-        given = [(row, row["metrics"][key]) for row in scored if row["metrics"].get(key) is not None]
-        ranked = sorted(given, key=lambda pair: question.distance(pair[1]))
-        if ranked:
-            (best, value), *others = ranked
-            if question.contest and len({row["estimator"] for row, _ in given}) < 2:
-                return None
-            after = next(((row, v) for row, v in others if row["estimator"] != best["estimator"]), None)
-            return {
-                "question": question.question_text,
-                "answer": best["estimator"],
-                "row": best["id"],
-                "detail": question.answer_text(key, value),
-                "next": "" if after is None else f"next: {after[0]['estimator']}, {_short(after[1])}{question.unit}",
-            }
-    return None
+def _fastest(rows: Sequence[Row]) -> Iterator[dict[str, str | None]]:
+    """Yield who takes the least processor time, of the rows that ended well without a mark."""
+    able = [row for row in rows if row["good"] and not row["mark"] and row["metrics"].get(_COST) is not None]
+    cost_of: dict[str, float] = {row["estimator"]: row["metrics"][_COST] for row in able}
+    if len(cost_of) < 2:
+        return
+    (name, cost), (other, next_cost), *_ = sorted(cost_of.items(), key=lambda pair: pair[1])
+    figures = f"{short(cost)} ms of processor time a frame", f"next: {other}, {short(next_cost)} ms"
+    if next_cost >= _FASTER * cost:
+        yield _card("Fastest", name, *figures, next(row for row in able if row["estimator"] == name))
+    else:
+        yield _card("Fastest", _UNDECIDED, f"{name} and {other}", figures[1])

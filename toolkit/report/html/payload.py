@@ -77,7 +77,7 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
         "card": [] if report.card is UNSET else report.card.words,
         "alignment": report.alignment,
         "error": to_builtins(report.error),
-        "highlights": highlights(rows, sequence.motion),
+        "highlights": highlights(report.contests or (), rows, "one run"),
         "rows": rows,
         "truth": None if report.truth is None else _drawn(files.tracks[report.truth]),
         "maps": [_map(one, files, rows) for one in report.maps],
@@ -134,6 +134,8 @@ def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
                 "output": "both" if name in repeated else run.output,
                 "status": run.status,
                 "mark": mark_of(run.consistency),
+                "judged": run.consistency is not UNSET,
+                "good": run.status == "ok",
                 "colour": colours[name],
                 "change": changes.get(name, ""),
                 "metrics": run.metrics,
@@ -249,14 +251,16 @@ def _undeclared(key: str) -> dict[str, Any]:
 
 def seeds_case(files: SeedsFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
     """Return what the page shows of one directory of a comparison over seeds."""
+    rows, seeds = _rows_over_seeds(files, case_id, colours), files.scores.seeds
     return {
         "kind": "seeds",
         "id": case_id,
         "title": title,
         "sequence": asdict(files.scores.sequence),
-        "seeds": files.scores.seeds,
-        "words": asdict(files.report.words),
-        "rows": _rows_over_seeds(files, case_id, colours),
+        "seeds": seeds,
+        "words": to_builtins(files.report.words),
+        "highlights": highlights(files.report.contests or (), rows, f"{len(seeds)} seeds"),
+        "rows": rows,
         "manifest": to_builtins(files.manifest),
     }
 
@@ -274,6 +278,8 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
                 "output": run.output,
                 "status": _status(run),
                 "mark": mark_of(run.consistency),
+                "judged": run.consistency is not UNSET,
+                "good": run.counts["ok"] == len(run.status),
                 "colour": colours[run.estimator],
                 "change": "" if run.change is UNSET else run.change,
                 "metrics": {key: metric.mean for key, metric in run.metrics.items()},

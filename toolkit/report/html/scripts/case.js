@@ -7,7 +7,11 @@ function caseSection(one) {
 /** What is said of a case before any figure: what was recorded, what went wrong, and the answers looked for first. */
 function glance(one) {
   const [name, ...rest] = one.words.sequence.split(": ");
-  return [el("p", { class: "lead", text: rest.length ? rest.join(": ") : name }), troubles(one), highlightTiles(one)];
+  const { verdict } = one.words;
+  return [
+    el("p", { class: "lead", text: rest.length ? rest.join(": ") : name }), troubles(one),
+    verdict ? el("p", { class: "verdict", text: verdict }) : null, highlightTiles(one),
+  ];
 }
 
 /** Say in words, before any figure, who did not end well. */
@@ -22,8 +26,9 @@ function highlightTiles(one) {
   if (!one.highlights?.length) return null;
   return el("div", { class: "tiles" }, one.highlights.map((tile) => {
     const row = one.rows.find((other) => other.id === tile.row);
-    return el("div", { class: "tile", onpointerenter: () => pointAt(keyOf(row)), onpointerleave: () => pointAt(null) },
-      el("span", { class: "question", text: tile.question }), el("b", {}, swatch(row), tile.answer),
+    const pointing = row ? { onpointerenter: () => pointAt(keyOf(row)), onpointerleave: () => pointAt(null) } : {};
+    return el("div", { class: "tile", ...pointing },
+      el("span", { class: "question", text: tile.question }), el("b", {}, row ? swatch(row) : null, tile.answer),
       el("span", { text: tile.detail }), el("span", { class: "fine", text: tile.next }));
   }));
 }
