@@ -258,7 +258,7 @@ class Isam2Tree:
         if not self._retires or self._factorization == "QR" or not is_time:
             return []
         unused = self._frozen.unused_for(RETIRED_AFTER_FRAMES)
-        # A gap bridge ties poses for longer than biases. A bias leaving alone would take its pose's factors along.
+        # Tracks use poses for longer than biases. A bias leaving alone would take its pose's factors along.
         stay = {key for keys in self._recent if not set(keys).issubset(unused) for key in keys}
         return [key for key in unused if key not in stay and self.has(key)]
 

@@ -23,7 +23,7 @@ from toolkit.sequence import StereoRig
 # 0.01 for the rest made a flight of two minutes five times less accurate.
 ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
 POSITION_THRESHOLD_BASELINES = 0.3
-# In sigmas of a sighting; linearised sightings of a chain are renewed beyond a tenth of a sigma, too.
+# In sigmas of a sighting.
 LANDMARK_BEYOND_SIGMA = 0.1
 
 

@@ -8,6 +8,7 @@ import pytest
 from toolkit.cli import main
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.files.documents import to_line
 from toolkit.noise import card_of, measured_noise
@@ -92,7 +93,8 @@ def test_the_command_refuses_a_recording_without_tracks_in_one_line(capsys: pyte
     assert "4 frames are too few" in capsys.readouterr().err
 
 
-def compared(sequence: Sequence, settings: Settings = Settings(card=True)):  # noqa: B008 - it cannot be changed
+def compared(sequence: Sequence, card: bool = True) -> Comparison:
+    settings = Settings(card=card)
     return run(Plan((sequence,), ("dead-reckoning",), settings=settings, workers=1))[0]
 
 
@@ -108,7 +110,7 @@ def test_a_report_and_its_page_have_the_card_on_request(walking: Sequence, tmp_p
 
 
 def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:
-    comparison = compared(walking.truncated(20), Settings())
+    comparison = compared(walking.truncated(20), card=False)
     assert comparison.card is None
     assert '"card"' not in to_line(report_document(comparison))
 
