@@ -31,6 +31,7 @@ __all__ = [
     "contract_keys",
     "describe",
     "evaluate",
+    "is_on_request",
     "known_metrics",
     "metrics_called",
     "repeated",
@@ -41,6 +42,7 @@ __all__ = [
 ]
 
 ENTRY_POINT_GROUP = "toolkit.metrics"
+_ON_REQUEST = "computed on request"
 
 
 class MetricFile(Protocol):
@@ -230,8 +232,13 @@ def _causal_only(file: MetricFile) -> str:
     return str(getattr(file, "CAUSAL_ONLY", ""))
 
 
+def is_on_request(reason: str) -> bool:
+    """Say whether a value is missing because nobody asked for it."""
+    return reason.startswith(_ON_REQUEST)
+
+
 def _how_to_request(switch: str) -> str:
-    return f"computed on request: --set metrics.{switch}=true"
+    return f"{_ON_REQUEST}: --set metrics.{switch}=true"
 
 
 def _on_request(file: MetricFile) -> str:

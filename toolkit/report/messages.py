@@ -12,7 +12,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
-from toolkit.metrics import Metric, metrics_called, unavailable
+from toolkit.metrics import Metric, is_on_request, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
@@ -305,7 +305,7 @@ def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[s
     for metric in explained_metrics(comparison, columns):
         by_reason: dict[str, list[Row]] = {}
         for row in rows:
-            if row.value(metric.key) is None:
+            if row.value(metric.key) is None and not is_on_request(row.reason(metric.key)):
                 by_reason.setdefault(row.reason(metric.key), []).append(row)
         for reason, affected in by_reason.items():
             empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
