@@ -112,10 +112,10 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         whole = _with_pixel_noise(audited.sequence, recording.noise.pixel_sigma_px)
         if whole is not audited.sequence:
             audited = _audited_with_its_noise(audited, _cut(whole, recording))
-        whole, measured = _with_measured_noise(whole, recording)
         card = None
         if recording.card:
             whole, card = _with_card(whole, _cut(whole, recording))
+        whole, measured = _with_measured_noise(whole, recording)
         used = _cut(whole, recording)
         used = with_gap_twists(used) if recording.noise.bridge_gaps else used
         sequence = _within_budget(used, recording.tracks.budget)
