@@ -22,7 +22,8 @@ from toolkit.metrics.parts.association import Matched
 
 # Stretches a path is divided into, at most; with fewer than the second number nothing is tested.
 MOST_STRETCHES, FEWEST_STRETCHES = 40, 10
-# 99 % intervals: on pairs of runs that differ by their noise alone at most one in 20 names a winner (docs/metrics.md).
+# 99 % intervals. Where an error is nearly one draw for the whole run, as of ekf with an IMU, they are too narrow: there
+# one in six pairs of runs that differ by noise alone is called clear (docs/metrics.md).
 CONFIDENCE = 0.99
 # Degrees of freedom that the estimate of their number uses up: a drift that keeps one direction has not three, but one.
 _USED_UP, _LEAST_DOF = 2.0, 0.5

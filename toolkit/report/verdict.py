@@ -66,6 +66,8 @@ def _accuracy(contest: Contest, over_seeds: bool) -> str:
     """Say who is most accurate, or that nobody is by more than chance, and how much worse another is."""
     first, leaders = contest.rows[0], contest.leaders
     name = metrics_called((contest.metric,))[0].column
+    if len(leaders) == 1 and first.mark:
+        return f"No winner: {first.estimator} leads ({name} {_with_unit(contest, first)}) but is {first.mark}."
     if len(leaders) == 1:
         claim = "predicts withheld tracks best" if contest.metric == HELD_OUT else "is most accurate"
         opening = f"{first.estimator} {claim} ({name} {_with_unit(contest, first)}"
