@@ -6,7 +6,7 @@ from all of them and serves the held-out reprojection error.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -309,7 +309,10 @@ class Sequence:
 
         With ``digits``, of the same rounded (:func:`toolkit.arrays.content_digest`).
         """
-        seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
+        rig = [getattr(self.rig, each.name) for each in fields(self.rig)]
+        # A weight of 1 does not change a hash: baselines of before there was one stay comparable.
+        rig[-1] = None if self.rig.track_weight == 1.0 else self.rig.track_weight
+        seen = (self.frames_t_ns, self.gravity_world, *rig, self.noise, self.observations, self.motion)
         further = filter(None, (self.bridges, self.gap_twists, self.track_budget))
         return content_digest((*seen, self.truth, self.prior, *further), digits)
 
