@@ -118,4 +118,4 @@ def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:
 def test_a_card_that_cannot_be_had_costs_a_comparison_nothing_and_is_told(walking: Sequence) -> None:
     comparison = compared(walking.truncated(4))
     assert (comparison.card, comparison.runs[0].status) == (None, "ok")
-    assert "no card of its tracks: " in comparison_text(comparison, width=None)
+    assert "no card of its tracks: " in report_text(comparison, {})
