@@ -71,7 +71,6 @@ def test_a_wrong_setting_is_refused_in_one_line_that_names_it(given: dict[str, o
         ("noise.match_imu", "noise.motion_scale"),
         ("noise.track_fit_s", "noise.measured_s"),
         ("noise.disparity_scale", "vision-scale"),
-        ("tracks.leave_out_moving", "outlier policy"),
     ],
 )
 def test_a_setting_of_an_earlier_version_is_answered_with_what_there_is_now(key: str, now: str) -> None:

@@ -22,13 +22,21 @@ COVERED = replace(WALKING, value=1.0, error=0.0)
 @pytest.mark.parametrize(
     ("measured", "settings", "words"),
     [
-        (MeasuredNoise(WALKING), Noise(), ("tracks count 0.05 +- 0.01", "0.92", "odometry as stated", "the recording")),
-        (MeasuredNoise(COVERED), Noise(), ("count in full", "0.92", "smaller than stated")),
+        (
+            MeasuredNoise(WALKING),
+            Noise(),
+            ("0.05 +- 0.01 of its information", "0.92", "odometry as stated", "the recording"),
+        ),
+        (MeasuredNoise(COVERED), Noise(), ("in full", "0.92", "smaller than stated")),
         (MeasuredNoise(motion=MotionScale(5.0, 0.3, 20.0)), Noise(), ("white", "odometry 5 +- 0.3 times as noisy")),
         (MeasuredNoise(WALKING), Noise(measured_s=30.0), ("0.05 +- 0.01", "first 30 s")),
-        (MeasuredNoise(), Noise(track_weight=0.2), ("count 1, as set", "odometry as stated")),
+        (MeasuredNoise(), Noise(track_weight=0.2), ("at 1 of its information, as set", "odometry as stated")),
         (MeasuredNoise(why_not="3 frames are too few"), Noise(), ("not measured: 3 frames are too few",)),
-        (None, Noise(track_weight=1.0, motion_scale=2.0), ("count 1, as set", "2 times as noisy as stated, as set")),
+        (
+            None,
+            Noise(track_weight=1.0, motion_scale=2.0),
+            ("at 1 of its information, as set", "2 times as noisy as stated, as set"),
+        ),
     ],
 )
 def test_the_noise_that_all_estimators_assumed_is_said_with_its_source(

@@ -15,6 +15,7 @@ from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.noise import Card, MeasuredNoise, card_of, measured_noise, with_gap_twists
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
@@ -120,6 +121,8 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         used = with_gap_twists(used) if recording.noise.bridge_gaps else used
         sequence = _within_budget(used, recording.tracks.budget)
         prior = STARTS[recording.start](sequence)
+        if recording.tracks.leave_out_moving:
+            sequence = _within_budget(_without_moving_tracks(used, prior), recording.tracks.budget)
         findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
         return Prepared(sequence, findings, prior, whole, audited.undecided, measured, card)
 
@@ -286,6 +289,20 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
     fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
     facts = (*sequence.provenance.facts, fact)
     return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
+
+
+def _without_moving_tracks(sequence: Sequence, prior: Prior) -> Sequence:
+    """Return the sequence without the sightings that move against the rest, recorded in the facts."""
+    at_rest, counts = without_moving_tracks(sequence, prior)
+    fact = (
+        f"not given to estimators, because they contradict the motion and most other tracks (tracks.leave_out_moving): "
+        f"{counts.sightings / max(counts.of_sightings, 1):.1%} of the sightings, of {counts.tracks} of "
+        f"{counts.of_tracks} tracks"
+    )
+    if counts.undecided_frames:
+        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to decide"
+    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
+    return replace(at_rest, provenance=provenance)
 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:

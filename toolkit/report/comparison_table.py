@@ -198,7 +198,7 @@ def noise_line(comparison: Comparison) -> str:
         ("", "") if measured is None else (_tracks_measured(measured.tracks), _scale_measured(measured.motion))
     )
     if settings.track_weight != "auto":
-        tracks = f"tracks count {rig.track_weight:.2g}, as set"
+        tracks = f"each counted at {rig.track_weight:.2g} of its information, as set"
     if settings.motion_scale != "auto":
         motion = f"{settings.motion_scale:.3g} times as noisy as stated, as set"
     line = (
@@ -218,8 +218,8 @@ def _tracks_measured(weight: TrackWeight) -> str:
         return "white along tracks"
     along = f"errors along tracks correlated, {weight.correlation:.2f} from frame to frame"
     if weight.value == 1.0:
-        return f"tracks count in full ({along}, but smaller than stated)"
-    return f"tracks count {weight.value:.2g} +- {weight.error:.1g} ({along})"
+        return f"each counted in full ({along}, but smaller than stated)"
+    return f"each counted at {weight.value:.2g} +- {weight.error:.1g} of its information ({along})"
 
 
 def _scale_measured(scale: MotionScale) -> str:

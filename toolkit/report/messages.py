@@ -31,7 +31,7 @@ _MARK = {
 _REMEDY = {
     "overconfident": "do not use its covariance",
     "heavy-tailed": "look for mismatched tracks",
-    "timid": "its covariance is too large",
+    "timid": "its covariance, or the stated noise, is too large",
 }
 
 # Estimators whose difference takes more seeds than these to find count as equal.

@@ -30,7 +30,6 @@ _GONE = {
     "noise.match_imu": "the IMU's noise is measured once for all estimators; noise.motion_scale sets it",
     "noise.track_fit_s": "noise.measured_s is the length of the beginning on which noise is measured",
     "noise.disparity_scale": "no estimator has such a state any more; the audit's vision-scale reports a scale",
-    "tracks.leave_out_moving": "no tracks are left out any more; the outlier policy weighs them",
 }
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 

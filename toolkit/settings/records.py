@@ -199,6 +199,9 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
+    leave_out_moving: Annotated[
+        bool, _setting("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
+    ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
