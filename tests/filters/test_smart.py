@@ -13,7 +13,7 @@ from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
-from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow
+from toolkit.models.stereo_window import Evaluated, MarginalPrior, StereoWindow
 from toolkit.models.window_solver import solve_window
 from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
@@ -137,7 +137,7 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
     keys, nothing = tuple((X(k),) for k in range(POSES)), MarginalPrior.nothing()
     ends = []
     for begin in (start, points):
-        window = SmartWindow(keys, values, (motion,), nothing, seen, begin)
+        window = StereoWindow(keys, values, (motion,), nothing, seen, begin)
         first_step = Evaluated.of(window, CAMERA).linearised().vision.point_steps(np.zeros(6 * POSES))
         for _ in range(6):
             window = solve_window(window, CAMERA).window

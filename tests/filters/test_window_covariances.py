@@ -15,7 +15,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.models.motion import motion_model, state_cov, state_keys
 from toolkit.models.reduced_vision import Sightings
-from toolkit.models.stereo_window import MarginalPrior, SmartWindow
+from toolkit.models.stereo_window import MarginalPrior, StereoWindow
 from toolkit.models.window_solver import SolvedWindow, without_oldest
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
@@ -148,7 +148,7 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
     none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
-    window = SmartWindow(keys, values, (), MarginalPrior.nothing(), none, np.empty((0, 3)))
+    window = StereoWindow(keys, values, (), MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):
         np.testing.assert_allclose(SolvedWindow(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])

@@ -1,9 +1,8 @@
-"""The window of `smart`: states with motion factors and a linear prior, tracks without landmark variables.
+"""A window of states with motion factors and a linear prior, and tracks whose landmarks are no variables.
 
-A :class:`SmartWindow` is the problem, a :class:`TrackedWindow` adds the track id of each point, and :class:`Evaluated`
-computes the normal equations, which ``smart_solver`` solves.
-
-Everything is dense: a window has a few hundred unknowns.
+A :class:`StereoWindow` is the problem, a :class:`TrackedWindow` adds the track id of each point, and :class:`Evaluated`
+computes the normal equations, which ``window_solver`` solves. A fixed-lag smoother solves it frame by frame, the
+measurement of noise on stretches of a recording. Everything is dense: a window has a few hundred unknowns.
 """
 
 from collections.abc import Iterable
@@ -36,7 +35,7 @@ class MarginalPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class SmartWindow:
+class StereoWindow:
     """States in the order of time: their keys (each [pose, velocity, bias] or [pose, bias]), factors and sightings.
 
     ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
@@ -69,7 +68,7 @@ class SmartWindow:
 class TrackedWindow:
     """A window and the track ids (M,) of its points."""
 
-    window: SmartWindow
+    window: StereoWindow
     track_ids: IntArray
 
     @classmethod
@@ -77,7 +76,7 @@ class TrackedWindow:
         """Return a window without states."""
         none = np.empty(0, dtype=np.int64)
         sightings = Sightings(none, none, np.empty((0, 3)))
-        return cls(SmartWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
+        return cls(StereoWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
 
     def points_by_id(self) -> dict[int, Array]:
         """Return the point (3,) m of every track."""
@@ -155,13 +154,13 @@ class System:
 class Evaluated:
     """A window and its cost at its values: half the squared errors of motion and prior, and Huber's losses."""
 
-    window: SmartWindow
+    window: StereoWindow
     motion: gtsam.GaussianFactorGraph
     off_prior: Array
     vision: Vision
 
     @classmethod
-    def of(cls, window: SmartWindow, camera: RobustCamera) -> "Evaluated":
+    def of(cls, window: StereoWindow, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: Python factors cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
         return cls(window, _joined_graph(window.motion).linearize(window.values), _off_prior(window), vision)
@@ -207,7 +206,7 @@ def _joined_graph(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.Nonline
     return whole
 
 
-def _off_prior(window: SmartWindow) -> Array:
+def _off_prior(window: StereoWindow) -> Array:
     """Return the deviation (D,) of the prior's states from its linearisation point."""
     about = window.prior.about
     keys = [key for key in window.all_keys if about.exists(key)]

@@ -14,7 +14,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
-from toolkit.models.stereo_window import Evaluated, MarginalPrior, SmartWindow, System
+from toolkit.models.stereo_window import Evaluated, MarginalPrior, StereoWindow, System
 
 MOST_ITERATIONS = 5
 # Newton's method converges quadratically: after a step shorter than this, in sigmas of all states together, the next is
@@ -31,7 +31,7 @@ _SHARES = (1.0, 0.5, 0.25, 0.0)
 class SolvedWindow:
     """A window at its minimum, and the root of its information, linearised one step before the minimum."""
 
-    window: SmartWindow
+    window: StereoWindow
     root: Array
 
     def cov(self, i: int) -> Array:
@@ -45,7 +45,7 @@ class SolvedWindow:
         return np.asarray(half.T @ half)
 
 
-def solve_window(window: SmartWindow, camera: RobustCamera, iterations: int = MOST_ITERATIONS) -> SolvedWindow:
+def solve_window(window: StereoWindow, camera: RobustCamera, iterations: int = MOST_ITERATIONS) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -66,7 +66,7 @@ def solve_window(window: SmartWindow, camera: RobustCamera, iterations: int = MO
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
 
-def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> SmartWindow:
+def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> StereoWindow:
     """Marginalise the ``count`` oldest states with every track they saw; the row numbers of other points stay."""
     seen = window.sightings
     leaving_points = np.unique(seen.point[seen.pose < count])
@@ -84,10 +84,10 @@ def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> Sma
     kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
     prior = MarginalPrior(information, vector, values)
     motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
-    return SmartWindow(window.keys[count:], values, motion, prior, kept, window.points)
+    return StereoWindow(window.keys[count:], values, motion, prior, kept, window.points)
 
 
-def _with_points(window: SmartWindow, points: IntArray) -> SmartWindow:
+def _with_points(window: StereoWindow, points: IntArray) -> StereoWindow:
     """Return the window with some points (M,), by their ascending rows, and their sightings."""
     seen = window.sightings.of_points(points)
     rows = np.searchsorted(points, seen.point).astype(np.int64)
@@ -119,7 +119,7 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
     return _DescentStep(here, 0.0, damping)
 
 
-def _with_shortened_landmark_steps(moved: SmartWindow, before: Array, camera: RobustCamera) -> SmartWindow:
+def _with_shortened_landmark_steps(moved: StereoWindow, before: Array, camera: RobustCamera) -> StereoWindow:
     """Return the window with each landmark (M,) moved by the part of its step with the lowest cost of its sightings.
 
     A landmark that comes nearer by metres may overshoot to behind a camera, and alone would make every step fail.
@@ -130,7 +130,7 @@ def _with_shortened_landmark_steps(moved: SmartWindow, before: Array, camera: Ro
     return replace(moved, points=places[cheapest, np.arange(len(before))])
 
 
-def _moved(window: SmartWindow, system: System, step: Array) -> SmartWindow:
+def _moved(window: StereoWindow, system: System, step: Array) -> StereoWindow:
     """Return the window after a step (D,) of its states and the corresponding steps of its landmarks."""
     delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
     for key in window.all_keys:

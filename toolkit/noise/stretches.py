@@ -23,7 +23,7 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model, state_keys
 from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
 from toolkit.models.state import Belief
-from toolkit.models.stereo_window import Evaluated, SmartWindow, TrackedWindow
+from toolkit.models.stereo_window import Evaluated, StereoWindow, TrackedWindow
 from toolkit.models.window_solver import solve_window
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, Prior, Sequence, StereoRig
@@ -82,7 +82,7 @@ class Stretch:
         """
         return self._solved(before.by_sound_sightings(), motion_model(noise, self.gravity_world), rig)
 
-    def _solved(self, window: SmartWindow, model: MotionModel, rig: StereoRig) -> "Adjusted":
+    def _solved(self, window: StereoWindow, model: MotionModel, rig: StereoRig) -> "Adjusted":
         bias = model.read(window.values, len(self.packets) - 1, 0).bias
         assert bias is not None
         motion = tuple(
@@ -162,7 +162,7 @@ class SoundResiduals(NamedTuple):
 class Adjusted:
     """A stretch at its minimum."""
 
-    window: SmartWindow
+    window: StereoWindow
     camera: RobustCamera
 
     @cached_property
@@ -174,7 +174,7 @@ class Adjusted:
         """The sightings evaluated at the minimum."""
         return self._evaluated.vision
 
-    def by_sound_sightings(self) -> SmartWindow:
+    def by_sound_sightings(self) -> StereoWindow:
         """Return the window with the sightings that are plausible by the stated noise, and the points they see."""
         vision, seen = self.vision, self.window.sightings
         bound = chi2_bound(left_only.degrees_of_freedom(seen.uv_px), SOUND)
