@@ -1,4 +1,4 @@
-"""What the project promises to show on real recordings (issue 2), with the defaults a user gets."""
+"""What the project promises to show on real recordings, with the defaults a user gets."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -293,7 +293,7 @@ def test_on_the_first_lines_drive_the_decoupled_filter_is_marked_and_the_others_
 def test_the_first_line_of_the_readme_is_as_good_on_kitti00_as_measured_before(
     first_line: tuple[str, Path], real: Callable[[str], Path], name: str, output: Output, most_m: float
 ) -> None:
-    """What issue 2 promises on a real IMU, scored by a truth that the built-in recording does not bring."""
+    """What is promised on a real IMU, scored by a truth that the built-in recording does not bring."""
     (run,) = (first_line[1] / "runs").glob("*/kitti00")
     (entry,) = [one for one in read_metrics(run / "metrics.json").runs if (one.estimator, one.output) == (name, output)]
     assert entry.status == "ok"
