@@ -27,7 +27,6 @@ from toolkit.models.gating import (
     MISMATCHED_TRACK_FACTOR,
     huber_threshold,
 )
-from toolkit.models.state import Belief
 from toolkit.sequence import StereoRig
 
 _GATE_RULES = np.array(
@@ -42,8 +41,6 @@ _GATE_RULES = np.array(
     ]
 )
 _KERNELS = "filters.kalman.kernels"
-_EVEN_NOISE = np.empty((0, 2))
-_DOF = np.array([3, 2])
 
 
 def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
@@ -123,11 +120,6 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
 def _as_kernel_arrays(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
     """Return arrays in the form kernels take."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
-
-
-def _pose_of(belief: Belief) -> Array:
-    """Return the pose (1, 4, 4) in the form kernels take."""
-    return np.array(belief.T_world_imu[None], order="C")
 
 
 def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:

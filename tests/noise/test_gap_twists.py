@@ -79,6 +79,13 @@ def test_estimators_read_improved_twists_in_the_gaps_alone() -> None:
     assert repaired.content_hash() != sequence.content_hash()
 
 
+def test_a_twist_that_never_changes_leaves_an_improved_one_some_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.noise.gap_twists._change_variance", lambda *_: np.zeros(6))
+    gaps = with_gap_twists(gappy(0)).gap_twists
+    assert gaps is not None
+    assert 0.0 < gaps.noise_scale.min() < 0.02
+
+
 def test_it_can_be_switched_off() -> None:
     on, off = (prepare(Recording(gappy(0), noise=Noise(bridge_gaps=given))).sequence for given in (True, False))
     assert on.gap_twists is not None

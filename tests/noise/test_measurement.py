@@ -13,7 +13,8 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, IntArray
 from toolkit.measured_motion import NoSamples, TwistChangeNoise
 from toolkit.noise import measured_noise
-from toolkit.noise.stretches import Stretch
+from toolkit.noise.motion import MotionScale, motion_scale
+from toolkit.noise.stretches import MotionFit, Stretch
 from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import SCENARIOS, noise_free, simulate
@@ -121,6 +122,11 @@ def test_a_motion_that_errs_five_times_as_much_as_stated_is_found_within_its_err
 def test_a_motion_that_errs_less_than_stated_is_taken_as_stated(name: str) -> None:
     sequence = recorded(name, 3.0)
     assert measured_noise(replace(sequence, noise=sequence.noise.scaled(5.0))).motion.value == 1.0
+
+
+def test_a_step_after_which_nothing_could_be_adjusted_keeps_the_stated_noise() -> None:
+    found = motion_scale(lambda scale: MotionFit(900.0, 100.0, 100.0) if scale == 1.0 else MotionFit(0.0, 0.0, 0.0))
+    assert found == MotionScale(1.0, 0.0, ratio=9.0)
 
 
 def test_neither_truth_nor_withheld_tracks_are_looked_at(drive: Sequence) -> None:

@@ -23,6 +23,9 @@ _FEWEST_CHANGES = 10
 # Larger changes are clipped to this many standard deviations: they are failures of vision, not motion.
 _MOST_SIGMAS = 3.0
 _ROUNDS = 5
+# Least variance of a prediction, as a share of the measured twist's: a twist that never changed in what vision saw
+# would leave none, and a motion without noise has a singular covariance.
+_LEAST_VARIANCE = 1e-4
 
 
 @np.errstate(all="ignore")  # wild values overflow, and say nothing of a twist
@@ -66,8 +69,8 @@ def _improved(sequence: Sequence, gaps: BoolArray, noise: TwistNoise) -> GapTwis
     seen[:, :3] += np.median((measured - seen)[known, :3], axis=0)
     middle_s, here, at = sequence.frames_s[:-1] + 0.5 * dt_s, np.flatnonzero(gaps), np.flatnonzero(known)
     predicted = np.stack([np.interp(middle_s[here], middle_s[at], column) for column in seen[at].T], axis=1)
-    variance = changes_per_s * _distance_s(middle_s, here, at)[:, None]
     stated = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density]) ** 2 / dt_s[here, None]
+    variance = np.maximum(changes_per_s * _distance_s(middle_s, here, at)[:, None], _LEAST_VARIANCE * stated)
     weight = stated / (stated + variance)
     mean = measured[here] + weight * (predicted - measured[here])
     scale = np.sqrt((1.0 - weight).reshape(-1, 2, 3).mean(axis=2))[:, ::-1]

@@ -36,16 +36,21 @@ class MotionScale:
 
 
 def motion_scale(fit: Callable[[float], MotionFit]) -> MotionScale:
-    """Return the factor by the fit of the motion samples under the stated noise times a factor."""
+    """Return the factor by the fit of the motion samples under the stated noise times a factor.
+
+    Where a step leaves no stretch that could be adjusted, the fit says nothing and the stated noise is kept.
+    """
     squares, expected, spread = fit(1.0)
     ratio = squares / expected if expected > 0.0 else 1.0
-    if squares - expected <= _STANDARD_ERRORS * np.sqrt(2.0 * spread):
+    if spread <= 0.0 or squares - expected <= _STANDARD_ERRORS * np.sqrt(2.0 * spread):
         return MotionScale(ratio=ratio)
     variance = 1.0
     for _ in range(_MOST_STEPS):
         step = float(np.clip(1.0 + (squares - expected) / spread, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
         variance = float(np.clip(variance * step, 1.0, _MOST**2))
         squares, expected, spread = fit(variance**0.5)
+        if spread <= 0.0:
+            return MotionScale(ratio=ratio)
         if abs(squares - expected) < _SMALL * np.sqrt(2.0 * spread):
             break
     error = variance * float(np.sqrt(2.0 / spread))

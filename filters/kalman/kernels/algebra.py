@@ -79,16 +79,6 @@ def multiply(A: Array, B: Array, out: Array) -> None:
 
 
 @compiled
-def multiply_transposed(A: Array, B: Array, out: Array) -> None:
-    """Write A (l, m) times the transposed B (n, m) to ``out``."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[0]):
-            out[i, j] = 0.0
-            for k in range(A.shape[1]):
-                out[i, j] += A[i, k] * B[j, k]
-
-
-@compiled
 def solve(A: Array, B: Array) -> None:
     """Overwrite B (n, m) by the solution of ``A X = B``, by elimination with row pivots; A (n, n) is destroyed."""
     n = A.shape[0]
