@@ -1,10 +1,12 @@
 """Does the working tree answer as a named revision did? Run before and after every refactoring; not part of the tests.
 
-Every estimator runs on four sequences in both trees, the revision's in a temporary directory that stands first on the
-path of its processes. Poses, covariances, landmarks, velocities, biases, status and every metric that is no cost are
-compared; one line a sequence and estimator names the largest difference of each kind. A difference is measured
-over max(1, |value|), that of a covariance over the two standard deviations it belongs to. The exit status is 1 where
-one exceeds the tolerance or an estimator failed, 2 where a tree could not be run.
+Every estimator runs on nine sequences in both trees, the revision's in a temporary directory that stands first on the
+path of its processes: with gaps between frames (0027, under VISLAM_DATA), sightings in the left image alone, tracks
+that return and outliers among them. Noise is measured anew, not read from the cache. Poses, covariances, landmarks,
+velocities, biases, status and every metric that is no cost are compared; one line a sequence and estimator names the
+largest difference of each kind. A difference is measured over max(1, |value|), that of a covariance over the two
+standard deviations it belongs to. The exit status is 1 where one exceeds the tolerance or an estimator failed, 2 where
+a tree could not be run.
 
     python tests/benchmarks/same_answers.py REVISION                  both trees, about two runs' time
     python tests/benchmarks/same_answers.py REVISION --save FILE.npz  run the revision only and keep its answers
@@ -28,7 +30,10 @@ import numpy as np
 
 PROJECT = Path(__file__).resolve().parents[2]
 CHILD = Path(__file__).with_name("same_answers_child.py")
-SEQUENCES = ("kitti00", "drive", "drive-imu", "flight")
+SEQUENCES = (
+    "kitti00", "0027", "drive", "drive-imu", "drive-realistic", "flight",
+    "flight-left-only", "drive-returning", "drive-outliers",
+)  # fmt: skip
 ESTIMATORS = (
     "dead-reckoning", "mapping", "seed-ekf", "ekf", "iekf", "riekf", "ekf-slam",
     "msckf", "msckf-fej", "msckf-slam", "smart", "fixed-lag", "isam2", "batch",
@@ -112,7 +117,7 @@ def run_tree(tree: Path, sequence: str, wanted: argparse.Namespace) -> Answers:
         out = Path(folder, "answers.npz")
         frames = 0 if wanted.all_frames else wanted.kitti_frames
         command = [sys.executable, str(CHILD), sequence, str(frames), str(out), *wanted.estimators]
-        environment = {**os.environ, "PYTHONPATH": str(tree)}
+        environment = {**os.environ, "PYTHONPATH": str(tree), "VISLAM_CACHE": folder}
         done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             raise UnrunnableError(f"{sequence} in {tree}:\n{done.stderr}")
@@ -150,7 +155,7 @@ def print_comparison(old: Answers, new: Answers, wanted: argparse.Namespace) -> 
             agree = agree and not beyond and not failed
             reported = [f"{kind} {d.absolute:.1e} ({d.relative:.1e})" for kind, d in kinds.items() if d.absolute > 0.0]
             verdict = "FAILED " if failed else "DIFFERS" if beyond else "agrees " if reported else "same   "
-            print(f"{verdict} {sequence:<10} {estimator:<15} {', '.join(reported)}", flush=True)
+            print(f"{verdict} {sequence:<16} {estimator:<15} {', '.join(reported)}", flush=True)
             for key in [k for k in before if "/metrics/" in k] if "metrics" in beyond else []:
                 now = answers_of(new, sequence, estimator).get(key, "absent")
                 if now == "absent" or difference("metrics", before[key], now).relative > wanted.tolerance:

@@ -16,13 +16,24 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 SEED = 0
-# Seconds of each simulated sequence; the recorded one is cut by its frames.
-DURATION_S = {"drive": 10.0, "drive-imu": 6.0, "flight": 6.0}
+# Scenario, seconds, and what is planted: an injector of toolkit.simulation.faults and its dose.
+SIMULATED: dict[str, tuple[str, float, tuple[str, float] | None]] = {
+    "drive": ("drive", 10.0, None),
+    "drive-imu": ("drive-imu", 6.0, None),
+    "flight": ("flight", 6.0, None),
+    "flight-left-only": ("flight", 4.0, ("missing_right", 0.33)),
+    "drive-returning": ("drive", 6.0, ("dropped_sightings", 0.2)),
+    "drive-outliers": ("drive", 6.0, ("outlier_tracks", 0.3)),
+    "drive-realistic": ("drive-realistic", 6.0, None),
+}
+# Recordings under VISLAM_DATA, and their first frames: those of 0027 are cut behind gaps of its frames.
+RECORDED = {"0027": ("ucsd/0027.npz", 120)}
 
 
 class _Unwatched:
@@ -61,14 +72,35 @@ def call(function: Callable[..., Any], values: Mapping[str, object]) -> Any:
 
 
 def sequence_of(name: str, frames: int) -> Any:
-    """Return a sequence as the estimators read it: simulated or loaded, audited, cut to its first frames (0: all)."""
+    """Return a sequence as the estimators read it: simulated or loaded, audited, cut, with its noise as measured."""
     audit = first_of(("toolkit.audit",), "audit")
-    if name in DURATION_S:
+    load = first_of(("toolkit.datasets",), "load_sequence")
+    if name in SIMULATED:
+        scenario, duration_s, planted = SIMULATED[name]
         scenarios = first_of(("toolkit.simulation",), "SCENARIOS")
         simulate = first_of(("toolkit.simulation",), "simulate")
-        return audit(simulate(replace(scenarios[name], duration_s=DURATION_S[name]), SEED)).sequence
-    sequence = audit(first_of(("toolkit.datasets",), "load_sequence")(name)).sequence
-    return sequence.truncated(frames) if frames else sequence
+        sequence = simulate(replace(scenarios[scenario], duration_s=duration_s), SEED)
+        if planted:
+            fault, dose = planted
+            sequence = first_of(("toolkit.simulation.faults",), fault)(sequence, dose, SEED)
+        sequence = audit(sequence).sequence
+    elif name in RECORDED:
+        path, frames = RECORDED[name]
+        sequence = audit(load(str(Path(os.environ["VISLAM_DATA"], path)))).sequence.truncated(frames)
+    else:
+        sequence = audit(load(name)).sequence
+        sequence = sequence.truncated(frames) if frames else sequence
+    return with_measured_noise(sequence)
+
+
+def with_measured_noise(sequence: Any) -> Any:
+    """Return the sequence with the weight of its tracks and the noise of its motion as they are measured on it."""
+    try:
+        measured = first_of(("toolkit.noise",), "measured_noise")(sequence)
+    except ImportError:  # revisions whose estimators adapt their noise themselves
+        return sequence
+    rig = replace(sequence.rig, track_weight=measured.tracks.value)
+    return replace(sequence, rig=rig, noise=sequence.noise.scaled(measured.motion.value))
 
 
 def read_of(sequence: Any, prior: Any) -> dict[str, Any]:
@@ -78,6 +110,7 @@ def read_of(sequence: Any, prior: Any) -> dict[str, Any]:
         "ids": sequence.observations.track_id,
         "motion": sequence.motion.values,
         "stamps": sequence.frames_t_ns,
+        "track weight": np.array(getattr(sequence.rig, "track_weight", 1.0)),
         "prior": np.concatenate([prior.T_world_imu.ravel(), prior.v_world, prior.bias]),
         "prior covariances": prior.cov[None],
     }
