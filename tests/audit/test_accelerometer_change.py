@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from toolkit.audit.agreement import accelerometer_change
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.samples import accelerometer_change
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -22,7 +22,7 @@ def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
     scenario: str, duration_s: float, dose: float, seed: int
 ) -> None:
     sound = recording(scenario, seed, duration_s)
-    found = accelerometer_change.check(Evidence(faults.changed_speed(sound, dose, seed)))
+    found = accelerometer_change(Evidence(faults.changed_speed(sound, dose, seed)))
     assert isinstance(found, Symptom) and found.warns and not found.harmful
     match = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
     assert match is not None and match[4] == ("more" if dose > 1.0 else "less")
@@ -34,5 +34,5 @@ def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
 @pytest.mark.parametrize("scenario", ["drive-imu", "flight", "flight-realistic"])
 @pytest.mark.parametrize("seed", range(20, 28))
 def test_a_sound_accelerometer_reads_one_gravity(scenario: str, seed: int) -> None:
-    found = accelerometer_change.check(Evidence(recording(scenario, seed, 5.0 + (seed % 4) * 2.0)))
+    found = accelerometer_change(Evidence(recording(scenario, seed, 5.0 + (seed % 4) * 2.0)))
     assert not isinstance(found, Symptom)

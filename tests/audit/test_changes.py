@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
+from toolkit.audit.clocks import camera_offset, change_of_offset
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.parts.clocks import camera_offset, change_of_offset
-from toolkit.audit.timing.clock_change import check
-from toolkit.audit.timing.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s
+from toolkit.audit.timing import LARGEST_ERROR_S, OFFSET_SIGMAS, _constant_phase_s, clock_change
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -93,13 +92,13 @@ def test_clocks_that_keep_pace_do_not_part_by_what_rotations_of_half_a_recording
     by_rotations = change_of_offset(evidence.sequence, evidence.intervals)
     assert by_rotations is not None
     assert abs(by_rotations.value) > 5.0 * by_rotations.error + 0.005
-    assert check(evidence) is None
+    assert clock_change(evidence) is None
 
 
 @pytest.mark.parametrize("duration_s", [5.0, 8.0])
 def test_a_camera_clock_that_is_set_by_little_is_reported_within_its_error(duration_s: float) -> None:
     flight = simulate(replace(SCENARIOS["flight-realistic"], duration_s=duration_s), 102)
-    symptom = check(Evidence(faults.camera_clock_step(flight, 0.025)))
+    symptom = clock_change(Evidence(faults.camera_clock_step(flight, 0.025)))
     assert isinstance(symptom, Symptom)
     found = re.search(r"changes by (-?\d+) \+- (\d+) ms", symptom.detail)
     assert found is not None
@@ -227,5 +226,5 @@ def test_an_offset_beyond_chance_is_reported_though_it_is_known_badly() -> None:
     w_imu = evidence.intervals.w_cam_radps @ late.rig.T_imu_cam[:3, :3].T
     found = camera_offset(late, evidence.intervals, w_imu)
     assert found is not None
-    assert LARGEST_ERROR_S < found.error < abs(found.value) / SIGMAS
+    assert LARGEST_ERROR_S < found.error < abs(found.value) / OFFSET_SIGMAS
     assert "frames are stamped early" in messages(audit(late))["time-offset"]

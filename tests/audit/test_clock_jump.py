@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
+from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.parts.edits import keep_frames, keep_samples
 from toolkit.audit.timing import clock_jump
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -28,7 +28,7 @@ def test_a_clock_that_is_set_by_steps_is_reported_with_its_size_and_cut_at(
 ) -> None:
     sound = recording(scenario, seed)
     dose_s = steps * float(np.diff(sound.frames_s[:2])[0])
-    found = clock_jump.check(Evidence(faults.clock_jump(sound, dose_s, seed)))
+    found = clock_jump(Evidence(faults.clock_jump(sound, dose_s, seed)))
     if scenario == "flight" and isinstance(found, Undecided):  # its tracks tell half of a step on some seeds only
         assert abs(steps) < 1.0 and "jump together" in found.why
         return
@@ -50,7 +50,7 @@ def test_a_pause_of_both_streams_is_none_for_the_vehicle_goes_on(scenario: str, 
     there = keep_frames(sound, np.flatnonzero((sound.frames_s < begin_s) | (sound.frames_s > end_s)))
     paused = keep_samples(there, (samples_s < begin_s) | (samples_s > end_s))
     assert paused.frame_count < sound.frame_count
-    assert clock_jump.check(Evidence(paused)) is None
+    assert clock_jump(Evidence(paused)) is None
 
 
 def test_a_frame_and_a_sample_that_are_there_twice_are_repeats_and_not_a_jump() -> None:
@@ -75,7 +75,7 @@ def test_stamps_that_tremble_together_are_no_jumps(seed: int) -> None:
     late_ns = np.rint(rng.normal(0.0, 0.02e9, sound.frame_count)).astype(np.int64)
     stamps = np.interp(sound.motion.t_ns, sound.frames_t_ns, sound.frames_t_ns + late_ns).astype(np.int64)
     motion = sound.motion.of(stamps, sound.motion.values)
-    assert clock_jump.check(Evidence(replace(sound, frames_t_ns=sound.frames_t_ns + late_ns, motion=motion))) is None
+    assert clock_jump(Evidence(replace(sound, frames_t_ns=sound.frames_t_ns + late_ns, motion=motion))) is None
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -96,6 +96,6 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_r
             motion=replace(standing.motion, t_ns=standing.motion.t_ns + np.where(samples_s > at_s, leap_ns, 0)),
         )
         for sequence in (paused, jumped):
-            reported = clock_jump.check(Evidence(sequence))
+            reported = clock_jump(Evidence(sequence))
             assert isinstance(reported, Undecided)
             assert "do not determine whether time passed" in reported.why

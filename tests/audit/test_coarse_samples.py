@@ -17,7 +17,7 @@ def simulated(scenario: str) -> Sequence:
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
 def test_rounded_samples_are_reported_with_their_step(scenario: str) -> None:
-    found = coarse_samples.check(Evidence(faults.coarse_samples(simulated(scenario), 0.1)))
+    found = coarse_samples(Evidence(faults.coarse_samples(simulated(scenario), 0.1)))
     assert isinstance(found, Symptom) and found.warns
     assert "in steps of 0.1 rad/s, which adds errors of 0.029" in found.detail
 
@@ -25,8 +25,8 @@ def test_rounded_samples_are_reported_with_their_step(scenario: str) -> None:
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
 def test_samples_with_all_their_digits_are_not_accused(scenario: str) -> None:
     sound = simulated(scenario)
-    assert coarse_samples.check(Evidence(sound)) is None
-    assert coarse_samples.check(Evidence(faults.coarse_samples(sound, 1e-4))) is None
+    assert coarse_samples(Evidence(sound)) is None
+    assert coarse_samples(Evidence(faults.coarse_samples(sound, 1e-4))) is None
 
 
 def test_steps_count_from_half_of_the_stated_noise_on() -> None:
@@ -37,7 +37,7 @@ def test_steps_count_from_half_of_the_stated_noise_on() -> None:
         values = flight.motion.values.copy()
         step = share * sigma * np.sqrt(12.0)
         values[:, 3:] = step * np.round(values[:, 3:] / step)
-        found = coarse_samples.check(Evidence(replace(flight, motion=flight.motion.of(flight.motion.t_ns, values))))
+        found = coarse_samples(Evidence(replace(flight, motion=flight.motion.of(flight.motion.t_ns, values))))
         assert (found is not None) == expected
 
 
@@ -46,4 +46,4 @@ def test_a_wheel_that_stands_or_an_axis_that_is_never_used_is_no_step() -> None:
     values = drive.motion.values.copy()
     values[:, 1] = 0.0
     values[:40, :3] = 0.0
-    assert coarse_samples.check(Evidence(replace(drive, motion=drive.motion.of(drive.motion.t_ns, values)))) is None
+    assert coarse_samples(Evidence(replace(drive, motion=drive.motion.of(drive.motion.t_ns, values)))) is None

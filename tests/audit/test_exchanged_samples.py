@@ -54,4 +54,4 @@ def test_noise_that_was_estimated_from_the_samples_is_exchanged_with_them() -> N
 def test_sound_samples_and_other_units_are_not_exchanged(scenario: str, dose: float) -> None:
     sound = recording(scenario, 5)
     for sequence in (faults.linear_unit(sound, dose), faults.angular_unit(sound, dose)):
-        assert exchanged_samples.check(Evidence(sequence)) is None
+        assert exchanged_samples(Evidence(sequence)) is None

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.audit.calibration import gyro_scale
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.samples import gyro_scale
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -21,7 +21,7 @@ def simulated(scenario: str, seed: int) -> Sequence:
 @pytest.mark.parametrize("dose", [0.85, 1.2])
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
 def test_the_sensitivity_of_an_axis_is_reported(scenario: str, dose: float) -> None:
-    found = gyro_scale.check(Evidence(faults.gyro_axis_scale(simulated(scenario, 51), dose)))
+    found = gyro_scale(Evidence(faults.gyro_axis_scale(simulated(scenario, 51), dose)))
     assert isinstance(found, Symptom)
     assert found.warns and found.count == 1
     match = re.search(r"turns (\S+) \+- (\S+) times as fast as the camera about", found.detail)
@@ -33,7 +33,7 @@ def test_the_sensitivity_of_an_axis_is_reported(scenario: str, dose: float) -> N
 @pytest.mark.parametrize("seed", [61, 62, 63])
 @pytest.mark.parametrize("scenario", list(DURATION_S))
 def test_a_sound_gyro_is_not_accused(scenario: str, seed: int) -> None:
-    assert not isinstance(gyro_scale.check(Evidence(simulated(scenario, seed))), Symptom)
+    assert not isinstance(gyro_scale(Evidence(simulated(scenario, seed))), Symptom)
 
 
 def test_noise_of_either_alone_accuses_nobody() -> None:
@@ -44,10 +44,10 @@ def test_noise_of_either_alone_accuses_nobody() -> None:
         replace(sound, motion=sound.motion.of(sound.motion.t_ns, noisy)),
         faults.few_tracks(sound, 12.0),  # the camera's own rates are noise in part
     ):
-        assert not isinstance(gyro_scale.check(Evidence(faulty)), Symptom)
+        assert not isinstance(gyro_scale(Evidence(faulty)), Symptom)
 
 
 def test_what_is_beyond_chance_and_does_not_count_is_reported() -> None:
-    found = gyro_scale.check(Evidence(faults.gyro_axis_scale(simulated("flight", 51), 0.96)))
+    found = gyro_scale(Evidence(faults.gyro_axis_scale(simulated("flight", 51), 0.96)))
     assert isinstance(found, Undecided)
     assert "times as fast as the camera about" in found.why

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
+from toolkit.audit.conventions import accelerometer_axes
 from toolkit.audit.fault import Evidence
-from toolkit.audit.samples.accelerometer_axes import check as accelerometer_axes
-from toolkit.audit.samples.saturated_samples import check as saturated
-from toolkit.audit.samples.stuck_samples import check as stuck
+from toolkit.audit.samples import saturated_samples as saturated
+from toolkit.audit.samples import stuck_samples as stuck
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
+from toolkit.audit.bundle import COMMON, LEVER
 from toolkit.audit.calibration import lever_arm
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.parts.bundle import COMMON, LEVER
-from toolkit.audit.parts.self_calibration import SelfCalibration
+from toolkit.audit.self_calibration import SelfCalibration
 from toolkit.geometry import Array, se3
 from toolkit.sequence import Sequence
 from toolkit.simulation import FLIGHT, faults, simulate
@@ -26,7 +26,7 @@ def messages(sequence: Sequence, lacking_m: Array, error_m: float = 1e-6) -> Sym
     evidence, value = Evidence(sequence), np.zeros(COMMON)
     value[LEVER] = lacking_m
     evidence.__dict__["self_calibration"] = SelfCalibration(value, error_m**2 * np.eye(COMMON), 1)
-    reported = lever_arm.check(evidence)
+    reported = lever_arm(evidence)
     assert reported is None or isinstance(reported, Symptom)
     return reported
 
@@ -76,6 +76,6 @@ def test_a_displaced_camera_beside_an_imu_is_reported_once() -> None:
 def test_a_place_that_is_known_badly_says_what_would_not_show() -> None:
     evidence = Evidence(recorded())
     evidence.__dict__["self_calibration"] = SelfCalibration(np.zeros(COMMON), 0.15**2 * np.eye(COMMON), 1)
-    reported = lever_arm.check(evidence)
+    reported = lever_arm(evidence)
     assert isinstance(reported, Undecided)
     assert "0.7 m along x, 0.7 m along y, 0.7 m along z would not show" in reported.why

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
+from toolkit.audit.bundle import COMMON, Calibration, twist_strides
+from toolkit.audit.calibration import hidden, wrong
 from toolkit.audit.fault import Evidence
-from toolkit.audit.parts.bundle import COMMON, Calibration
-from toolkit.audit.parts.calibration_limits import hidden, wrong
-from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.strides import twist_strides
+from toolkit.audit.self_calibration import SelfCalibration, self_calibration
 from toolkit.geometry import se3_inverse, so3_exp
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, Scenario, faults, noise_free, simulate

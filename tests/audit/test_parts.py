@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit.parts.axes import axes_named, right_handed_axes, signed_axes
-from toolkit.audit.parts.edits import split
-from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.one_step import errors_are_independent
-from toolkit.audit.parts.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
+from toolkit.audit.conventions import axes_named, right_handed_axes, signed_axes
+from toolkit.audit.edits import split
+from toolkit.audit.intervals import interval_means
+from toolkit.audit.one_step import errors_are_independent
+from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.models.camera_motion import camera_motion

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.audit.parts.edits import keep_frames, keep_samples
+from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3
 from toolkit.measured_motion import TwistSamples

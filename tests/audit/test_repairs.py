@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
+from toolkit.audit.alignment import TranslationFit, is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence
-from toolkit.audit.parts.alignment import TranslationFit
-from toolkit.audit.parts.extrinsic import is_excluded, is_there, metres, way_gone
-from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
-from toolkit.audit.fault import Evidence
-from toolkit.audit.parts.bundle import (
+from toolkit.audit.bundle import (
     CHANGE,
     COMMON,
     RIGHT_ROLL,
     RIGHT_SHIFT,
     Calibration,
     KeyFrameWindow,
+    imu_strides,
     predicted,
     stride_equations,
 )
-from toolkit.audit.parts.calibration_limits import doubtful, hidden, wrong
-from toolkit.audit.parts.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
-from toolkit.audit.parts.strides import imu_strides
+from toolkit.audit.calibration import doubtful, hidden, wrong
+from toolkit.audit.fault import Evidence
+from toolkit.audit.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
 from toolkit.geometry import Array, so3_exp, so3_log
 from toolkit.measured_motion import ImuMotion, ImuNoise
 from toolkit.models.imu import preintegrate, preintegration_params

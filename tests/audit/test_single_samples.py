@@ -31,7 +31,7 @@ def test_a_sample_that_leaves_its_neighbours_and_comes_back_is_dropped_alone(sce
         for k in range(6):
             values = sound.motion.values.copy()
             values[row, k] += size
-            found = implausible.check(Evidence(with_values(sound, values)))
+            found = implausible(Evidence(with_values(sound, values)))
             assert isinstance(found, Symptom) and found.count == 1 and found.remedy is not None
             assert np.setdiff1d(sound.motion.t_ns, found.remedy.motion.t_ns).tolist() == [sound.motion.t_ns[row]]
 
@@ -40,18 +40,18 @@ def test_a_sample_that_leaves_its_neighbours_and_comes_back_is_dropped_alone(sce
 @pytest.mark.parametrize("seed", range(8))
 def test_no_sample_of_a_sound_recording_is_dropped(scenario: str, seed: int) -> None:
     evidence = Evidence(recording(scenario, seed))
-    assert implausible.check(evidence) is None
-    assert stuck_samples.check(evidence) is None
+    assert implausible(evidence) is None
+    assert stuck_samples(evidence) is None
 
 
 def test_a_knock_that_lasts_and_knocks_that_are_usual_are_motion() -> None:
     sound = recording("flight", 1)
     knocked = sound.motion.values.copy()
     knocked[400:403, 2] += [4.0, 8.0, 4.0]
-    assert implausible.check(Evidence(with_values(sound, knocked))) is None
+    assert implausible(Evidence(with_values(sound, knocked))) is None
     walking = sound.motion.values.copy()
     walking[50::60, 2] += 8.0  # a leg that strikes the ground every 0.3 s
-    assert implausible.check(Evidence(with_values(sound, walking))) is None
+    assert implausible(Evidence(with_values(sound, walking))) is None
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -59,7 +59,7 @@ def test_a_knock_that_lasts_and_knocks_that_are_usual_are_motion() -> None:
 def test_odometry_that_hangs_for_a_third_of_a_second_is_bridged(dose_s: float, seed: int) -> None:
     hung = faults.stuck_motion(recording("drive", seed), dose_s, seed)
     repeats = (hung.motion.values[1:] == hung.motion.values[:-1]).all(axis=1)
-    found = stuck_samples.check(Evidence(hung))
+    found = stuck_samples(Evidence(hung))
     assert isinstance(found, Symptom) and found.remedy is not None
     assert found.count == repeats.sum()
 
@@ -71,4 +71,4 @@ def test_odometry_that_repeats_itself_now_and_then_or_holds_each_value_does_not_
     held = with_values(sound, sound.motion.values[kept])
     runs = (held.motion.values[3:] == held.motion.values[:-3]).all(axis=1)
     assert runs.any()  # four in a row are there
-    assert stuck_samples.check(Evidence(held)) is None
+    assert stuck_samples(Evidence(held)) is None

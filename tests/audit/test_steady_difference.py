@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from toolkit.audit import audit
-from toolkit.audit.agreement import steady_difference
+from toolkit.audit.calibration import steady_difference
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -31,7 +31,7 @@ def drive(seed: int, duration_s: float = 25.0, scenario: str = "drive") -> Seque
 def test_two_percent_of_scale_are_reported_with_their_error(
     fault: Callable[[Sequence, float, int], Sequence], dose: float, percent: float, seed: int
 ) -> None:
-    found = steady_difference.check(Evidence(fault(drive(seed), dose, seed)))
+    found = steady_difference(Evidence(fault(drive(seed), dose, seed)))
     assert isinstance(found, Symptom) and not found.harmful
     match = re.search(r"steps are ([\d.]+) \+- ([\d.]+) % (longer|shorter)", found.detail)
     assert match is not None and match[3] == ("longer" if percent > 0.0 else "shorter")
@@ -42,7 +42,7 @@ def test_two_percent_of_scale_are_reported_with_their_error(
 
 @pytest.mark.parametrize("seed", range(43, 47))
 def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction(seed: int) -> None:
-    found = steady_difference.check(Evidence(faults.shifted_centre(drive(seed), 12.0, seed)))
+    found = steady_difference(Evidence(faults.shifted_centre(drive(seed), 12.0, seed)))
     assert isinstance(found, Symptom)
     match = re.search(r"equivalent to (\d+) px of the principal point", found.detail)
     assert match is not None and float(match[1]) == pytest.approx(12.0, abs=2.5)
@@ -51,7 +51,7 @@ def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction(seed: 
 @pytest.mark.parametrize("scenario", ["drive", "drive-realistic"])
 @pytest.mark.parametrize("seed", range(50, 60))
 def test_a_sound_drive_has_no_steady_difference(scenario: str, seed: int) -> None:
-    assert steady_difference.check(Evidence(drive(seed, 8.0 + (seed % 5) * 3.0, scenario))) is None
+    assert steady_difference(Evidence(drive(seed, 8.0 + (seed % 5) * 3.0, scenario))) is None
 
 
 def test_what_is_more_than_slip_is_a_fault_of_its_own() -> None:

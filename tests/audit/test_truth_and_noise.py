@@ -33,7 +33,7 @@ def flight() -> Sequence:
 
 
 def with_truth(sequence: Sequence, truth: Truth | None) -> Symptom | Undecided | None:
-    return truth_mismatch.check(Evidence(replace(sequence, truth=truth)))
+    return truth_mismatch(Evidence(replace(sequence, truth=truth)))
 
 
 def truth_of(sequence: Sequence) -> Truth:
@@ -45,8 +45,8 @@ def truth_of(sequence: Sequence) -> Truth:
 @pytest.mark.parametrize("seed", [21, 22])
 def test_a_sound_truth_and_a_sound_noise_are_not_accused(scenario: str, seed: int) -> None:
     evidence = Evidence(simulated(scenario, seed))
-    assert truth_mismatch.check(evidence) is None
-    assert overstated_noise.check(evidence) is None
+    assert truth_mismatch(evidence) is None
+    assert overstated_noise(evidence) is None
 
 
 @pytest.mark.parametrize(("metres", "unit"), [(0.3048, "feet"), (0.9144, "yards"), (0.0254, "inches")])
@@ -65,7 +65,7 @@ def test_a_wrong_baseline_is_reported_with_its_size(
 ) -> None:
     sound: Sequence = request.getfixturevalue(recording)
     wrong = replace(sound, rig=replace(sound.rig, baseline_m=scale * sound.rig.baseline_m))
-    found = truth_mismatch.check(Evidence(wrong))
+    found = truth_mismatch(Evidence(wrong))
     assert isinstance(found, Symptom)
     assert found.warns and found.remedy is None
     reported = float(found.detail.split("steps are ")[1].split()[0])
@@ -142,7 +142,7 @@ def test_a_truth_that_stands_still_while_the_camera_moves_is_reported(
 
 def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
     sequence = faults.standstill(simulate(replace(SCENARIOS["drive"], duration_s=12.0), 4), 8.0, 1)
-    assert truth_mismatch.check(Evidence(sequence)) is None
+    assert truth_mismatch(Evidence(sequence)) is None
 
 
 @pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y changed (positions alone)"])
@@ -170,13 +170,11 @@ def test_a_thousand_times_the_noise_of_an_imu_is_reported_by_its_name(
     """A walk must be larger still: the motion of a flight hides it."""
     noise = flight.noise
     assert isinstance(noise, ImuNoise)
-    found = overstated_noise.check(
-        Evidence(replace(flight, noise=replace(noise, **{name: factor * getattr(noise, name)})))
-    )
+    found = overstated_noise(Evidence(replace(flight, noise=replace(noise, **{name: factor * getattr(noise, name)}))))
     assert found is not None
     assert found.warns
     assert name in found.detail
 
 
 def test_noise_that_allows_for_vibration_is_not_accused(flight: Sequence) -> None:
-    assert overstated_noise.check(Evidence(replace(flight, noise=flight.noise.scaled(10.0)))) is None
+    assert overstated_noise(Evidence(replace(flight, noise=flight.noise.scaled(10.0)))) is None

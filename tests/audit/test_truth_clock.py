@@ -23,7 +23,7 @@ def simulated(scenario: str, seed: int) -> Sequence:
 @pytest.mark.parametrize("scenario", list(DURATION_S))
 def test_the_pace_of_the_truths_clock_is_reported(scenario: str, pace: float) -> None:
     faulty = faults.truth_clock_rate(simulated(scenario, 31), pace)
-    symptom = truth_clock.check(Evidence(faulty))
+    symptom = truth_clock(Evidence(faulty))
     assert isinstance(symptom, Symptom)
     assert symptom.warns and symptom.remedy is None
     match = re.search(r"time passes (\S+) \+- (\S+) times as fast", symptom.detail)
@@ -36,7 +36,7 @@ def test_the_pace_of_the_truths_clock_is_reported(scenario: str, pace: float) ->
 @pytest.mark.parametrize("scenario", list(DURATION_S))
 def test_a_truth_by_the_frames_clock_is_not_accused(scenario: str, seed: int) -> None:
     evidence = Evidence(simulated(scenario, seed))
-    assert not isinstance(truth_clock.check(evidence), Symptom)
+    assert not isinstance(truth_clock(evidence), Symptom)
     assert evidence.truth_clock is not None and evidence.truth_clock.rate is not None
     value, error = evidence.truth_clock.rate
     assert abs(value) < 4.0 * error
@@ -53,7 +53,7 @@ def test_a_clock_is_reported_once_either_by_its_offset_or_by_its_pace() -> None:
 def test_a_truth_without_turns_leaves_its_clock_open() -> None:
     """On a road that goes straight ahead nothing tells the truth's clock."""
     straight = faults.standstill(simulated("drive", 4), 8.0, 1)
-    reported = truth_clock.check(Evidence(straight))
+    reported = truth_clock(Evidence(straight))
     assert isinstance(reported, Undecided)
     assert "too little change of rotation" in reported.why
 
@@ -61,7 +61,7 @@ def test_a_truth_without_turns_leaves_its_clock_open() -> None:
 @pytest.mark.parametrize("scenario", list(DURATION_S))
 def test_orientations_that_were_not_written_are_reported(scenario: str) -> None:
     faulty = faults.unwritten_orientations(simulated(scenario, 33))
-    symptom = truth_mismatch.check(Evidence(faulty))
+    symptom = truth_mismatch(Evidence(faulty))
     assert isinstance(symptom, Symptom)
     assert "all orientations of the truth are equal" in symptom.detail
     assert faulty.truth is not None

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
-from toolkit.audit.agreement.conflict import Deviation, sustained
+from toolkit.audit.agreement import Deviation, sustained
+from toolkit.audit.alignment import Turn, alignment, turn_by_velocities, velocity_regression
 from toolkit.audit.calibration import lever_arm
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.parts.alignment import alignment, velocity_regression
-from toolkit.audit.parts.extrinsic import Turn, turn_by_velocities
 from toolkit.audit.tracks import track_scatter
 from toolkit.geometry import Array, interpolate_poses, se3, se3_inverse, so3_exp, transform
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
@@ -108,12 +107,12 @@ def test_a_camera_in_its_place_is_not_accused_by_the_errors_that_last(seed: int)
     evidence = Evidence(simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0, varied=True), seed))
     assert evidence.alignment is not None
     assert np.abs(evidence.alignment.lever_m / evidence.alignment.lever_error_m).max() > 7.0
-    assert lever_arm.check(evidence) is None
+    assert lever_arm(evidence) is None
 
 
 def test_a_camera_a_quarter_of_a_metre_from_its_place_is_reported_beside_an_imu() -> None:
     sound = simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0), 102)
-    assert isinstance(lever_arm.check(Evidence(faults.displaced_camera(sound, 0.25))), Symptom)
+    assert isinstance(lever_arm(Evidence(faults.displaced_camera(sound, 0.25))), Symptom)
 
 
 @pytest.mark.parametrize("scenario", ["drive", "flight"])
@@ -175,7 +174,7 @@ def test_a_tenth_of_tracks_that_slide_is_reported_where_the_noise_is_right(scena
 
 
 def scatter_of(sequence: Sequence) -> str | None:
-    found = track_scatter.check(Evidence(sequence))
+    found = track_scatter(Evidence(sequence))
     assert found is None or (isinstance(found, Symptom) and found.warns)
     return found and f"{found.detail}; {found.treatment}"
 
@@ -214,7 +213,7 @@ def test_half_a_pixel_that_is_assumed_and_too_much_is_reported_for_information()
     uv_px = exactly_seen(sound, T_world_cam)
     uv_px += np.random.default_rng(0).normal(0.0, sigma_px, uv_px.shape) * np.sqrt([1.0, 1.0, 0.5])
     observations = replace(sound.observations, uv_px=uv_px)
-    found = track_scatter.check(Evidence(replace(
+    found = track_scatter(Evidence(replace(
         sound, observations=observations, rig=replace(sound.rig, cov_uv_px2=assumed_px2)
     )))  # fmt: skip
     assert isinstance(found, Symptom)

@@ -1,17 +1,16 @@
-"""A fault: its name, its place in the order, and a check that describes it and returns a repaired sequence."""
+"""A fault is a check of the evidence, which describes it and returns a repaired sequence."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-from toolkit.audit.parts.alignment import TranslationFit, alignment
-from toolkit.audit.parts.clocks import TruthClock, truth_clock
-from toolkit.audit.parts.integrated_gravity import IntegratedGravity, integrated_gravity
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
-from toolkit.audit.parts.one_step import Agreement, OneStep, agreement, one_step, step_correlation
-from toolkit.audit.parts.robust import Scalar
-from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
+from toolkit.audit.alignment import IntegratedGravity, TranslationFit, alignment, integrated_gravity
+from toolkit.audit.clocks import TruthClock, truth_clock
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
+from toolkit.audit.one_step import Agreement, OneStep, agreement, one_step, step_correlation
+from toolkit.audit.robust import Scalar
+from toolkit.audit.self_calibration import SelfCalibration, self_calibration
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -173,11 +172,9 @@ class Evidence:
         return now
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One kind of fault. ``after`` names faults that are checked (and repaired) before it."""
+Check = Callable[[Evidence], Symptom | Undecided | None]
 
-    name: str
-    summary: str
-    check: Callable[[Evidence], Symptom | Undecided | None]
-    after: tuple[str, ...] = ()
+
+def name_of(check: Check) -> str:
+    """Return the name of the fault that a function checks: the function's, with hyphens."""
+    return check.__name__.replace("_", "-")

@@ -6,7 +6,7 @@ seen, ``K_l``, ``K_r``, ``extL_T_imu`` and ``extR_T_imu``. It is read, never unp
 ``cam_imgs_L`` and ``cam_imgs_R``.
 
 The extrinsics are called IMU to camera, and files are about that hold camera to IMU, in axes x forward, y left, z up.
-A sequence has them as they are called; the audit decides (:mod:`toolkit.audit.calibration.extrinsic_convention`).
+A sequence has them as they are called; the audit decides (:mod:`toolkit.audit.conventions`).
 """
 
 from collections.abc import Iterator, Mapping

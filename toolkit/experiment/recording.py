@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from toolkit.audit import Audit, Finding, audit, checked_again
-from toolkit.audit.parts.edits import keep_frames
+from toolkit.audit.edits import keep_frames
 from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from toolkit.audit.parts.windows import steps_beside_camera
+from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     backwards,

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.arrays import rows_of
-from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import Scalar, slope
+from toolkit.audit.intervals import interval_means
+from toolkit.audit.robust import Scalar, slope
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measured_motion import TwistSamples

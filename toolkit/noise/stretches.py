@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from toolkit.audit.parts.edits import keep_frames
+from toolkit.audit.edits import keep_frames
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse
 from toolkit.initialization.first_guess import guess_with_imu
 from toolkit.measured_motion import ImuMotion, MotionNoise

@@ -1,0 +1,344 @@
+"""Offset and rate of two clocks by rotations that both stamp: the camera's and the gyro's, or the truth's.
+
+``camera_offset`` is the delay of the camera's rotation after its stamps. A coarse search finds its neighbourhood;
+Gauss-Newton on the shift, with Cauchy weights and about the median (a gyro has a bias), refines it to a fraction of a
+sample. The rates of twists are noisy, so there the change of rotation by the camera is the instrument.
+
+``truth_clock`` does the same with the truth's rates of rotation in place of a gyro's, and also estimates the relative
+rate of the clocks. Gauss-Newton on offset and rate proceeds from the middle of the recording outwards, because far from
+the middle a wrong rate shifts a turn by more than its duration. Source: Furgale, Rehder & Siegwart, "Unified temporal
+and spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from toolkit.audit.intervals import LEAST_INTERVALS, Integral, Intervals
+from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, slope, spread
+from toolkit.geometry import Array, BoolArray, IntArray, so3_log
+from toolkit.jackknife import jackknife_error
+from toolkit.measured_motion import TwistSamples
+from toolkit.models.camera_motion import CameraMotion
+from toolkit.models.gating import MAD_TO_SIGMA
+from toolkit.resampling import NS_PER_S, Pairing
+from toolkit.sequence import Sequence, Truth
+
+# Range of the search, and its step in intervals.
+MOST_S, COARSE_STEP = 0.6, 0.25
+# Means over an interval that are computed at a time: they take a megabyte, however long the recording.
+MEANS_AT_A_TIME = 10_000
+REFINEMENTS = 5
+# The standard error is that of a jackknife over stretches of the recording (a corner is one event and not ten
+# intervals), times this factor, which was measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+SCATTER = 1.45
+# The unexplained variance must fall below this share of that without an offset, because slow turns may fit by chance.
+MOST_UNEXPLAINED = 0.9
+# The difference of two independent rates has the sum of their variances; a gyro's noise at standstill also has a shift
+# with the smallest difference. The variance must be below this share of the sum, without differences beyond so many
+# spreads.
+MOST_APART, GROSS_SPREADS = 0.8, 6.0
+# Limits of an offset of the truth's clock: so many standard errors and this time (s); a rate must cause as much at both
+# ends. Sound recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
+# The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
+SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
+# Least number of intervals of a fit, of which the truth may not cover some.
+FEWEST = LEAST_INTERVALS + 10
+# The slope of the truth's rates is taken over this share of a step of the frames to either side.
+SLOPE_STEP = 0.1
+# Largest rate; beyond it, other parts of a motion fit as well.
+MOST_RATE = 0.1
+# Limits of the change of the offset between the halves: so many standard errors, and beyond them what sound recordings
+# at hand have (s): 14 ms at most on drives, 3 ms with an IMU. Chosen with them in view.
+CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
+# The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
+# k plus s times sample k + 1.
+LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
+
+
+def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
+    candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
+    some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
+    costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
+    costs, at_zero = costs[:-1], costs[-1]
+    if not np.isfinite(costs).any():
+        return None
+    best = int(np.nanargmin(costs))
+    offset_s = float(candidates[best]) if costs[best] < MOST_UNEXPLAINED * at_zero else 0.0
+    found = Scalar(offset_s, np.inf)
+    seen, known = _change_seen(sequence, intervals, w_imu)
+    for _ in range(REFINEMENTS):
+        mean, inside = _gyro_at(gyro, sequence, intervals, found.value)
+        after, after_inside = _gyro_at(gyro, sequence, intervals, found.value + 0.1 * step_s)
+        before, before_inside = _gyro_at(gyro, sequence, intervals, found.value - 0.1 * step_s)
+        rows = known & inside & after_inside & before_inside
+        if rows.sum() < LEAST_INTERVALS:
+            return None
+        change = (after - before)[rows] / (0.2 * step_s)
+        residual = w_imu[rows] - mean[rows]
+        instrument = seen[rows] if isinstance(sequence.motion, TwistSamples) else change
+        residual = residual - np.median(residual, axis=0)
+        step = slope(instrument, change, residual)
+        found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
+    if abs(found.value) >= 2.0 * MOST_S or _share_apart(w_imu[rows], mean[rows]) > MOST_APART:
+        return None
+    if isinstance(sequence.motion, TwistSamples) and is_stamped_at_frames(sequence):
+        return found
+    return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
+
+
+def _slope(instrument: Array, change: Array, residual: Array) -> float:
+    return slope(instrument, change, residual).value
+
+
+def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
+    """Return the camera's angular acceleration at each interval (M, 3) rad/s^2, and where it is known (M,).
+
+    It is computed from the neighbouring intervals, so it is independent of the noise of the gyro and of the interval's
+    own.
+    """
+    seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
+    seen[intervals.interval + 1], known[intervals.interval + 1] = w_imu, True
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    before, after = intervals.interval, intervals.interval + 2
+    return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
+
+
+def _gyro_at(
+    gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
+) -> tuple[Array, BoolArray]:
+    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them its samples cover (..., M).
+
+    The intervals are shifted by the offsets (...) s.
+    """
+    begin = intervals.interval - intervals.interval[0]
+    shift_ns = np.rint(np.asarray(offset_s) * NS_PER_S).astype(np.int64)[..., None]
+    t_ns = sequence.frames_t_ns[intervals.interval[0] : intervals.interval[-1] + 2] + shift_ns
+    inside = (t_ns[..., begin] >= gyro.t_ns[0]) & (t_ns[..., begin + 1] <= gyro.t_ns[-1])
+    return gyro.means(t_ns)[..., begin, :], np.asarray(inside)
+
+
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
+    """Return the squared spread (C,) of the differences (C, M, 3) over the intervals that are covered (C, M).
+
+    NaN where these are fewer than LEAST_INTERVALS.
+    """
+    reached = inside.sum(axis=-1)
+    apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
+    deviation = MAD_TO_SIGMA * _medians(np.abs(apart - _medians(apart, reached)), reached)
+    return np.where(reached < LEAST_INTERVALS, np.nan, np.sum(deviation[..., 0] ** 2, axis=-1))
+
+
+def _medians(values: Array, reached: IntArray) -> Array:
+    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, so many in each row (C,)."""
+    ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
+    middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
+    return np.asarray(0.5 * (middle[0] + middle[1]))
+
+
+def _share_apart(w_imu: Array, mean: Array) -> float:
+    """Return the variance of the difference (M, 3) over the sum of both variances: 1 where they are independent."""
+    seen, measured = (rates - np.median(rates, axis=0) for rates in (w_imu, mean))
+    apart = seen - measured
+    apart = apart - np.median(apart, axis=0)
+    sound = (np.abs(apart) <= GROSS_SPREADS * spread(apart)).all(axis=1)
+    return float(np.sum(apart[sound] ** 2) / max(np.sum(seen[sound] ** 2 + measured[sound] ** 2), 1e-300))
+
+
+def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
+    """Return the change (s) of the camera's offset from the first half to the second; None if one is undetermined."""
+    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    early = np.arange(len(w_imu)) < len(w_imu) // 2
+    first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
+    if first is None or second is None:
+        return None
+    return Scalar(second.value - first.value, float(np.hypot(first.error, second.error)))
+
+
+def least_change_s(sequence: Sequence, error_s: float) -> float:
+    """Return the limit (s) of a change of the offset with this standard error (s)."""
+    return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
+
+
+def is_stamped_at_frames(sequence: Sequence) -> bool:
+    """Say whether most frames have a motion sample of the same stamp."""
+    return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
+
+
+class TruthClock(NamedTuple):
+    """Delay (s) of the frames after their stamps by the truth's clock, and by what share faster that clock runs.
+
+    Each is None where it is undetermined. ``half_s`` is half of the recording's duration.
+    """
+
+    offset: Scalar | None
+    rate: Scalar | None
+    half_s: float
+
+    @property
+    def runs_otherwise(self) -> bool:
+        """Whether the rate is significant and drives the clocks apart."""
+        if self.rate is None:
+            return False
+        return abs(self.rate.value) * self.half_s > max(LEAST_OFFSET_S, OFFSET_SIGMAS * self.rate.error * self.half_s)
+
+    @property
+    def unseen_s(self) -> float:
+        """The largest difference (s) of the clocks that may go undetected."""
+        if self.offset is None or self.rate is None:
+            return np.inf
+        return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
+
+
+class BesideTruth(NamedTuple):
+    """Rates of rotation (M, 3) rad/s of the camera, in the IMU's axes over M intervals, and of the truth.
+
+    ``sequence`` is the recording with the truth's rates of rotation in place of its motion samples.
+    """
+
+    sequence: Sequence
+    seen: Intervals
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, sequence: Sequence, camera: CameraMotion, truth: Truth) -> Self | None:
+        """Return both; None unless the truth has finite poses in the order of time and there are motion samples."""
+        step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
+        in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
+        if sequence.motion_kind == "none" or not in_order:
+            return None
+        R_world_imu = truth.T_world_imu[:, :3, :3]
+        w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+        middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
+        turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
+        rows = np.flatnonzero(camera.known)
+        seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
+        as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
+        return cls(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
+
+
+def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> TruthClock | None:
+    """Compare the clocks; None where the truth does not move, or no motion was measured."""
+    beside = BesideTruth.of(sequence, camera, truth)
+    if beside is None:
+        return None
+    offset = camera_offset(beside.sequence, beside.seen, beside.w_imu_radps)
+    rate = rate_of_clock(beside, 0.0 if offset is None else offset.value)
+    return TruthClock(offset, rate, 0.5 * sequence.duration_s)
+
+
+def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
+    """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
+
+    ``offset_s`` is an approximation of the delay (s) of the middle frame by the truth's clock. The standard error is
+    that of a jackknife over stretches of the recording.
+    """
+    clocks = _Clocks.of(beside)
+    try:
+        fitted = clocks.fitted(offset_s)
+        if fitted is None:
+            return None
+        found, at = fitted
+        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
+    except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
+        return None
+
+
+class _Linearised(NamedTuple):
+    """The camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate (m, 3, 2)."""
+
+    unexplained: Array
+    jacobian: Array
+
+
+class _Clocks(NamedTuple):
+    """The integral of the truth's rates, stamps of the frames (K,), and the camera's rates (M, 3) over M intervals.
+
+    ``since_s`` (K,) is the time since the middle of the frames.
+    """
+
+    truth: Integral
+    frames_t_ns: IntArray
+    since_s: Array
+    interval: IntArray
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, beside: BesideTruth) -> Self:
+        motion, t_ns = beside.sequence.motion, beside.sequence.frames_t_ns
+        since_s = (t_ns - t_ns[0]) / NS_PER_S
+        truth = Integral.of(motion.t_ns, motion.values[:, 3:])
+        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], beside.seen.interval, beside.w_imu_radps)
+
+    @property
+    def step_s(self) -> float:
+        return float(np.median(np.diff(self.since_s)))
+
+    def rates(self, shift_s: Array) -> Array:
+        """Return the truth's mean rates (M, 3) over the intervals, whose frames are shifted (K,)."""
+        return self.truth.means(self.frames_t_ns + np.rint(shift_s * NS_PER_S).astype(np.int64))[self.interval]
+
+    def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
+        """Return the equations of the rows that the truth covers; None where these are too few.
+
+        A fast clock lowers all rates of rotation, as a wrong focal length does, so this effect is not used for the
+        rate.
+        """
+        shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
+        at_ns = self.frames_t_ns + shift_s * NS_PER_S
+        inside = (at_ns[self.interval] >= self.truth.t_ns[0]) & (at_ns[self.interval + 1] <= self.truth.t_ns[-1])
+        used = rows[inside[rows]]
+        if used.size < LEAST_INTERVALS:
+            return None
+        slope = (self.rates(shift_s + apart_s) - self.rates(shift_s - apart_s))[used] / (2.0 * apart_s)
+        middle_s = 0.5 * (self.since_s[:-1] + self.since_s[1:])[self.interval[used]]
+        unexplained = self.w_imu_radps[used] - (1.0 + found[1]) * self.rates(shift_s)[used]
+        return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
+
+    def fitted(self, offset_s: float) -> tuple[Array, "_Linearised"] | None:
+        """Return offset and rate (2,) and the equations at them; None where they do not fit the camera's rotation."""
+        found, count, at = np.array([offset_s, 0.0]), self.interval.size, None
+        for share, steps in zip(SHARES, STEPS, strict=True):
+            aside = min(round(0.5 * (1.0 - share) * count), max(count - FEWEST, 0) // 2)
+            rows = np.arange(aside, count - aside)
+            for _ in range(steps):
+                at = self.linearised(found, rows)
+                if at is None:
+                    return None
+                found = found + _solved(*at)
+                found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
+        is_one = at is not None and abs(found[1]) < MOST_RATE and self.fits(found, offset_s)
+        return (found, at) if at is not None and is_one else None
+
+    def fits(self, found: Array, offset_s: float) -> bool:
+        """Say whether the rate lowers the residuals of the offset alone, where it shifts the ends by a step or more.
+
+        With a smaller shift, other turns cannot fit by chance, and the result is True.
+        """
+        if abs(found[1]) * self.since_s[-1] < self.step_s:
+            return True
+        rows = np.arange(self.interval.size)
+        both = [self.linearised(one, rows) for one in (found, np.array([offset_s, 0.0]))]
+        with_rate, without = (np.inf if at is None else float(np.sum(spread(at.unexplained) ** 2)) for at in both)
+        return with_rate < MOST_UNEXPLAINED * without
+
+
+def _solved(unexplained: Array, jacobian: Array) -> Array:
+    """Return offset and rate (2,) by least squares with Cauchy weights; raises LinAlgError where nothing turns."""
+    scale = np.maximum(spread(unexplained), 1e-9)
+    x, y = (jacobian / scale[:, None]).reshape(-1, 2), (unexplained / scale).ravel()
+    weight = np.ones(y.size)
+    for _ in range(ITERATIONS):
+        weighted = x.T * weight
+        found = np.linalg.solve(weighted @ x, weighted @ y)
+        weight = 1.0 / (1.0 + (y - x @ found) ** 2 / CAUCHY_SIGMAS**2)
+    return np.asarray(found)
+
+
+def _rate(unexplained: Array, jacobian: Array) -> float:
+    return float(_solved(unexplained, jacobian)[1])

@@ -1,0 +1,486 @@
+"""Conventions that contradict the motion: the extrinsic's direction, axes and translation, channels of the IMU."""
+
+import itertools
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.alignment import alignment, chained, is_excluded, is_there, metres, way_gone
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.intervals import Intervals, interval_means
+from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
+from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp, so3_log
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
+
+# A mirror image of the scene reverses the turns about two axes and the motion along the third.
+MIRRORED = "; mirrored images have the same effect"
+
+
+def signed_axes() -> Array:
+    """Return the matrices (48, 3, 3) that exchange and negate axes, the identity first."""
+    return np.stack(
+        [
+            np.eye(3)[list(order)] * np.array(signs)[:, None]
+            for order in itertools.permutations(range(3))
+            for signs in itertools.product((1.0, -1.0), repeat=3)
+        ]
+    )
+
+
+def right_handed_axes() -> Array:
+    """Return the rotations (24, 3, 3) that map axes to axes, the identity first."""
+    signed = signed_axes()
+    return np.asarray(signed[np.linalg.det(signed) > 0.0])
+
+
+def axes_named(turn: Array) -> str:
+    """Return in words which axes the rows of a matrix (3, 3) of `signed_axes` pick, for example "y, x, -z"."""
+    largest = np.argmax(np.abs(turn), axis=1)
+    return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
+
+
+# Least mean difference of the logarithms of two readings' residuals, in its own standard errors. The file allows all
+# readings, so the difference only has to be beyond chance (intervals are correlated over about a second).
+AGAINST_SECOND_READING = 4.0
+# Two readings look the same way if their cameras differ by less than this angle. The noise of the samples, which the
+# lever arm turns into motion of the camera, then changes the residuals more than the choice of the reading.
+SAME_READING_RAD = 0.05
+# Largest standard error of the share between two readings: two of them reach from either reading to the middle.
+LARGEST_ERROR = 0.25
+# From optical axes (right, down, forward) to regular ones (forward, left, up).
+_T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+
+
+def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
+    """An extrinsic whose direction and camera axes its file format leaves open.
+
+    The same 4 x 4 matrix can take coordinates from the IMU to the camera or from the camera to the IMU, and the
+    camera's axes can be x right, y down, z forward (optical) or x forward, y left, z up (regular). Points triangulated
+    in one frame, moved by the motion samples through each of the four readings and projected into the next frame, have
+    the smallest residuals under the right one. Medians over each interval are compared, which wrong matches hardly
+    affect. Two readings under which the camera looks in nearly the same direction, as an extrinsic in regular axes and
+    its inverse, differ in the position of the camera; the camera's own velocity in turns then decides between them.
+
+    Find which of the four readings of the extrinsic the tracks follow, and take it.
+    """
+    sequence = evidence.sequence
+    if EXTRINSIC_UNCERTAIN not in sequence.provenance.facts:
+        return None
+    if evidence.intervals is None:
+        return evidence.blind
+    readings, camera = _four_readings(sequence.rig.T_imu_cam), evidence.camera_motion
+    misses = {name: one_step_px_by_interval(sequence, camera, T) for name, T in readings.items()}
+    logs = {name: np.log(np.maximum(miss, 1e-9)) for name, miss in misses.items()}
+    first, *others = sorted(logs, key=lambda name: float(np.mean(logs[name])))
+    certainty = {name: mean_in_sigmas(logs[name] - logs[first]) for name in others}
+    as_good = [name for name in others if not certainty[name] > AGAINST_SECOND_READING]
+    if len(as_good) == len(others):
+        return Undecided(f"the tracks fit every reading of the extrinsic equally, best {first} and {as_good[0]}")
+    doubt = "".join(f"; {name} explains the motion equally well ({certainty[name]:.1f} sigma)" for name in as_good)
+    for name in others:
+        same_way = _turned_rad(readings[first], readings[name]) < SAME_READING_RAD
+        if not (same_way or name in as_good):
+            continue
+        share = _share(evidence.intervals, readings[first], readings[name])
+        if share is not None:
+            way = f"{share.value:.2f} +- {share.error:.2f} of the way from {first} to {name}"
+            doubt += f"; during rotation the camera's velocity is {way}"
+            first = name if share.value > 0.5 else first
+        elif same_way:
+            doubt += (
+                f"; {name} has the same orientation, and there is too little rotation to determine the camera's "
+                "position"
+            )
+    each_px = ", ".join(f"{median_one_step_px(sequence, camera, T):.2f} px {name}" for name, T in readings.items())
+    return Symptom(
+        count=1,
+        detail=f"one-step reprojection is {each_px}{doubt}",
+        treatment=f"the extrinsic is read {first}",
+        remedy=_read_as(sequence, readings[first], first),
+        harmful=first != next(iter(readings)),
+    )
+
+
+def _four_readings(T_imu_cam: Array) -> dict[str, Array]:
+    """Return T_imu_cam (4, 4), with optical camera axes, in the four readings of the given one, which is the first."""
+    inverse = se3_inverse(T_imu_cam)
+    return {
+        "as given, camera axes optical": T_imu_cam,
+        "as given, camera axes regular": T_imu_cam @ _T_REGULAR_OPTICAL,
+        "inverted, camera axes optical": inverse,
+        "inverted, camera axes regular": inverse @ _T_REGULAR_OPTICAL,
+    }
+
+
+def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scalar | None:
+    """Return where the measured velocity lies between those that two extrinsics predict: 0 is the first, 1 the other.
+
+    Constant differences are removed, because slip of a wheel and an error of the rotation cause them. The measured rate
+    of rotation is the instrument: the errors of the camera's rotation and velocity are correlated, and those of the
+    gyro are independent of both. None where no velocity is measured, or there is too little rotation.
+    """
+    if intervals.v_mps is None:
+        return None
+    one, other = (_velocities(intervals, T) for T in (T_imu_first, T_imu_other))
+    in_turns = -np.cross(intervals.w_radps, T_imu_other[:3, 3] - T_imu_first[:3, 3])
+    share = slope(*(_centred(values) for values in (in_turns, other - one, intervals.v_mps - one)))
+    return share if share.error < LARGEST_ERROR else None
+
+
+def _velocities(intervals: Intervals, T_imu_cam: Array) -> Array:
+    """Return the velocity (M, 3) of the IMU by the camera's own motion and an extrinsic."""
+    w_imu = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    return np.asarray(intervals.v_cam_mps @ T_imu_cam[:3, :3].T - np.cross(w_imu, T_imu_cam[:3, 3]))
+
+
+def _centred(values: Array) -> Array:
+    return np.asarray(values - np.median(values, axis=0))
+
+
+def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
+    return float(np.linalg.norm(so3_log(T_imu_first[:3, :3].T @ T_imu_other[:3, :3])))
+
+
+def _read_as(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
+    """Return the sequence with this extrinsic, and without the fact that its convention is in doubt."""
+    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_UNCERTAIN)
+    provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is read {reading}"))
+    return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
+
+
+# Least mean difference of the costs of two readings, in its own standard errors. To reject the file as given it must be
+# far beyond chance (intervals are correlated over about a second), to choose among repairs only beyond chance.
+AGAINST_GIVEN = 8.0
+AGAINST_SECOND = 4.0
+# Two readings look the same way if their cameras differ by less than this angle.
+SAME_WAY_RAD = 0.2
+# Positions nearer than this to each other are taken as one.
+NEAR_M = 0.01
+_OWN = "x, y, z"
+
+
+class ExtrinsicConvention(NamedTuple):
+    """An extrinsic (4, 4) under another convention than the given one.
+
+    ``name`` is the convention, ``cause`` says what is wrong with the given extrinsic, and ``done`` what is done to it.
+    ``other_m`` (3,) is the other possible position of the camera: a rotation of the body's axes also rotates the
+    position, unless that was measured in the right axes; a rotation of the camera's axes does not.
+    """
+
+    T_imu_cam: Array
+    name: str
+    cause: str
+    done: str
+    other_m: Array
+
+
+def mixed_axes(evidence: Evidence) -> Symptom | Undecided | None:
+    """Motion samples and extrinsic with different conventions of axes, or an extrinsic in the inverse direction.
+
+    The camera's own motion, transformed by the extrinsic, must equal the measured motion. Three axes have 24
+    right-handed conventions. If the body's axes follow another one, the whole extrinsic is rotated; if the camera's do,
+    the camera is rotated at its position. All of these and the inverse of the extrinsic are compared. The one that
+    explains the samples best is taken if it is not the given one and is better beyond doubt. Turns of the vehicle
+    decide between two possible positions of the camera, or the finding says that they do not. Medians are subtracted,
+    so a gyro bias has no effect.
+
+    A convention is taken only if the rotations alone do not contradict it, among all 48 ways to exchange and negate
+    three channels. Where they do, channels of the samples are wrong and not the extrinsic, and nothing is repaired.
+    Velocities alone decide nothing, because cars slip sideways, which changes the signs of the small components.
+
+    Find the extrinsic under which samples and camera agree; take it where it is not the given one.
+    """
+    if evidence.intervals is None:
+        return evidence.blind
+    given = evidence.sequence.rig.T_imu_cam
+    readings = _readings(given)  # the first is the given
+    costs = _costs(evidence.intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
+    first, second = _best_two(readings, costs)
+    better, alone = mean_in_sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
+    at_odds = _of_rotations(evidence.intervals, readings[first].T_imu_cam) != _OWN
+    if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
+        return _exchanged(alone)
+    if first == 0 and (certainty := mean_in_sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
+        return Undecided(
+            f"{readings[second].name} explains the motion as well as what is given ({certainty:.1f} sigma)"
+        )
+    if first == 0:
+        return None
+    if better < AGAINST_GIVEN:
+        return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
+    certain = mean_in_sigmas(costs[second] - costs[first]) > AGAINST_SECOND
+    taken, doubt = _settled(evidence, evidence.intervals, [readings[k] for k in _twins(readings, first)])
+    remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
+    return Symptom(
+        count=1,
+        detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} then{doubt}",
+        treatment=taken.done if certain else f"{readings[second].name} explains it as well: choose one",
+        remedy=remedy if certain else None,
+        spoils_vision=not certain,
+    )
+
+
+def _exchanged(alone: str) -> Symptom:
+    if alone == _OWN:
+        return Symptom(
+            count=1,
+            detail="the gyro agrees with the camera and the velocities do not, so no rotation of both corrects them",
+            treatment=f"the velocities' channels are exchanged or have the wrong sign: correct them{MIRRORED}",
+            remedy=None,
+        )
+    return Symptom(
+        count=1,
+        detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, so no rotation corrects all",
+        treatment=f"channels of the samples are exchanged or have the wrong sign: correct them{MIRRORED}",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _readings(given: Array) -> tuple[ExtrinsicConvention, ...]:
+    """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
+    place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
+    as_given = ExtrinsicConvention(given, _OWN, "", "", place_m)
+    return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
+
+
+def _of_body(given: Array, turn: Array) -> ExtrinsicConvention:
+    axes = axes_named(turn[:3, :3])
+    cause = f"the motion samples' axes are the extrinsic's {axes}"
+    return ExtrinsicConvention(turn @ given, axes, cause, "the extrinsic is rotated to the samples' axes", given[:3, 3])
+
+
+def _of_camera(given: Array, turn: Array) -> ExtrinsicConvention:
+    axes = axes_named(turn[:3, :3].T)
+    cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
+    done = "the camera's rotation is corrected, its position is kept"
+    return ExtrinsicConvention(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
+
+
+def _inverse(given: Array) -> ExtrinsicConvention:
+    T_imu_cam, cause = se3_inverse(given), "T_imu_cam is inverted, from the IMU to the camera"
+    return ExtrinsicConvention(
+        T_imu_cam, "the inverse of the extrinsic", cause, "the extrinsic is inverted", T_imu_cam[:3, 3]
+    )
+
+
+def _best_two(readings: tuple[ExtrinsicConvention, ...], costs: Array) -> tuple[int, int]:
+    """Return the best reading, and the best among those under which the camera looks another way."""
+    order = [int(k) for k in np.argsort(costs.mean(axis=1))]
+    twins = _twins(readings, order[0])
+    return order[0], next(k for k in order if k not in twins)
+
+
+def _twins(readings: tuple[ExtrinsicConvention, ...], one: int) -> list[int]:
+    """Return the readings under which the camera looks the same way as under one, which is among them.
+
+    A rotation of the camera's axes and one of the body's can be such a pair. The given extrinsic and its inverse have
+    none.
+    """
+    R_imu_cam = np.stack([reading.T_imu_cam[:3, :3] for reading in readings])
+    apart_rad = np.linalg.norm(R_imu_cam - R_imu_cam[one], axis=(1, 2)) / np.sqrt(2.0)  # of small angles
+    alone = (0, len(readings) - 1)
+    return [k for k in range(len(readings)) if k == one or (apart_rad[k] < SAME_WAY_RAD and not {k, one} & {*alone})]
+
+
+def _settled(
+    evidence: Evidence, intervals: Intervals, twins: list[ExtrinsicConvention]
+) -> tuple[ExtrinsicConvention, str]:
+    """Return the best of readings that look the same way, at the position that turns show, and any doubt in words."""
+    costs = _costs(intervals, np.stack([one.T_imu_cam for one in twins])).mean(axis=1)
+    place_m, doubt = _placed(evidence, intervals, twins[int(np.argmin(costs))])
+    placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in twins]
+    costs = _costs(intervals, np.stack([one.T_imu_cam for one in placed])).mean(axis=1)
+    return placed[int(np.argmin(costs))], doubt
+
+
+def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConvention) -> tuple[Array, str]:
+    """Return the position (3,) m of a reading's camera, or its other one where turns show that, and doubt in words."""
+    here, other = reading.T_imu_cam[:3, 3], reading.other_m
+    turned = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=reading.T_imu_cam))
+    found = alignment(turned, evidence.camera_motion, intervals)
+    if found is None or np.linalg.norm(other - here) < NEAR_M:
+        return here, ""
+    share = way_gone(turned, intervals, found, other - here)
+    if is_there(share):
+        return other, f"; by rotations the camera is at {metres(other)} and not at {metres(here)}"
+    if is_excluded(share):
+        return here, ""
+    return here, (
+        f"; too little rotation to decide whether the camera is at {metres(here)}, as assumed, or at {metres(other)}"
+    )
+
+
+def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
+    """Name the axes of an extrinsic that the gyro's channels measure: x, y, z unless others are better beyond doubt."""
+    signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
+    best = int(np.argmin(costs.mean(axis=1)))
+    return axes_named(signed[best]) if mean_in_sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
+
+
+def _costs(intervals: Intervals, candidates: Array) -> Array:
+    """Return the negative Cauchy log-likelihood (C, M) of each interval under each extrinsic (C, 4, 4)."""
+    R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
+    w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)
+    costs = cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)
+    if intervals.v_mps is not None:
+        v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
+        costs = costs + cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
+    return costs
+
+
+def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
+    """Return the change of the one-step stereo reprojection as text."""
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    given_px, now_px = (median_one_step_px(sequence, camera, T) for T in (sequence.rig.T_imu_cam, T_imu_cam))
+    return f"median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px"
+
+
+def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
+    """An extrinsic whose translation is that of its inverse.
+
+    A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like a
+    rigid transform, it puts the camera at p = -R_imu_cam t instead of t. Turns distinguish the two, because the
+    camera's velocity differs from the IMU's by w x p. The regression of `parts.alignment` over the whole recording
+    estimates the position, with the scale and the rotation of the camera as further unknowns. Where it lies between p
+    and t decides.
+
+    Compare the translation as given with that of the inverse; replace it where the latter is far more likely.
+    """
+    if evidence.intervals is None:
+        return evidence.blind
+    if evidence.intervals.v_mps is None or evidence.alignment is None:
+        return None  # without velocities lever-arm estimates the position
+    rig = evidence.sequence.rig
+    rotation, given = rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3]
+    candidate = -rotation.T @ given
+    apart_m = float(np.linalg.norm(candidate - given))
+    if apart_m == 0.0:
+        return None
+    share = way_gone(evidence.sequence, evidence.intervals, evidence.alignment, candidate - given)
+    if is_excluded(share):
+        return None
+    where = (
+        f"by the tracks during rotation it is {share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m) to"
+    )
+    if not is_there(share):
+        summary = (
+            f"the camera is at {metres(given)}, or at {metres(candidate)} if that is the translation of the inverse"
+        )
+        return Undecided(f"{summary}: {where} there, and there is too little rotation to decide")
+    return Symptom(
+        count=1,
+        detail=(
+            f"the camera at {metres(given)} in the IMU frame is the translation of the inverse: {where} "
+            f"{metres(candidate)}"
+        ),
+        treatment="the camera's position is set to it",
+        remedy=replace(evidence.sequence, rig=replace(rig, T_imu_cam=se3(rotation, candidate))),
+    )
+
+
+# Durations (s). Over a stride the camera's velocity changes by more than its noise; over a window the gyro drifts
+# little.
+STRIDE_S, WINDOW_S = 0.5, 10.0
+# So many strides begin within the length of one.
+OVERLAP = 2
+LEAST_STRIDES = 20
+# Accuracy of such a change of velocity (m/s^2).
+LEAST_SPREAD = 0.1
+# Another order must be better than the given one by so many standard errors, and leave at most this share of what the
+# given one leaves, because an order can also explain a part of other faults. In sound recordings the given order is the
+# best.
+AGAINST_GIVEN_ORDER, MOST_LEFT = 5.0, 0.7
+
+
+class _Changes(NamedTuple):
+    """Over M strides: the change of velocity (M, 3), and that of each channel in each axis (M, 3, 3, 3), in m/s^2.
+
+    ``along`` is the mean of each channel if it measured each axis: [stride, axis of the IMU, channel, axis of the first
+    frame]. ``window`` (M,) numbers the windows.
+    """
+
+    velocity: Array
+    along: Array
+    window: IntArray
+
+
+def accelerometer_axes(evidence: Evidence) -> Symptom | None:
+    """An accelerometer whose channels are exchanged or have the wrong sign, while gyro and camera agree.
+
+    In the axes of one frame, by the gyro, the change of the camera's velocity less the specific force is gravity, which
+    is constant. All 48 ways to exchange and negate three channels are tried; the right one leaves the smallest
+    variation. A motion that turns about one axis only and hardly accelerates distinguishes few of them.
+
+    Report the order and the signs of the channels that fit the camera's motion, if they are not the given ones.
+    """
+    intervals, sequence = evidence.intervals, evidence.sequence
+    if intervals is None or sequence.motion_kind != "imu":
+        return None
+    found = evidence.agreement
+    if found.residual_px > found.limit_px:
+        return None  # gyro and camera differ, which `disagreement` reports
+    changes = _changes(evidence, intervals)
+    if len(changes.velocity) < LEAST_STRIDES:
+        return None
+    orders = signed_axes()
+    left = np.stack([_left(changes, order) for order in orders])
+    costs = cauchy(left, LEAST_SPREAD)
+    ranked = [int(k) for k in np.argsort(costs.mean(axis=1))]
+    best = ranked[0]
+    given_mps2, best_mps2 = (float(np.median(np.linalg.norm(left[k], axis=1))) for k in (0, best))
+    if best == 0 or mean_in_sigmas(costs[0] - costs[best]) < AGAINST_GIVEN_ORDER or best_mps2 > MOST_LEFT * given_mps2:
+        return None
+    return Symptom(
+        count=1,
+        detail=(
+            f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: the residual against the camera's "
+            f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 then (median)"
+        ),
+        treatment=f"its channels are exchanged or have the wrong sign: correct them{MIRRORED}",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _changes(evidence: Evidence, intervals: Intervals) -> _Changes:
+    """Return changes of the camera's velocity between the middles of intervals, in axes of the first frame."""
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
+    bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ R_imu_cam.T, axis=0)
+    frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
+    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
+    v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
+    middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
+    h_s = np.diff(middle_ns) / NS_PER_S
+    mean = interval_means(motion.t_ns, motion.values, middle_ns)
+    half = so3_exp(0.5 * h_s[:, None] * (mean[:, 3:] - bias_radps))
+    R_first_imu = chained(half @ half)
+    v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
+    made = np.einsum("kia,kc,k->kaci", R_first_imu[:-1] @ half, mean[:, :3], h_s)
+    up_to = np.concatenate([np.zeros((1, 3, 3, 3)), np.cumsum(made, axis=0)])
+    stride = max(OVERLAP, round(STRIDE_S / float(np.median(h_s))))
+    a = np.arange(0, len(v_first) - stride, stride // OVERLAP)
+    unknown = np.concatenate([[0], np.cumsum(~camera.known)])
+    a = a[unknown[a + stride + 1] == unknown[a]]
+    b = a + stride
+    t_s = (middle_ns - middle_ns[0]) / NS_PER_S
+    over_s = t_s[b] - t_s[a]
+    window = (t_s[a] // WINDOW_S).astype(np.int64)
+    return _Changes(
+        (v_first[b] - v_first[a]) / over_s[:, None], (up_to[b] - up_to[a]) / over_s[:, None, None, None], window
+    )
+
+
+def _left(changes: _Changes, order: Array) -> Array:
+    """Return the changes (M, 3) less the specific force in an order (3, 3) of channels, about the window's median."""
+    left = changes.velocity - np.einsum("kaci,ac->ki", changes.along, order.T)
+    for window in np.unique(changes.window):
+        here = changes.window == window
+        left[here] -= np.median(left[here], axis=0)
+    return np.asarray(left)

@@ -1,0 +1,789 @@
+"""Faults of the motion samples alone, or beside the sizes of motion and gravity: values, columns, units, noise."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.edits import keep_samples
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.intervals import (
+    FORCES,
+    RATES,
+    SPEEDS,
+    Intervals,
+    force_ratio,
+    is_from_scatter,
+    ratio_of_speeds,
+    rotation_ratio,
+    speed_ratio,
+)
+from toolkit.audit.one_step import median_one_step_px
+from toolkit.audit.robust import Scalar
+from toolkit.geometry import Array, BoolArray, se3
+from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, TwistNoise, TwistSamples
+from toolkit.models.gating import MAD_TO_SIGMA
+from toolkit.models.noise import white_sigma
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, is_measured
+
+COORDINATES = ("uL", "uR", "v")
+CHANNELS = {"twist": ("velocity", "rate of rotation"), "imu": ("accelerometer", "gyro")}
+
+
+def not_finite(evidence: Evidence) -> Symptom | None:
+    """Sightings and motion samples that hold NaN or infinity; a column without a finite value is named.
+
+    Count the rows with a value that is not finite, and drop them; a missing right image is not a fault.
+    """
+    sequence = evidence.sequence
+    sightings: BoolArray = is_measured(sequence.observations.uv_px)
+    samples: BoolArray = np.asarray(np.isfinite(sequence.motion.values).all(axis=1))
+    bad_sightings, bad_samples = int(np.sum(~sightings)), int(np.sum(~samples))
+    if bad_sightings + bad_samples == 0:
+        return None
+    uv_px, values = sequence.observations.uv_px, sequence.motion.values
+    empty = _empty(uv_px[:, [0, 2]], (COORDINATES[0], COORDINATES[2]))
+    if sequence.motion_kind != "none":
+        names = (f"{sensor} {axis}" for sensor in CHANNELS[sequence.motion_kind] for axis in "xyz")
+        empty += _empty(values, tuple(names))
+    detail = f"{bad_sightings} sighting(s) and {bad_samples} motion sample(s) are not finite"
+    detail += f" ({', '.join(empty)} in all of them)" if empty else ""
+    if bad_samples and not samples.any():
+        why = "no motion sample is left: check the program that wrote them"
+        return Symptom(bad_sightings + bad_samples, detail, why, remedy=None, spoils_vision=True)
+    remedy = sequence
+    if bad_sightings:
+        remedy = replace(remedy, observations=sequence.observations.select(sightings))
+    if bad_samples:
+        remedy = keep_samples(remedy, samples)
+    return Symptom(
+        count=bad_sightings + bad_samples,
+        detail=detail,
+        treatment="dropped; the neighbouring motion samples bridge the interval",
+        remedy=remedy,
+    )
+
+
+def _empty(values: Array, names: tuple[str, ...]) -> list[str]:
+    """Name the columns of values (N, n) in which nothing is finite."""
+    if not len(values):
+        return []
+    return [name for name, column in zip(names, values.T, strict=True) if not np.isfinite(column).any()]
+
+
+# Values beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
+MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
+# Rates of change (m/s^2, rad/s^2) of a vehicle's velocity and rate of rotation that no vehicle reaches in both
+# directions within two samples: one and a half times gravity, and the same number.
+MOST_CHANGE = 15.0
+# A single sample of an accelerometer or gyro that differs from its neighbours by more is not a knock (m/s^2, rad/s).
+MOST_STEP = np.repeat([500.0, 10.0], 3)
+# Least difference of a sample that stands alone (m/s^2, rad/s): a smaller one matters no more than noise.
+LEAST_ALONE = np.repeat([2.0, 0.2], 3)
+# A sample stands alone if the steps next to its own are less than this share of its own. If more than this share of the
+# samples, and more than three, stand alone, they are usual for the sensor, as on a walking robot.
+ALONE, MOST_ALONE, FEWEST_ALONE = 0.2, 1e-3, 3
+# Noise alone may exceed these limits at a high rate, so a step must also exceed this many standard deviations of the
+# steps. Sound recordings have 5 at most, twists of a hand-held rig (dataset3) 20 and 40, which are below MOST_CHANGE.
+BEYOND_STEPS = 20.0
+# A wrong unit makes all samples too large; a single one exceeds this many times the median.
+BEYOND_MEDIAN = 1e3
+
+
+def implausible(evidence: Evidence) -> Symptom | None:
+    """Single values that no sensor gives, by a flipped bit or a failed parse; one of them can ruin a whole run.
+
+    A twist that differs from both neighbours by more than a vehicle's velocity can change is not a motion of the
+    vehicle, even if its value is possible. With an IMU, a single sample that differs from its neighbours, while those
+    do not differ from theirs, is not a motion either: a knock shows in several samples, or happens again.
+
+    Count sightings and motion samples beyond anything physical; drop them.
+    """
+    sequence = evidence.sequence
+    sightings: BoolArray = np.asarray((np.abs(sequence.observations.uv_px) > MOST_PX).any(axis=1))
+    samples = _implausible_samples(sequence)
+    if not (sightings.any() or samples.any()):
+        return None
+    remedy = sequence
+    if sightings.any():
+        remedy = replace(remedy, observations=sequence.observations.select(~sightings))
+    if samples.any():
+        remedy = keep_samples(remedy, ~samples)
+    return Symptom(
+        count=int(sightings.sum() + samples.sum()),
+        detail=(
+            f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) are beyond the range of any sensor, "
+            f"up to {_largest(sequence, sightings, samples):.3g}"
+        ),
+        treatment="dropped; the neighbouring motion samples bridge the interval",
+        remedy=remedy,
+    )
+
+
+def _implausible_samples(sequence: Sequence) -> BoolArray:
+    """Say which motion samples (S,) are beyond the limits and far from the others, or differ as no motion does."""
+    most_linear = MOST_MPS if sequence.motion_kind == "twist" else MOST_MPS2
+    size = np.abs(sequence.motion.values)
+    beyond = np.zeros(len(size), dtype=bool)
+    for columns, most in ((size[:, :3], most_linear), (size[:, 3:], MOST_RADPS)):
+        largest = columns.max(axis=1, initial=0.0)
+        if largest.size:
+            beyond |= (largest > most) & (largest > BEYOND_MEDIAN * np.median(largest))
+    return beyond | _leaps(sequence)
+
+
+def _leaps(sequence: Sequence) -> BoolArray:
+    """Say which samples (S,) differ from both neighbours in the same direction by more than a motion can."""
+    values, t_s = sequence.motion.values, sequence.motion.t_ns / NS_PER_S
+    leaps = np.zeros(len(values), dtype=bool)
+    if sequence.motion_kind == "none" or len(values) < 3:
+        return leaps
+    step, step_s = np.diff(values, axis=0), np.diff(t_s)[:, None]
+    least = BEYOND_STEPS * MAD_TO_SIGMA * np.median(np.abs(step), axis=0)
+    if sequence.motion_kind == "twist":
+        leaps[1:-1] = _there_and_back(step, np.maximum(MOST_CHANGE * step_s, least)).any(axis=1)
+        return leaps
+    leaps[1:-1] = _there_and_back(step, np.maximum(MOST_STEP, least)).any(axis=1)
+    return leaps | _alone(step, np.maximum(LEAST_ALONE, least))
+
+
+def _there_and_back(step: Array, least: Array) -> BoolArray:
+    """Say for which inner samples (S - 2, d) both steps (S - 1, d) exceed the least and have opposite signs."""
+    far = np.abs(step) > least
+    return np.asarray(far[1:] & far[:-1] & (np.sign(step[1:]) * np.sign(step[:-1]) < 0.0))
+
+
+def _alone(step: Array, least: Array) -> BoolArray:
+    """Say which samples (S,) differ from their neighbours, by steps (S - 1, d), while those do not differ from theirs.
+
+    None where there are too many.
+    """
+    alone = np.zeros(len(step) + 1, dtype=bool)
+    size = np.abs(step)
+    beside = np.maximum(size[:-3], size[3:])  # steps from its two neighbours to the next samples
+    quiet = beside < ALONE * np.minimum(size[1:-2], size[2:-1])
+    alone[2:-2] = (_there_and_back(step, least)[1:-1] & quiet).any(axis=1)
+    return alone if alone.sum() <= max(FEWEST_ALONE, MOST_ALONE * alone.size) else np.zeros_like(alone)
+
+
+def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> float:
+    bad: tuple[Array, ...] = (sequence.observations.uv_px[sightings], sequence.motion.values[samples])
+    return max(float(np.abs(values).max(initial=0.0)) for values in bad)
+
+
+# Least number and duration (s) of equal samples in a row: beyond chance, and beyond a sensor that is read more often
+# than it measures.
+LEAST_RUN, LEAST_S = 10, 0.1
+# Level of significance of a run of odometry's samples, for the whole recording, and the least length of a run.
+CHANCE, LEAST_RUN_OF_ODOMETRY = 1e-3, 4
+# If more than this share of all samples repeats, the rest is not interpolated: it would not represent the motion.
+MOST_REPEATED = 0.2
+# Least duration (s) for a single axis: one axis of a coarse sensor at rest may repeat a value for a while.
+LEAST_OF_AXIS_S = 1.0
+# Median speed and rate of the camera below which the vehicle may stand, or drive straight ahead.
+CAMERA_STANDING_MPS, STRAIGHT_RADPS = 0.1, 0.01
+IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
+
+
+def stuck_samples(evidence: Evidence) -> Symptom | None:
+    """An accelerometer, a gyro or odometry that repeats one value: the driver hangs or the sensor is not connected.
+
+    Real samples have noise: three axes are not equal many times in a row, nor is one axis for a second. Odometry can
+    repeat a value without a fault, zeros while the vehicle stands or whole counts of an encoder on a straight line. Its
+    repetitions are a fault where it moves and turns at once, or where its velocities or rates are zero throughout while
+    the camera moves. The number of equal samples in a row that is beyond chance follows from how often two neighbours
+    are equal in the rest of the recording.
+
+    Count the samples that repeat the one before in a long run; drop them.
+    """
+    sequence = evidence.sequence
+    if sequence.motion_kind == "none" or not sequence.motion.t_ns.size:
+        return None
+    values, t_ns = sequence.motion.values, sequence.motion.t_ns
+    step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
+    least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
+    if sequence.motion_kind == "twist" and (never := _never_moves(evidence)) is not None:
+        return never
+    if sequence.motion_kind == "twist":
+        moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
+        repeated = {"odometry": _in_long_runs(values, _least_of_odometry(values, least, step_s)) & moves_and_turns}
+    else:
+        repeated = {name: _in_long_runs(values[:, columns], least) for name, columns in IMU_SENSORS.items()}
+    stuck_axes = _stuck_axes(values, repeated, step_s) if sequence.motion_kind == "imu" else None
+    if stuck_axes is not None:
+        return stuck_axes
+    stuck = np.logical_or.reduce(list(repeated.values()))
+    if not stuck.any():
+        return None
+    seconds = {name: float(rows.sum()) * step_s for name, rows in repeated.items()}
+    too_many = stuck.mean() > MOST_REPEATED
+    return Symptom(
+        count=int(stuck.sum()),
+        detail=", ".join(f"the {name} repeats one value for {time:.3g} s" for name, time in seconds.items() if time),
+        treatment=(
+            "too long to be bridged: check the driver and the cables"
+            if too_many
+            else "repeated samples are dropped; the others bridge the gap"
+        ),
+        remedy=None if too_many else keep_samples(sequence, ~stuck),
+        spoils_vision=bool(too_many),
+    )
+
+
+def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
+    """Return how many equal samples (S, 6) of odometry in a row are a fault: 0.1 s of them, and beyond chance."""
+    same = (values[1:] == values[:-1]).all(axis=1)
+    lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
+    longest = int(lengths.max(initial=1)) - 1
+    often = (same.sum() - longest + 1) / max(same.size - longest + 1, 2)  # in the rest of the recording
+    if often >= 1.0:
+        return least
+    by_chance = 1 + int(np.ceil(np.log(CHANCE / len(values)) / np.log(often)))
+    return min(max(by_chance, LEAST_RUN_OF_ODOMETRY, 1 + round(LEAST_S / max(step_s, 1e-6))), least)
+
+
+def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Symptom | None:
+    """Report single axes of an IMU (S, 6) that repeat one value while the other axes of the sensor do not."""
+    least, found = max(LEAST_RUN, round(LEAST_OF_AXIS_S / max(step_s, 1e-6))), list[tuple[str, BoolArray]]()
+    for name, columns in IMU_SENSORS.items():
+        for axis, column in zip("xyz", values[:, columns].T, strict=True):
+            repeats = _in_long_runs(column[:, None], least) & ~whole[name] & ~_at_an_end(column)
+            found += [(f"{name} {axis}", repeats)] if repeats.any() else []
+    if not found:
+        return None
+    return Symptom(
+        count=int(np.logical_or.reduce([rows for _, rows in found]).sum()),
+        detail=", ".join(f"the {name} repeats one value for {rows.sum() * step_s:.3g} s" for name, rows in found),
+        treatment="the true values are unknown: check the driver and the cables (real samples have noise)",
+        remedy=None,
+    )
+
+
+def _at_an_end(column: Array) -> BoolArray:
+    """Say which values (S,) are at an end of the sensor's range: the largest or smallest, reached more than once."""
+    at_end = np.zeros(column.size, dtype=bool)
+    for end in (column.min(initial=np.inf), column.max(initial=-np.inf)):
+        here = column == end
+        if np.sum(here[1:] & ~here[:-1]) + here[:1].sum() > 1:
+            at_end |= here
+    return at_end
+
+
+def _never_moves(evidence: Evidence) -> Symptom | None:
+    """Report odometry whose velocities or rates of rotation are all zero while the camera's are not."""
+    camera, values = evidence.camera_motion, evidence.sequence.motion.values
+    if not len(values) or camera.known.sum() < LEAST_RUN:
+        return None
+    speed_mps = float(np.median(np.linalg.norm(camera.v_mps[camera.known], axis=1)))
+    rate_radps = float(np.median(np.linalg.norm(camera.w_radps[camera.known], axis=1)))
+    findings = []
+    if not values[:, :3].any() and speed_mps > CAMERA_STANDING_MPS:
+        findings.append(f"all {len(values)} velocities are zero while the camera moves at {speed_mps:.2g} m/s (median)")
+    if not values[:, 3:].any() and rate_radps > STRAIGHT_RADPS:
+        findings.append(
+            f"all {len(values)} rates of rotation are zero while the camera turns at {rate_radps:.2g} rad/s"
+        )
+    if not findings:
+        return None
+    return Symptom(
+        count=len(values),
+        detail=", and ".join(findings),
+        treatment="they were not recorded: check the driver and the cables",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _in_long_runs(values: Array, least: int) -> BoolArray:
+    """Say which samples (S, d) repeat the one before, within a run of at least ``least`` equal ones."""
+    if not len(values):
+        return np.zeros(0, dtype=bool)
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    begins = np.flatnonzero(~same)
+    lengths = np.diff(np.append(begins, same.size))
+    long = np.repeat(lengths >= least, lengths)
+    # If more than half of the neighbours outside such runs are equal too, the sensor is coarse and not stuck.
+    is_coarse = (~long).any() and same[~long].mean() > 0.5
+    return np.asarray(same & long & ~is_coarse)
+
+
+# Least number of samples at the largest value of an axis, and the least ratio to the number at the value next to it. A
+# sensor with coarse steps also has several samples at its largest value, but more at the one next to it.
+LEAST_COUNT, LEAST_RATIO = 10, 3.0
+AXES = tuple(f"{sensor} {axis}" for sensor in ("accelerometer", "gyro") for axis in "xyz")
+UNITS = ("m/s^2", "m/s^2", "m/s^2", "rad/s", "rad/s", "rad/s")
+
+
+def saturated_samples(evidence: Evidence) -> Symptom | None:
+    """An accelerometer or a gyro at the end of its range: larger values are cut off and lost.
+
+    Samples that are cut off accumulate at the largest value of an axis, while those of a sensor within its range become
+    fewer towards it. Nothing is repaired, because the true values are unknown.
+
+    Report the axes whose samples accumulate at an end of the range, with their number and value.
+    """
+    if evidence.sequence.motion_kind != "imu":
+        return None
+    values = evidence.sequence.motion.values
+    findings, rows = list[str](), np.zeros(len(values), dtype=bool)
+    for name, unit, column in zip(AXES, UNITS, values.T, strict=True):
+        for sign in (1.0, -1.0):
+            at_end = _at_range_end(sign * column)
+            if at_end.any():
+                rows |= at_end
+                findings.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
+    if not findings:
+        return None
+    return Symptom.warning(
+        count=int(rows.sum()),
+        detail=f"samples accumulate at the end of a range: {', '.join(findings)}",
+        treatment="values beyond it are lost: use a sensor of a larger range",
+    )
+
+
+def _at_range_end(column: Array) -> BoolArray:
+    """Say which samples (S,) are at the largest value, if they are too many for a sensor within its range."""
+    distinct, counts = np.unique(column, return_counts=True)
+    if distinct.size < 2 or counts[-1] < max(LEAST_COUNT, LEAST_RATIO * counts[-2]):
+        return np.zeros(column.size, dtype=bool)
+    return np.asarray(column == distinct[-1])
+
+
+# Fewer samples, or fewer different values, are not judged.
+LEAST_COARSE_SAMPLES, LEAST_VALUES = 100, 5
+# Rounding is reported from this share of the stated standard deviation of a sample on, as for pixels.
+MOST_ROUNDING = 0.5
+_COLUMNS = {
+    "twist": (("velocities", "m/s"), ("rates of rotation", "rad/s")),
+    "imu": (("accelerometer", "m/s^2"), ("gyro", "rad/s")),
+}
+
+
+class _Coarse(NamedTuple):
+    """The step of a sensor's axis, and the stated standard deviation of a sample, in its unit."""
+
+    step: float
+    stated: float
+
+    @property
+    def rounding(self) -> float:
+        return self.step / float(np.sqrt(12.0))
+
+
+def coarse_samples(evidence: Evidence) -> Symptom | None:
+    """Motion samples that come in steps, because a converter has few bits or a log few digits.
+
+    Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals", 1948).
+    While a vehicle moves uniformly they stay the same for seconds, so they are not white noise. Rounded values repeat,
+    and different ones are at least a step apart; without rounding, noise makes nearly all values different.
+
+    Report the steps of the samples where the rounding is more than MOST_ROUNDING of the stated noise.
+    """
+    sequence = evidence.sequence
+    if sequence.motion_kind == "none" or sequence.motion.t_ns.size < LEAST_COARSE_SAMPLES:
+        return None
+    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    if not step_s > 0.0:
+        return None
+    values, stated = sequence.motion.values, _stated(sequence.noise) / np.sqrt(step_s)
+    found = list[str]()
+    for columns, (name, unit) in zip((slice(0, 3), slice(3, 6)), _COLUMNS[sequence.motion_kind], strict=True):
+        axes = [
+            _Coarse(*one) for one in zip(map(_step_of, values[:, columns].T), stated[columns].tolist(), strict=True)
+        ]
+        worst = max(axes, key=lambda one: one.rounding / one.stated)
+        if worst.rounding > MOST_ROUNDING * worst.stated:
+            found.append(
+                f"{name} come in steps of {worst.step:.3g} {unit}, which adds errors of {worst.rounding:.2g} to the "
+                f"{worst.stated:.2g} {unit} stated for a sample"
+            )
+    if not found:
+        return None
+    return Symptom.warning(
+        count=len(found),
+        detail="; ".join(found),
+        treatment="write all the digits that the sensor has, or state noise that includes the rounding",
+    )
+
+
+def _stated(noise: MotionNoise) -> Array:
+    """Return the stated densities (6,) of linear and angular samples."""
+    if isinstance(noise, TwistNoise):
+        return np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
+    assert isinstance(noise, ImuNoise)
+    return np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
+
+
+def _step_of(column: Array) -> float:
+    """Return the least distance of two different values (S,); 0 where few or most of the values are different."""
+    distinct = np.unique(column[np.isfinite(column)])
+    if not LEAST_VALUES <= distinct.size < column.size // 2:
+        return 0.0
+    return float(np.diff(distinct).min())
+
+
+# Limit of the stated white noise over that of the samples. It is often stated several times too large on purpose, for
+# vibration and errors of scale. Sound recordings at hand have 8 at most (accelerometer, 5 s of MH_01), with the factor
+# that this toolkit puts on EuRoC's noise; chosen with them in view.
+MOST_WHITE = 40.0
+# Limit of the stated random walk over the change of the samples, to which motion adds far more than the walk. A true
+# walk exceeds it less than once in ten thousand, by the chi-square of twelve changes (three axes, four quarters of a
+# recording).
+MOST_WALK = 3.0
+LEAST_SAMPLES = 100
+_SENSORS = {"accel": (slice(0, 3), "m/s^2"), "gyro": (slice(3, 6), "rad/s")}
+
+
+def overstated_noise(evidence: Evidence) -> Symptom | None:
+    """An IMU whose stated noise is far more than its samples can have: estimators then hardly use the sensor.
+
+    White noise of density s gives samples, dt apart, a standard deviation of s / sqrt(dt), and a random walk of density
+    w changes them by w sqrt(T) within a time T. Motion adds to both. Samples that scatter or change by much less
+    contradict the stated noise. A stated noise that is too small shows in residuals and is not judged here. Source:
+    Woodman, "An introduction to inertial navigation" (2007), section 4.
+
+    Compare the scatter of an IMU's samples, and their change over time, with those of the stated noise.
+    """
+    motion, noise = evidence.sequence.motion, evidence.sequence.noise
+    if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)):
+        return None
+    finite = np.isfinite(motion.values).all(axis=1)
+    t_ns, values = motion.t_ns[finite], motion.values[finite]
+    if t_ns.size < LEAST_SAMPLES or (np.diff(t_ns) <= 0).any():
+        return None
+    findings = list(_refuted(t_ns / NS_PER_S - t_ns[0] / NS_PER_S, values, noise))
+    if not findings:
+        return None
+    return Symptom.warning(
+        count=len(findings),
+        detail="; ".join(findings),
+        treatment=(
+            "estimators given this noise hardly use the IMU: check it (imu0/sensor.yaml, imu.yaml); it is a "
+            "density, the standard deviation at one sample a second"
+        ),
+    )
+
+
+def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
+    """Yield a description of each stated density that samples (S, 6) at times (S,) contradict, with both figures."""
+    step_s = float(np.median(np.diff(t_s)))
+    lag_s = 0.25 * float(t_s[-1] - t_s[0])
+    for name, (columns, unit) in _SENSORS.items():
+        stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s)
+        found = float(white_sigma(values[:, columns]).max())
+        error = found / np.sqrt(len(values))
+        if stated > MOST_WHITE * found and found > 0.0:
+            yield (
+                f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and measured are {found:.2g} "
+                f"+- {error:.1g}"
+            )
+        stated = getattr(noise, f"{name}_random_walk") * np.sqrt(lag_s)
+        found = _moved(t_s, values[:, columns], lag_s)
+        if stated > MOST_WALK * found > 0.0:
+            yield (
+                f"by {name}_random_walk they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are "
+                f"{found:.3g}"
+            )
+
+
+def _moved(t_s: Array, values: Array, lag_s: float) -> float:
+    """Return the change of samples (S, 3) within a time, motion included: the root mean square over all axes."""
+    begin = np.flatnonzero(t_s <= t_s[-1] - lag_s)
+    end = np.minimum(np.searchsorted(t_s, t_s[begin] + lag_s), t_s.size - 1)
+    return float(np.sqrt(np.mean((values[end] - values[begin]) ** 2)))
+
+
+# As given a size is wrong by more than the first factor; exchanged, both are right within the second, as in sound
+# recordings.
+LEAST_FACTOR, MOST_FACTOR = 3.0, 1.25
+_OTHER_WAY = [3, 4, 5, 0, 1, 2]
+
+
+def exchanged_samples(evidence: Evidence) -> Symptom | None:
+    """Velocities and rates of rotation in each other's columns; with an IMU, specific forces and rates.
+
+    In SI units the speed of a vehicle exceeds its rate of rotation by far, and specific force is gravity on average.
+    Where the sizes of the samples contradict the camera's motion and gravity by far, and agree once the columns are
+    exchanged, the columns were exchanged.
+
+    Exchange linear and angular columns where this alone makes both agree with camera and gravity.
+    """
+    sequence = evidence.sequence
+    if evidence.intervals is None or not _sizes_are_off(evidence):
+        return None
+    exchanged = _exchanged(sequence)
+    if not _fits(evidence.after(exchanged)):
+        return None
+    names = ("velocities", "rates of rotation")
+    if sequence.motion_kind == "imu":
+        names = ("accelerations", "rates of rotation")
+    return Symptom(
+        count=len(sequence.motion.values),
+        detail=f"{names[0]} and {names[1]} are exchanged: {_sizes(sequence)}, which are plausible the other way round",
+        treatment="exchanged back",
+        remedy=exchanged,
+    )
+
+
+def _exchanged(sequence: Sequence) -> Sequence:
+    """Return the sequence with linear and angular columns exchanged, and the noise if it was estimated from them."""
+    motion, noise = sequence.motion, sequence.noise
+    exchanged = replace(sequence, motion=motion.of(motion.t_ns, motion.values[:, _OTHER_WAY]))
+    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
+        return exchanged
+    velocity, gyro = noise.velocity_noise_density, noise.gyro_noise_density
+    if not (
+        is_from_scatter(velocity, motion.v_mps, motion.t_ns) and is_from_scatter(gyro, motion.w_radps, motion.t_ns)
+    ):
+        return exchanged
+    return replace(exchanged, noise=replace(noise, velocity_noise_density=gyro, gyro_noise_density=velocity))
+
+
+def _sizes_are_off(evidence: Evidence) -> bool:
+    speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
+    ratio = speed if force is None else force
+    return ratio is not None and not 1.0 / LEAST_FACTOR < ratio.value < LEAST_FACTOR
+
+
+def _fits(evidence: Evidence) -> bool:
+    if evidence.intervals is None:
+        return False
+    sizes = (speed_ratio(evidence.intervals), force_ratio(evidence.sequence))
+    fit = all(1.0 / MOST_FACTOR < size.value < MOST_FACTOR for size in sizes if size is not None)
+    return fit and rotation_ratio(evidence.intervals).value < MOST_FACTOR  # the camera's noise lowers this one
+
+
+def _sizes(sequence: Sequence) -> str:
+    """Return the median sizes of linear and angular columns as text."""
+    first, second = (float(np.median(np.linalg.norm(half, axis=1))) for half in np.split(sequence.motion.values, 2, 1))
+    unit = "m/s^2" if sequence.motion_kind == "imu" else "m/s"
+    return f"{first:.2g} {unit} and {second:.2g} rad/s (medians)"
+
+
+LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
+# A unit is named where the ratio is within this factor of the unit's, and this many standard errors from one.
+WITHIN_FACTOR, UNIT_SIGMAS = 1.25, 5.0
+# Vision's speed is accurate to 5 % in sound recordings, which distinguishes km/h from ft/s, a factor of 1.1 apart.
+WITHIN_FACTOR_OF_SPEED = 1.08
+# The stamps are wrong if the ratios of speeds and of rates of rotation are both beyond the first factor, and differ by
+# less than the second.
+LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
+# Limits of the time (s) between two frames of a vehicle's camera.
+LEAST_FRAME_S, MOST_FRAME_S = 1e-3, 5.0
+IN_A_PART = " in a part of the recording and not in another"
+# Limits of the baselines of rigs on vehicles, hand-held or flying (m), and the largest distance of a camera from its
+# IMU (m).
+LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
+
+
+class _WrongUnit(NamedTuple):
+    """A unit that is wrong: what was measured, and the sequence in SI, or None where two units are as likely."""
+
+    summary: str
+    remedy: Sequence | None
+
+
+def units(evidence: Evidence) -> Symptom | Undecided | None:
+    """Times, lengths, speeds, rates of rotation and accelerations in other units than SI.
+
+    Two sources of one motion have a ratio that does not depend on axes: of the speeds of samples and camera, of their
+    rates of rotation, of the speeds of truth and samples, of specific force and gravity. A ratio far from one that is a
+    unit's factor names the unit; other ratios are not judged here. A ratio that speeds and rates have in common is that
+    of the stamps, because the camera's motion is divided by time. The baseline and the extrinsic are judged by lengths
+    that no rig has.
+
+    Count the quantities in another unit; convert them where the unit is certain.
+    """
+    found: list[_WrongUnit] = []
+    now = evidence
+    stamps = _stamps(evidence) or _frame_rate(evidence)
+    measures = (_baseline, _lever_arm, _speed, _rotation, _force, _truth)
+    found += [] if stamps is None else [stamps]
+    for measure in measures if stamps is None else ():
+        wrong = measure(now)
+        if wrong is not None:
+            found.append(wrong)
+            now = now if wrong.remedy is None else now.after(wrong.remedy)
+    if not found:
+        return evidence.blind if evidence.intervals is None else None
+    certain = all(wrong.remedy is not None for wrong in found)
+    return Symptom(
+        count=len(found),
+        detail="; ".join(wrong.summary for wrong in found),
+        treatment="converted to SI" if certain else "no single unit fits all of it: correct the recording",
+        remedy=now.sequence if certain else None,
+        spoils_vision=True,
+    )
+
+
+def _stamps(evidence: Evidence) -> _WrongUnit | None:
+    """Report stamps by which both speeds and rates of rotation of camera and odometry differ by one factor."""
+    speed = speed_ratio(evidence.intervals)
+    if evidence.intervals is None or speed is None or not speed.value > 0.0:
+        return None
+    rotation = rotation_ratio(evidence.intervals)
+    known = all(ratio.error * UNIT_SIGMAS < (LEAST_OF_STAMPS - 1.0) * ratio.value for ratio in (speed, rotation))
+    if not known or abs(np.log(speed.value / rotation.value)) > np.log(STAMPS_ALIKE):
+        return None
+    if min(abs(np.log(ratio.value)) for ratio in (speed, rotation)) < np.log(LEAST_OF_STAMPS):
+        return None
+    return _WrongUnit(
+        f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and their rate of rotation {rotation.value:.3g} "
+        f"+- {rotation.error:.1g} times the camera's: the stamps run {speed.value:.3g} times as fast as "
+        "time, so they are not in seconds",
+        None,
+    )
+
+
+def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
+    """Report stamps whose steps between frames are not those of a vehicle's camera."""
+    if evidence.sequence.frame_count < 2 or evidence.intervals is None:
+        return None
+    step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
+    if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
+        return None
+    return _WrongUnit(
+        f"by the stamps frames come every {step_s:.2g} s, which no camera does: they are not in seconds", None
+    )
+
+
+def _baseline(evidence: Evidence) -> _WrongUnit | None:
+    """Judge the baseline by its size; a measured speed decides between units."""
+    rig = evidence.sequence.rig
+    if LEAST_BASELINE_M <= rig.baseline_m <= MOST_BASELINE_M:
+        return None
+    fitting = [u for u, factor in LENGTHS.items() if LEAST_BASELINE_M <= rig.baseline_m / factor <= MOST_BASELINE_M]
+    ratio = speed_ratio(evidence.intervals)
+    summary = f"baseline_m is {rig.baseline_m:g}, which no rig has"
+    if ratio is not None:
+        measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
+        unit = _in_other_unit(ratio, measured, WITHIN_FACTOR, UNIT_SIGMAS)
+        fitting = [unit] if unit is not None else []
+        summary += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
+    if len(fitting) != 1:
+        return _WrongUnit(f"{summary}: it is not in metres", None)
+    baseline_m = rig.baseline_m / LENGTHS[fitting[0]]
+    remedy = replace(evidence.sequence, rig=replace(rig, baseline_m=baseline_m))
+    return _WrongUnit(f"{summary}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
+
+
+def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
+    """Judge the distance of camera and IMU by its size, in the largest unit that makes it one."""
+    rig = evidence.sequence.rig
+    position = rig.T_imu_cam[:3, 3]
+    distance_m = float(np.linalg.norm(position))
+    if not distance_m > MOST_LEVER_M:
+        return None
+    summary = f"T_imu_cam puts the camera {distance_m:.3g} m from the IMU"
+    unit = "millimetres"
+    if distance_m / LENGTHS[unit] > MOST_LEVER_M:
+        return _WrongUnit(f"{summary}: it is not in metres", None)
+    T_imu_cam = se3(rig.T_imu_cam[:3, :3], position / LENGTHS[unit])
+    if evidence.intervals is not None:
+        camera = evidence.camera_motion
+        given_px, now_px = (median_one_step_px(evidence.sequence, camera, T) for T in (rig.T_imu_cam, T_imu_cam))
+        summary += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
+    remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=T_imu_cam))
+    return _WrongUnit(f"{summary}: its translation is in {unit}", remedy)
+
+
+def _speed(evidence: Evidence) -> _WrongUnit | None:
+    ratio = speed_ratio(evidence.intervals)
+    unit = None if ratio is None else _in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, UNIT_SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    summary = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
+    if not _all_along(evidence, speed_ratio, SPEEDS[unit]):
+        return _WrongUnit(f"{summary}{IN_A_PART}", None)
+    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
+
+
+def _rotation(evidence: Evidence) -> _WrongUnit | None:
+    intervals = evidence.intervals
+    if intervals is None:
+        return None
+    ratio = rotation_ratio(intervals)
+    unit = _in_other_unit(ratio, RATES, WITHIN_FACTOR, UNIT_SIGMAS)
+    if unit is None:
+        return None
+    summary = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
+    if not _all_along(evidence, rotation_ratio, RATES[unit]):
+        return _WrongUnit(f"{summary}{IN_A_PART}", None)
+    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
+
+
+def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
+    """Say whether both halves of the recording have a ratio nearer to a unit's factor than to one."""
+    intervals = evidence.intervals
+    assert intervals is not None
+    first = np.arange(intervals.interval.size) < intervals.interval.size // 2
+    halves = (intervals.select(first), intervals.select(~first))
+    ratios = [ratio for half in halves if (ratio := ratio_of(half)) is not None]
+    return all((ratio.value > np.sqrt(factor)) == (factor > 1.0) for ratio in ratios)
+
+
+def _force(evidence: Evidence) -> _WrongUnit | None:
+    ratio = force_ratio(evidence.sequence)
+    unit = None if ratio is None else _in_other_unit(ratio, FORCES, WITHIN_FACTOR, UNIT_SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    summary = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
+    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0 / FORCES[unit]))
+
+
+def _truth(evidence: Evidence) -> _WrongUnit | None:
+    """Judge the truth by the ratio of its speed to the samples', or to the camera's with an IMU."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    truth = sequence.truth
+    if truth is None or intervals is None or truth.t_ns.size < 2:
+        return None
+    frames_t_ns = sequence.frames_t_ns
+    inside = (frames_t_ns >= truth.t_ns[0]) & (frames_t_ns <= truth.t_ns[-1])
+    t_s, at_s = ((stamps - truth.t_ns[0]) / NS_PER_S for stamps in (truth.t_ns, frames_t_ns))
+    positions = np.stack([np.interp(at_s, t_s, axis) for axis in truth.T_world_imu[:, :3, 3].T], axis=1)
+    v_true = np.diff(positions, axis=0) / np.diff(at_s)[:, None]
+    rows = inside[intervals.interval] & inside[intervals.interval + 1]
+    measured = intervals.v_cam_mps if intervals.v_mps is None else intervals.v_mps
+    ratio = ratio_of_speeds(v_true[intervals.interval[rows]], measured[rows])
+    unit = None if ratio is None else _in_other_unit(ratio, LENGTHS, WITHIN_FACTOR, UNIT_SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    scale = 1.0 / LENGTHS[unit]
+    T_world_imu = se3(truth.T_world_imu[:, :3, :3], scale * truth.T_world_imu[:, :3, 3])
+    v_world = None if truth.v_world is None else scale * truth.v_world
+    remedy = replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
+    summary = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
+    return _WrongUnit(summary, remedy)
+
+
+def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
+    """Return the only unit whose factor a ratio matches; None where none does, several do, or the ratio may be 1."""
+    if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
+        return None
+    apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}
+    near = [unit for unit in apart if apart[unit] < np.log(within_factor)]
+    return near[0] if len(near) == 1 else None
+
+
+def _scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Sequence:
+    """Return the sequence with its motion samples multiplied, linear and angular ones.
+
+    Noise that the file did not state, but a loader estimated from the scatter of the samples, is in their unit and
+    is scaled as well.
+    """
+    motion, noise = sequence.motion, sequence.noise
+    scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
+    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
+        return replace(sequence, motion=scaled)
+    velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
+    if linear != 1.0 and is_from_scatter(velocity, motion.v_mps, motion.t_ns):
+        velocity = linear * velocity
+    if angular != 1.0 and is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
+        gyro_noise = angular * gyro_noise
+    return replace(
+        sequence,
+        motion=scaled,
+        noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
+    )

@@ -1,0 +1,937 @@
+"""Faults of time: stamps that repeat, jump or are uneven, gaps in the samples, clocks that differ."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.bundle import CHANGE, LATE
+from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
+from toolkit.audit.edits import keep_frames, keep_samples
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable
+from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
+from toolkit.audit.self_calibration import self_calibration
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.jackknife import jackknife_error
+from toolkit.measured_motion import ImuNoise, MotionNoise, MotionSamples, NoSamples, TwistNoise, TwistSamples
+from toolkit.models.camera_motion import camera_motion
+from toolkit.models.gating import MAD_TO_SIGMA
+from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.sequence import Sequence
+
+# A step this many times the usual (median) one is a gap: one missing stamp makes a step of 2, two make 3.
+GAP_RATIO = 3.5
+# What a cast of NaN to int64 gives.
+NOT_A_TIME = np.iinfo(np.int64).min
+
+
+# A step of the frames is unusual if it differs from the usual one by this share of it, by this time (s), and by so many
+# times the scatter of all steps. A step of the samples near it must differ by the same, to half of their usual step or
+# a quarter of the difference.
+LEAST_JUMP_SHARE, LEAST_JUMP_S, SCATTERS = 0.25, 0.01, 10.0
+ALIKE_STEPS, ALIKE = 0.5, 0.25
+# So many intervals on either side show how far the camera moves in a step, at least so many together; acceleration
+# limits the accuracy to this share.
+AROUND, FEWEST_AROUND, SYSTEMATIC = 4, 5, 0.03
+# The camera moved one step, or as many as the stamps say, to within so many standard errors; the two must be at least
+# so many standard errors apart.
+WITHIN, APART = 3.0, 6.0
+# A camera that moves less (m), or rotates less (rad), in a usual step is not used.
+LEAST_M, LEAST_RAD = 0.01, 0.005
+# With more unusual steps than this, none of them is taken as a jump: the stamps are uneven for another reason.
+MOST = 10
+
+
+class _Step(NamedTuple):
+    """The frame and the sample after which both streams have an unusual step.
+
+    ``by_s`` is its excess over the usual step, ``stamped`` the step of the frames in usual steps. ``gone`` is how many
+    usual steps the camera moved; None where that does not show whether the clock was set.
+    """
+
+    frame: int
+    sample: int
+    by_s: float
+    stamped: float
+    gone: Scalar | None
+
+    @property
+    def is_jump(self) -> bool:
+        """Whether the camera moved by one usual step, and not by as many as the stamps say."""
+        if self.gone is None:
+            return False
+        near, far = abs(self.gone.value - 1.0), abs(self.gone.value - self.stamped)
+        return near < WITHIN * self.gone.error < far
+
+
+def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
+    """A clock that is set during the recording: stamps of frames and samples jump together, and the vehicle does not.
+
+    If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, it has
+    moved by one usual step. The distance that the camera moves in that interval, by the tracks and in units of the
+    intervals around it, decides between the two. A clock that goes back by more than a step shows in its stamps
+    (`time_order`).
+
+    Report the times at which the clock was set; keep the longest stretch between them.
+    """
+    sequence = evidence.sequence
+    steps = list(_steps_alike(sequence))
+    jumps = [step for step in steps if step.is_jump]
+    if not jumps:
+        open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
+        summary = f"the stamps of frames and samples jump together by {', '.join(open_s)}"
+        return Undecided(f"{summary}: the tracks do not determine whether time passed") if open_s else None
+    usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    jumps_text = [
+        f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
+        f"{usual_s * step.gone.value:.3f} +- {usual_s * step.gone.error:.3f} s passed)"
+        for step in jumps
+        if step.gone is not None
+    ]
+    remedy = _longest_stretch(sequence, jumps)
+    return Symptom(
+        count=len(jumps),
+        detail=f"the clock of frames and samples is set {', '.join(jumps_text)}",
+        treatment=f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames",
+        remedy=remedy,
+    )
+
+
+def _at_s(sequence: Sequence, step: _Step) -> float:
+    return float(sequence.frames_t_ns[step.frame] - sequence.frames_t_ns[0]) / NS_PER_S
+
+
+def _steps_alike(sequence: Sequence) -> Iterator[_Step]:
+    """Yield the unusual steps of the frames at which the samples have a step with the same excess."""
+    frames_t_ns, samples_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
+    if min(frames_t_ns.size, samples_t_ns.size) < 2 * AROUND or NOT_A_TIME in (frames_t_ns.min(), samples_t_ns.min()):
+        return
+    step_s, sample_step_s = np.diff(frames_t_ns) / NS_PER_S, np.diff(samples_t_ns) / NS_PER_S
+    usual_s, usual_sample_s = float(np.median(step_s)), float(np.median(sample_step_s))
+    if usual_s <= 0.0 or usual_sample_s <= 0.0:
+        return
+    off_s, sample_off_s = step_s - usual_s, sample_step_s - usual_sample_s
+    scatter_s = MAD_TO_SIGMA * float(np.median(np.abs(off_s)))
+    far = (np.abs(off_s) > max(LEAST_JUMP_SHARE * usual_s, LEAST_JUMP_S, SCATTERS * scatter_s)) & (step_s >= 0.0)
+    if far.sum() > MOST:
+        return
+    for frame in np.flatnonzero(far).tolist():
+        by_s = float(off_s[frame])
+        reach_ns = round((usual_sample_s + abs(by_s)) * NS_PER_S)
+        begin, end = frames_t_ns[frame] - reach_ns, frames_t_ns[frame + 1] + reach_ns
+        near = np.flatnonzero((samples_t_ns[:-1] >= begin) & (samples_t_ns[1:] <= end))
+        apart_s = np.abs(sample_off_s[near] - by_s)
+        if near.size and apart_s.min() <= max(ALIKE_STEPS * usual_sample_s, ALIKE * abs(by_s)):
+            stamped = float(step_s[frame]) / usual_s
+            yield _Step(frame, int(near[np.argmin(apart_s)]), by_s, stamped, _gone(sequence, frame, stamped))
+
+
+def _gone(sequence: Sequence, frame: int, stamped: float) -> Scalar | None:
+    """Return how many usual steps the camera moves or rotates after a frame, if that decides the question."""
+    for steps in _steps_gone(sequence, frame):
+        error = float(np.hypot(steps.error, SYSTEMATIC))
+        decided = abs(steps.value - 1.0) < WITHIN * error or abs(steps.value - stamped) < WITHIN * error
+        if decided and abs(stamped - 1.0) > APART * error:
+            return Scalar(steps.value, error)
+    return None
+
+
+def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
+    """Yield how far the camera moves, and how far it rotates, after a frame, in units of the intervals around it.
+
+    Nothing is yielded where the camera stands, hardly rotates, or its motion is not known.
+    """
+    kept = np.arange(max(frame - AROUND, 0), min(frame + AROUND + 2, sequence.frame_count))
+    camera = camera_motion(replace(keep_frames(sequence, kept), frames_t_ns=NS_PER_S * np.arange(kept.size)))
+    here = int(np.flatnonzero(kept == frame)[0])
+    if not camera.known[here]:
+        return
+    for moved, least in ((camera.v_mps, LEAST_M), (camera.w_radps, LEAST_RAD)):
+        beside = np.flatnonzero(camera.known & (np.arange(camera.known.size) != here))
+        size = np.linalg.norm(moved, axis=1)
+        if beside.size < FEWEST_AROUND or np.median(size[beside]) < least or _is_noise(moved, beside, here):
+            continue
+        yield _ratio(size, beside, here)
+
+
+def _is_noise(moved: Array, beside: IntArray, here: int) -> bool:
+    """Say whether motions (n, 3) around the one at ``here`` have no common direction, as noise at standstill.
+
+    That is so where the line through them, at ``here``, is within APART standard errors of zero.
+    """
+    line = np.stack([np.ones(beside.size), beside - here], axis=1)
+    found, *_ = np.linalg.lstsq(line, moved[beside])
+    variance = float(np.sum((moved[beside] - line @ found) ** 2)) / (beside.size - 2)
+    error = np.sqrt(variance * np.linalg.inv(line.T @ line)[0, 0])
+    return bool(np.linalg.norm(found[0]) < APART * error)
+
+
+def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
+    """Return the size (n,) at one interval over the line through those around it, with its standard error."""
+    line = np.polynomial.Polynomial.fit(beside - here, size[beside], 1)
+    expected = float(line(0.0))
+    scatter = float(np.sqrt(np.sum((size[beside] - line(beside - here)) ** 2) / (beside.size - 2)))
+    return Scalar(size[here] / expected, scatter / expected * float(np.sqrt(1.0 + 1.0 / beside.size)))
+
+
+def _longest_stretch(sequence: Sequence, jumps: list[_Step]) -> Sequence:
+    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
+    frame_part = np.searchsorted([jump.frame for jump in jumps], np.arange(sequence.frame_count), side="left")
+    sample_part = np.searchsorted([jump.sample for jump in jumps], np.arange(sequence.motion.t_ns.size), side="left")
+    part = int(np.argmax(np.bincount(frame_part)))
+    return keep_samples(keep_frames(sequence, np.flatnonzero(frame_part == part)), sample_part == part)
+
+
+# A forward step of so many usual ones means that earlier stamps were out of order; after a jump, all steps are smaller.
+# So many stamps must follow a jump, so that a single stamp out of order at the end is not taken for one.
+LEAP, FEWEST_AFTER = 1.9, 3
+
+# If more than this share of the stamps is late, the whole order is wrong, and sorting is no repair.
+MOST_LATE = 0.5
+
+
+def time_order(evidence: Evidence) -> Symptom | None:
+    """Stamps of frames or motion samples that repeat, run backwards, jump back, or are no time.
+
+    Count the stamps that are not after all stamps before them; sort them and keep the first of equal ones.
+
+    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is kept.
+    """
+    sequence = evidence.sequence
+    frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
+    if frames + samples == 0:
+        return None
+    detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
+    if max(map(_share_equal, _streams(sequence))) > MOST_LATE:
+        why = "most are equal to the one before them, as stamps are that were rounded: write them with all their digits"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
+    if max(map(_share_back, _streams(sequence))) > MOST_LATE:
+        why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
+    jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
+    if jumps_s:
+        detail += f": the clock jumps back by {max(jumps_s):.2f} s and goes on from there"
+        remedy = _between_jumps(sequence)
+        treatment = f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames"
+        return Symptom(count=frames + samples, detail=detail, treatment=treatment, remedy=remedy)
+    if max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
+        why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
+    return Symptom(
+        count=frames + samples,
+        detail=detail,
+        treatment="sorted by time; of equal stamps the first is kept; stamps that are no time are dropped",
+        remedy=_sorted(sequence),
+    )
+
+
+def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
+    return sequence.frames_t_ns, sequence.motion.t_ns
+
+
+def _share_back(t_ns: IntArray) -> float:
+    """Return the share of the steps that are negative or zero."""
+    return float(np.mean(np.diff(t_ns) <= 0)) if t_ns.size > 1 else 0.0
+
+
+def _share_equal(t_ns: IntArray) -> float:
+    """Return the share of the stamps that repeat the one before them."""
+    return float(np.mean(np.diff(t_ns) == 0)) if t_ns.size > 1 else 0.0
+
+
+def _sorted(sequence: Sequence) -> Sequence:
+    """Return the sequence with stamps in order, without repeats and invalid ones."""
+    if _late(sequence.frames_t_ns):
+        sequence = keep_frames(sequence, _in_order(sequence.frames_t_ns))
+    if _late(sequence.motion.t_ns):
+        sequence = keep_samples(sequence, _in_order(sequence.motion.t_ns))
+    return sequence
+
+
+def _jumps(t_ns: IntArray) -> IntArray:
+    """Return the rows after which the clock has jumped back and goes on at its usual step.
+
+    After a stamp, or a block of stamps, that is merely out of order, time jumps forward to where it was.
+    """
+    step_ns = np.diff(t_ns)
+    if t_ns.size < 3 or (t_ns == NOT_A_TIME).any():
+        return np.empty(0, dtype=np.int64)
+    usual_ns = float(np.median(np.abs(step_ns)))
+    backwards = np.flatnonzero(step_ns < 0)
+    return np.array([row for row in backwards.tolist() if _goes_on(t_ns, row, usual_ns)], dtype=np.int64)
+
+
+def _jump_lengths_s(t_ns: IntArray) -> list[float]:
+    """Return the length (s) of each jump, from the expected next stamp back to the actual one."""
+    step_ns = np.diff(t_ns)
+    due_ns = np.median(np.abs(step_ns)) if step_ns.size else 0.0
+    return [float(due_ns - step_ns[row]) / NS_PER_S for row in _jumps(t_ns).tolist()]
+
+
+def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
+    latest = t_ns[: row + 1].max()
+    later = np.flatnonzero(t_ns[row + 1 :] > latest)
+    end = row + 1 + int(later[0]) if later.size else t_ns.size  # the first stamp that is new, or none
+    if end - row <= FEWEST_AFTER and not later.size:
+        return False  # too few stamps follow to decide
+    return bool(np.diff(t_ns[row + 1 : end + 1]).max(initial=0) < LEAP * usual_ns)
+
+
+def _between_jumps(sequence: Sequence) -> Sequence:
+    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
+    frames_t_ns, samples_t_ns = _streams(sequence)
+    frame_part = _parts(frames_t_ns)
+    sample_part = _parts(samples_t_ns)
+    part = int(np.argmax(np.bincount(frame_part)))
+    kept = keep_frames(sequence, np.flatnonzero(frame_part == part))
+    if sample_part.max(initial=0):
+        of_part = part if sample_part.max() == frame_part.max() else int(np.argmax(np.bincount(sample_part)))
+        kept = keep_samples(kept, sample_part == of_part)
+    return _sorted(kept)
+
+
+def _parts(t_ns: IntArray) -> IntArray:
+    """Return for each stamp (N,) the number of jumps before it."""
+    part = np.zeros(t_ns.size, dtype=np.int64)
+    part[_jumps(t_ns) + 1] = 1
+    return np.cumsum(part)
+
+
+def _late(t_ns: IntArray) -> int:
+    """Count the stamps that are no time, or not after every valid stamp before them."""
+    latest_before = np.maximum.accumulate(np.concatenate([[NOT_A_TIME], t_ns[:-1]]))
+    return int(np.sum(t_ns <= latest_before)) if t_ns.size else 0
+
+
+def _in_order(t_ns: IntArray) -> IntArray:
+    """Return the rows that sort the stamps, without invalid ones, and of repeated ones only the first."""
+    _, first_row = np.unique(t_ns, return_index=True)
+    rows: IntArray = first_row[t_ns[first_row] != NOT_A_TIME]
+    return rows
+
+
+# With fewer frames there is no interval.
+LEAST_FRAMES = 2
+
+
+def outside_motion(evidence: Evidence) -> Symptom | None:
+    """Frames before the first or after the last motion sample.
+
+    Count the frames outside the time of the motion samples and cut them off.
+    """
+    sequence = evidence.sequence
+    frames_t_ns, motion_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
+    if motion_t_ns.size == 0:
+        return Symptom(sequence.frame_count, "there are no motion samples", "no frame can be used", remedy=None)
+    covered = (frames_t_ns >= motion_t_ns.min()) & (frames_t_ns <= motion_t_ns.max())
+    count = int(np.sum(~covered))
+    if count == 0:
+        return None
+    if sequence.frame_count - count < LEAST_FRAMES:
+        frames_s, motion_s = (
+            f"{t.min() / NS_PER_S:.6g} to {t.max() / NS_PER_S:.6g} s" for t in (frames_t_ns, motion_t_ns)
+        )
+        return Symptom(
+            count=count,
+            detail=f"the frames are at {frames_s} and the motion samples at {motion_s}: {count} of "
+            f"{sequence.frame_count} frames lie outside",
+            treatment="no motion is left: stamp both by one clock, in one unit",
+            remedy=None,
+        )
+    return Symptom(
+        count=count,
+        detail=f"{count} of {sequence.frame_count} frames lie outside the time of the motion samples",
+        treatment="cut off",
+        remedy=keep_frames(sequence, np.flatnonzero(covered)),
+    )
+
+
+# Shorter gaps (s) in the motion samples, such as a dropped sample of a fast IMU, are interpolated (`motion_gap`).
+MOTION_GAP_S = 1.5
+
+
+def time_gap(evidence: Evidence) -> Symptom | None:
+    """Gaps in time: in the motion samples, where the motion is not measured, and in the frames.
+
+    A gap in the frames alone is reported as information, because the motion samples cover it. A long gap in the motion
+    samples is a fault: no measurement says how the vehicle moved, and no noise model covers interpolation over it. The
+    longest stretch without such a gap is kept. The relative pose of the other stretches was not measured.
+
+    Find gaps in the motion samples and keep the longest stretch between them; else find gaps in the frames.
+    """
+    sequence = evidence.sequence
+    holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
+    # Gaps outside the time of the frames do not matter.
+    inside = (sequence.motion.t_ns[holes + 1] > sequence.frames_t_ns[:1]) & (
+        sequence.motion.t_ns[holes] < sequence.frames_t_ns[-1:]
+    )
+    return _motion_symptom(sequence, holes[inside]) if inside.any() else _frames_symptom(sequence)
+
+
+def _holes(t_ns: IntArray, least_s: float) -> IntArray:
+    """Return the rows after which the next stamp is too far away."""
+    step_s = np.diff(t_ns) / NS_PER_S
+    if step_s.size == 0:
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero(step_s > max(least_s, GAP_RATIO * float(np.median(step_s))))
+
+
+def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
+    t_ns = sequence.motion.t_ns
+    longest_s = float((t_ns[holes + 1] - t_ns[holes]).max()) / NS_PER_S
+    # A frame at the edge of a gap belongs to the adjacent stretch.
+    stretch = np.searchsorted(t_ns[holes + 1], sequence.frames_t_ns, side="right")
+    in_hole = np.searchsorted(t_ns[holes], sequence.frames_t_ns, side="left") > stretch
+    sizes = np.bincount(stretch[~in_hole], minlength=1)
+    kept = np.flatnonzero(~in_hole & (stretch == np.argmax(sizes)))
+    return Symptom(
+        count=holes.size,
+        detail=f"{holes.size} hole(s) in the motion samples, the longest of {longest_s:.2f} s",
+        treatment=f"the longest stretch without one is kept: {kept.size} of {sequence.frame_count} frames",
+        remedy=keep_frames(sequence, kept),
+    )
+
+
+def _frames_symptom(sequence: Sequence) -> Symptom | None:
+    holes = _holes(sequence.frames_t_ns, 0.0)
+    if holes.size == 0:
+        return None
+    longest_s = float(np.diff(sequence.frames_t_ns)[holes].max()) / NS_PER_S
+    return Symptom.information(
+        count=holes.size,
+        detail=f"{holes.size} hole(s) in the frames, the longest of {longest_s:.2f} s",
+        treatment="the motion samples bridge them",
+    )
+
+
+# A vehicle turns and stops within this time (s). Samples with a longer step, and with so many frames in one step, do
+# not represent its motion.
+MOST_STEP_S, MOST_RATIO = 2.0, 20.0
+
+
+def sparse_motion(evidence: Evidence) -> Symptom | None:
+    """Motion samples that come more rarely than frames: the motion between two of them was not measured.
+
+    Compare the usual step of the samples with that of the frames; the limit is the ratio that makes a gap.
+    """
+    sequence = evidence.sequence
+    if sequence.motion.t_ns.size < 2 or sequence.frame_count < 2 or not is_comparable(sequence):
+        return None
+    step_s, frame_s = (
+        float(np.median(np.diff(t_ns))) / NS_PER_S for t_ns in (sequence.motion.t_ns, sequence.frames_t_ns)
+    )
+    if step_s <= GAP_RATIO * frame_s:
+        return None
+    detail = f"motion samples come every {step_s:.2g} s and frames every {frame_s:.2g} s"
+    if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
+        return Symptom(
+            count=int(sequence.motion.t_ns.size),
+            detail=detail,
+            treatment="too few to be used, as where their stamps are in another unit than the frames': check both",
+            remedy=None,
+            spoils_vision=True,
+        )
+    return Symptom.warning(
+        count=int(sequence.motion.t_ns.size),
+        detail=detail,
+        treatment=(
+            "between two samples the motion is interpolated linearly, with an error that no stated noise includes"
+        ),
+    )
+
+
+# Least number of measured stretches that are interpolated. With fewer, the variance of the samples is taken as the
+# error of the interpolation.
+LEAST_STRETCHES = 5
+
+
+def motion_gap(evidence: Evidence) -> Symptom | None:
+    """Short gaps in the motion samples: interpolated, with the noise that interpolation has in the rest of the
+    recording.
+
+    A gap shorter than `time_gap` reports is filled on straight lines between the samples at its ends. The recording
+    itself shows the error of that: stretches of the same length that were measured are interpolated in the same way,
+    and the noise in the gap is raised until it covers the integral of their error. The uncertainty of the state after a
+    gap is then right if the motion in it is like that of the rest.
+
+    Count the gaps between the first frame and the last; fill them and raise the noise there.
+    """
+    sequence = evidence.sequence
+    if not is_comparable(sequence):
+        return None
+    t_ns = sequence.motion.t_ns
+    rows, usual_ns = _short_holes(sequence)
+    if not rows.size:
+        return None
+    scale = np.stack([_noise_scale(sequence, round((t_ns[row + 1] - t_ns[row]) / usual_ns), usual_ns) for row in rows])
+    longest_s = float((t_ns[rows + 1] - t_ns[rows]).max()) / NS_PER_S
+    linear, angular = scale.max(axis=0)
+    return Symptom(
+        count=rows.size,
+        detail=f"{rows.size} gap(s) in the motion samples, the longest of {longest_s:.3g} s",
+        treatment=(
+            f"bridged by linear interpolation, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times "
+            "the noise there, as measured stretches bridged likewise need"
+        ),
+        remedy=replace(
+            sequence,
+            motion=_filled(sequence.motion, rows, usual_ns),
+            bridges=_with(sequence.bridges, Bridges(t_ns[rows], t_ns[rows + 1], scale)),
+        ),
+    )
+
+
+def _short_holes(sequence: Sequence) -> tuple[IntArray, float]:
+    """Return the samples after which there is a gap, between the first frame and the last, and the usual step (ns).
+
+    A twist may be the mean over the whole interval to the next one, so a gap between twists needs a frame inside it.
+    """
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    step_ns = np.diff(t_ns)
+    if not step_ns.size or isinstance(sequence.motion, NoSamples):
+        return np.empty(0, dtype=np.int64), 0.0
+    usual_ns = float(np.median(step_ns))
+    inside = (t_ns[1:] > frames_t_ns[0]) & (t_ns[:-1] < frames_t_ns[-1])
+    if isinstance(sequence.motion, TwistSamples):
+        inside = np.searchsorted(frames_t_ns, t_ns[1:]) > np.searchsorted(frames_t_ns, t_ns[:-1], side="right")
+    return np.flatnonzero((step_ns > GAP_RATIO * usual_ns) & inside), usual_ns
+
+
+def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
+    """Return the factors (2,) on the noise, linear and angular, of an interpolation over so many steps."""
+    values, step_s = sequence.motion.values, usual_ns / NS_PER_S
+    stretches = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
+    if stretches.size >= LEAST_STRETCHES:
+        stretch = values[stretches[:, None] + np.arange(steps + 1)]  # (W, steps + 1, 6)
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        line = stretch[:, :1] * (1.0 - share) + stretch[:, -1:] * share
+        summed = step_s * np.cumsum(stretch - line, axis=1)[:, 1:]
+        elapsed_s = step_s * np.arange(1, steps + 1)[:, None]
+        density_squared = (np.mean(summed**2, axis=0) / elapsed_s).max(axis=0)
+    else:
+        density_squared = np.var(values, axis=0) * steps * step_s
+    excess = density_squared.reshape(2, 3).max(axis=1) / _stated_densities(sequence.noise) ** 2
+    return np.asarray(np.sqrt(1.0 + excess))
+
+
+def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray:
+    """Return the first samples of the stretches of so many steps without a gap."""
+    if t_ns.size <= steps:
+        return np.empty(0, dtype=np.int64)
+    holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
+    return np.flatnonzero(holes_before[steps:] == holes_before[:-steps])
+
+
+def _stated_densities(noise: MotionNoise) -> Array:
+    """Return the stated densities (2,) of linear and angular samples, the smallest over the axes."""
+    if isinstance(noise, TwistNoise):
+        return np.array([noise.velocity_noise_density.min(), noise.gyro_noise_density.min()])
+    assert isinstance(noise, ImuNoise)
+    return np.array([noise.accel_noise_density, noise.gyro_noise_density])
+
+
+def _filled(motion: MotionSamples, rows: IntArray, usual_ns: float) -> MotionSamples:
+    """Return the samples with interpolated ones in the gaps after ``rows``, at the usual steps."""
+    ends = [(int(motion.t_ns[row]), int(motion.t_ns[row + 1])) for row in rows]
+    inner = [np.linspace(begin, end, round((end - begin) / usual_ns) + 1)[1:-1] for begin, end in ends]
+    t_ns = np.sort(np.concatenate([motion.t_ns, *(np.rint(stamps).astype(np.int64) for stamps in inner)]))
+    at_s, sample_s = (t_ns - t_ns[0]) / NS_PER_S, (motion.t_ns - t_ns[0]) / NS_PER_S
+    values = np.stack([np.interp(at_s, sample_s, column) for column in motion.values.T], axis=1)
+    return motion.of(t_ns, values)
+
+
+def _with(before: Bridges | None, new: Bridges) -> Bridges:
+    if before is None:
+        return new
+    begin, end = np.append(before.begin_t_ns, new.begin_t_ns), np.append(before.end_t_ns, new.end_t_ns)
+    return Bridges(begin, end, np.vstack([before.noise_scale, new.noise_scale]))
+
+
+# Least root mean square of the steps' deviation, as a share of the usual step. Real drives have 1.3 % at most, which
+# their cameras do not follow either; chosen with them in view.
+LEAST_UNEVEN_SHARE = 0.03
+# The motion follows a share of 1 of the deviations if the stamps are right. The stamps are reported if the share is
+# below the second number by so many standard errors, of a jackknife.
+UNEVEN_SIGMAS, MOST_FOLLOWED = 5.0, 0.5
+# The usual step is half of this quantile of two steps together, which are even where every other frame is late. The
+# shortest quarter misses no frame, in a recording that has lost half of its frames at most.
+UNHURT = 0.25
+# Offsets of the intervals around one that show how the camera moves there.
+BESIDE = (-2, -1, 1, 2)
+
+
+def uneven_stamps(evidence: Evidence) -> Symptom | None:
+    """Frames with uneven stamps of evenly taken images: transfer times, a busy computer, every other stamp late.
+
+    The motion of a camera from one image to the next is proportional to the time between them. An interval that is
+    longer by its stamps must show more motion than the intervals around it. Where it shows as much as these, the stamps
+    are not the times of the images. Only the tracks are used.
+
+    Regress the variation of the camera's motion on that of the frames' steps.
+    """
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    if evidence.spoilt_by or not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
+        return None
+    step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
+    even_s = _even_steps_s(step_s)
+    off_s = step_s - even_s
+    if float(np.sqrt(np.mean(off_s[camera.known] ** 2))) < LEAST_UNEVEN_SHARE * float(np.median(even_s)):
+        return None
+    found = _followed(np.hstack([camera.v_mps, camera.w_radps]), step_s, even_s, camera.known)
+    if found is None or found.value + UNEVEN_SIGMAS * found.error > MOST_FOLLOWED:
+        return None
+    typical_ms = 1e3 * float(np.median(np.abs(off_s)))
+    return Symptom.warning(
+        count=1,
+        detail=(
+            f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the "
+            f"camera's motion shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should "
+            "show all"
+        ),
+        treatment="images are taken at more even intervals than stamped: stamp them when they are exposed",
+    )
+
+
+def _even_steps_s(step_s: Array) -> Array:
+    """Return the steps (K - 1,) of evenly taken images: multiples of the usual step, for frames may be lost."""
+    usual_s = 0.5 * float(np.quantile(step_s[1:] + step_s[:-1], UNHURT))
+    for _ in range(2):
+        steps = np.maximum(np.round(step_s / usual_s), 1.0)
+        usual_s = float(step_s.sum() / steps.sum())
+    return np.asarray(usual_s * steps)
+
+
+def _followed(rates: Array, step_s: Array, even_s: Array, known: BoolArray) -> Scalar | None:
+    """Return the share of the variation of the steps that the camera's motion follows, from its rates (K - 1, 6).
+
+    ``even_s`` (K - 1,) are the steps without variation.
+
+    None where the motion is known in too few intervals and those around them.
+    """
+    rows = np.arange(-BESIDE[0], step_s.size - BESIDE[-1])
+    beside = rows[:, None] + np.array(BESIDE)
+    usable = known[rows] & known[beside].all(axis=1)
+    rows, beside = rows[usable], beside[usable]
+    if rows.size < LEAST_INTERVALS:
+        return None
+    moved = rates * step_s[:, None]
+    around = moved[beside].sum(axis=1) / step_s[beside].sum(axis=1)[:, None]
+    regressor, response = around * (step_s - even_s)[rows, None], moved[rows] - around * even_s[rows, None]
+    return Scalar(_share_followed(regressor, response), jackknife_error(_share_followed, regressor, response))
+
+
+def _share_followed(regressor: Array, response: Array) -> float:
+    return slope(regressor, regressor, response).value
+
+
+# Largest standard error of the lag, in intervals, and how many of them it must differ by from the present pairing's.
+LARGEST_LAG_ERROR = 0.1
+LAG_SIGMAS = 5.0
+
+
+def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
+    """Twist samples that describe another interval than their pairing says.
+
+    With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is 0
+    where the sample at the start describes the interval, 1 where that at the end does, and 1/2 for their mean. Least
+    squares are biased towards 1/2 on noisy samples, because a mean of two has half the variance. The change of the
+    neighbouring camera rotations is therefore used as an instrument: it follows the change of the samples and is
+    independent of their noise.
+
+    Estimate the lag of the angular velocities; pair the samples by the nearest of start, mean and end.
+    """
+    sequence, intervals = evidence.sequence, evidence.intervals
+    if not isinstance(sequence.motion, TwistSamples):
+        return None
+    if intervals is None:
+        return evidence.blind
+    lag = _lag(sequence, intervals)
+    if lag is None:
+        return Undecided("too few successive intervals have a sample at both ends and a known camera motion")
+    if lag.error > LARGEST_LAG_ERROR:
+        return Undecided(f"too little change of rotation: the lag is {lag.value:.1f} +- {lag.error:.1f} of an interval")
+    present = sequence.motion.pairing
+    nearest = min(LAG, key=lambda pairing: abs(LAG[pairing] - lag.value))
+    if nearest == present or abs(lag.value - LAG[present]) < LAG_SIGMAS * lag.error:
+        return None
+    return Symptom(
+        count=1,
+        detail=(
+            f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval away from its "
+            f'start, which is "{nearest}", not "{present}"'
+        ),
+        treatment=f'an interval is paired with the sample of its "{nearest}"',
+        remedy=replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
+    )
+
+
+def _lag(sequence: Sequence, intervals: Intervals) -> Scalar | None:
+    """Estimate the lag where both frames have a sample and the camera's motion is known on either side."""
+    w_camera = np.zeros((sequence.frame_count - 1, 3))
+    w_camera[intervals.interval] = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    known = np.zeros(sequence.frame_count - 1, dtype=bool)
+    known[intervals.interval] = True
+    sample, follows = _samples_at_frames(sequence)
+    middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:] & follows[1:-1])
+    if middle.size < LEAST_INTERVALS:
+        return None
+    w_samples = sequence.motion.values[:, 3:]
+    at_start, at_end = w_samples[sample[middle]], w_samples[sample[middle] + 1]
+    unexplained = w_camera[middle] - at_start
+    instrument = 0.5 * (w_camera[middle + 1] - w_camera[middle - 1])
+    return slope(instrument, at_end - at_start, unexplained - np.median(unexplained, axis=0))
+
+
+def _samples_at_frames(sequence: Sequence) -> tuple[IntArray, BoolArray]:
+    """Return the sample at or after each frame (K,), and which intervals (K - 1,) have samples at both ends only."""
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    sample = np.searchsorted(t_ns, frames_t_ns)
+    at_frame = t_ns[sample] == frames_t_ns
+    return sample, at_frame[:-1] & at_frame[1:] & (np.diff(sample) == 1)
+
+
+# An offset is reported beyond so many standard errors and beyond what is no fault. A sample of an IMU may describe the
+# interval before or after its stamp, 5 ms at 100 Hz. A twist may describe the interval before or after its stamp, whose
+# middle is half an interval away, and may be one interval late: an indoor recording that is taken as sound is late by
+# 0.8.
+OFFSET_SIGMAS, LEAST_OFFSET_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
+# With an IMU, sound recordings at hand have 3.1 standard errors at most; from this many on the finding is undecided and
+# says so.
+DOUBTFUL_SIGMAS = 3.2
+# The same limit, in intervals, for twists stamped between the frames. There a pairing has the same effect as an offset
+# of the clock, and the shift corrects both.
+LEAST_OFF_FRAMES = 0.25
+# A shift is rejected if the velocities fit worse by so many standard errors. Halves and thirds of the indoor recording
+# whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a simulated one have
+# -0.1 at most. Chosen between these.
+AGAINST_SHIFT = 2.5
+# Offsets (s) up to this are taken from the self-calibration.
+NEAR_S = 0.025
+# With a larger standard error (s), an offset is not excluded and the finding is undecided. One beyond chance is
+# accepted up to twice the standard error, except for twists stamped at the frames, whose interval is open.
+LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
+# The time from a sample to the next frame is constant if this share of the frames has it to within this share of a
+# step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within so many
+# standard errors.
+CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
+
+
+def time_offset(evidence: Evidence) -> Symptom | Undecided | None:
+    """Frames stamped by another clock than the motion samples, or with a constant delay of the camera.
+
+    The camera's rotation over an interval, from its tracks alone, equals the mean of the gyro over that interval,
+    shifted by the offset (`parts.clocks`).
+
+    For twists stamped at the frames, `twist_lag` sets the pairing, and only an offset that no pairing explains is
+    reported here. For twists stamped between the frames, the frames are shifted to where the samples, as they are
+    paired, fit. Frames are not shifted by an offset that only half of the recording has, or that grows: that is a
+    change of the clock. They are not shifted either where the velocities of the twists then fit worse: the rates of
+    rotation alone are late.
+
+    Find the offset of the frames' stamps; shift the frames by it.
+    """
+    sequence, intervals = evidence.sequence, evidence.intervals
+    if intervals is None:
+        return evidence.blind
+    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    found = _refined(camera_offset(sequence, intervals, w_imu), evidence)
+    if found is None:
+        return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
+    expected_s, least_s = _expected(sequence)
+    offset_s = found.value - expected_s
+    beyond_s = found.value if is_stamped_at_frames(sequence) else offset_s
+    surely_s = _largest_error_s(sequence) * (1.0 if is_stamped_at_frames(sequence) else LARGEST_BEYOND)
+    if abs(beyond_s) < max(least_s, OFFSET_SIGMAS * found.error) or found.error > surely_s:
+        return _as_often(sequence, Scalar(offset_s, found.error)) or _unknown(sequence, found)
+    late = "late" if offset_s < 0.0 else "early"
+    seen = (
+        f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
+        f"{1e3 * found.error:.1f} ms"
+    )
+    detail = f"{seen}: frames are stamped {late}"
+    change = change_of_offset(sequence, intervals)
+    if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
+        return _changing(detail, change)
+    remedy = _shifted(sequence, offset_s)
+    if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
+        return Symptom.warning(
+            count=1,
+            detail=(
+                f"{seen}, but then the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
+            ),
+            treatment="stamp rates of rotation and velocities by one clock, the camera's",
+        )
+    return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
+
+
+def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) -> float:
+    """Return by how many standard errors the twists' velocities fit the camera's worse after the frames are shifted."""
+    before, after = evidence.intervals, evidence.after(shifted).intervals
+    if before is None or after is None or before.v_mps is None or after.v_mps is None:
+        return 0.0
+    stamps_ns = shifted.frames_t_ns - round(offset_s * NS_PER_S)
+    _, here, there = np.intersect1d(
+        evidence.sequence.frames_t_ns[before.interval], stamps_ns[after.interval], return_indices=True
+    )
+    R_imu_cam, p_imu_cam = evidence.sequence.rig.T_imu_cam[:3, :3], evidence.sequence.rig.T_imu_cam[:3, 3]
+    seen = before.v_cam_mps @ R_imu_cam.T - np.cross(before.w_cam_radps @ R_imu_cam.T, p_imu_cam)
+    costs = cauchy(np.stack([before.v_mps[here] - seen[here], after.v_mps[there] - seen[here]]), LEAST_SPREAD_V)
+    return mean_in_sigmas(costs[1] - costs[0])
+
+
+def _changing(detail: str, change: Scalar) -> Symptom:
+    """Report an offset that differs between the halves, so that no constant shift is right."""
+    parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms"
+    return Symptom.warning(
+        count=1,
+        detail=f"{detail}, but by {parted} more in the second half than in the first",
+        treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
+    )
+
+
+def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
+    """Return the self-calibration's offset, unless that of the rotations is large and a self-calibration confirms it.
+
+    Offsets by rotations have larger errors, and a wrong rotation of the extrinsic causes offsets of up to 0.1 s.
+    """
+    fitted = evidence.self_calibration
+    if found is None or fitted is None:
+        return found
+    if abs(found.value) > NEAR_S:
+        shifted = evidence.after(_shifted(evidence.sequence, found.value))
+        if shifted.self_calibration is not None:
+            return found
+    return Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
+
+
+def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
+    """Return the standard error of an offset that is within chance, where it is large."""
+    if found.error <= _largest_error_s(sequence):
+        return _doubtful(sequence, found)
+    known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
+    return Undecided(f"too little change of rotation: {known}")
+
+
+def _doubtful(sequence: Sequence, found: Scalar) -> Undecided | None:
+    """Return, with an IMU, an offset that is beyond chance and below the limit of a finding."""
+    if isinstance(sequence.motion, TwistSamples) or abs(found.value) < max(
+        LEAST_OFFSET_S, DOUBTFUL_SIGMAS * found.error
+    ):
+        return None
+    late = "late" if found.value < 0.0 else "early"
+    seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
+    return Undecided(
+        f"frames look as if stamped {late} by {seen}, too little change of rotation to distinguish that from chance"
+    )
+
+
+def _largest_error_s(sequence: Sequence) -> float:
+    return LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
+
+
+def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
+    """Report twists at the rate and a constant time from the frames, if the tracks allow an offset of that time."""
+    if not isinstance(sequence.motion, TwistSamples) or (late_s := _constant_phase_s(sequence)) is None:
+        return None
+    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    near = [shift for shift in (-late_s, step_s - late_s) if abs(offset.value - shift) <= NEAR_SIGMAS * offset.error]
+    if not near:
+        return None
+    shifts, sigmas = " or ".join(f"{1e3 * shift:+.0f}" for shift in near), abs(offset.value) / offset.error
+    from_zero = "which is consistent with zero as well"
+    if sigmas > NEAR_SIGMAS:
+        from_zero = f"{sigmas:.1f} standard errors from zero"
+    return Symptom.warning(
+        count=1,
+        detail=(
+            f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the "
+            f"camera's clock were to be shifted by {shifts} ms; by the tracks the offset is "
+            f"{1e3 * offset.value:+.0f} +- {1e3 * offset.error:.0f} ms, {from_zero}"
+        ),
+        treatment="if frames and twists were taken together, give them the same stamps",
+    )
+
+
+def _constant_phase_s(sequence: Sequence) -> float | None:
+    """Return the time (s) from a sample to the next frame, where rates are equal and it is constant and not zero."""
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    step_ns, tolerance = float(np.median(np.diff(t_ns))), CONSTANT_STEPS * float(np.median(np.diff(t_ns)))
+    since_ns = frames_t_ns - t_ns[np.clip(np.searchsorted(t_ns, frames_t_ns, side="right") - 1, 0, t_ns.size - 1)]
+    phase_ns = float(np.median(since_ns))
+    varies = np.quantile(np.abs(since_ns - phase_ns), CONSTANT_SHARE) > tolerance
+    if varies or abs(float(np.median(np.diff(frames_t_ns))) - step_ns) > tolerance:
+        return None
+    return phase_ns / NS_PER_S if tolerance < phase_ns < step_ns - tolerance else None
+
+
+def _expected(sequence: Sequence) -> tuple[float, float]:
+    """Return the offset (s) that the pairing of twists implies, and the largest difference that is no fault."""
+    if not isinstance(sequence.motion, TwistSamples):
+        return 0.0, LEAST_OFFSET_S
+    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    least_s = (
+        LEAST_TWIST_INTERVALS * step_s
+        if is_stamped_at_frames(sequence)
+        else max(LEAST_OFFSET_S, LEAST_OFF_FRAMES * step_s)
+    )
+    return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
+
+
+def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
+    """Return the sequence with its frames on the samples' clock, without frames outside the time of the samples."""
+    shifted = replace(sequence, frames_t_ns=sequence.frames_t_ns + round(offset_s * NS_PER_S))
+    motion_t_ns = sequence.motion.t_ns
+    inside = (shifted.frames_t_ns >= motion_t_ns[0]) & (shifted.frames_t_ns <= motion_t_ns[-1])
+    return shifted if inside.all() else keep_frames(shifted, np.flatnonzero(inside))
+
+
+# Where only a change larger than this (s) would be found, the finding is undecided and says so.
+LARGEST_CHANGE_S = 0.1
+
+
+def clock_change(evidence: Evidence) -> Symptom | Undecided | None:
+    """Clocks of frames and motion samples that run at different rates, or one of which was set during the recording.
+
+    With clocks of one rate, the offset between camera and samples is the same in both halves of the recording, whatever
+    interval a sample describes. If it changes, no constant shift is right. With an IMU the change is an unknown of the
+    self-calibration, whose other unknowns both halves share. With odometry, and where no calibration is found, it is
+    the difference of the offsets that the rotations have in both halves.
+
+    Compare the offsets of both halves.
+    """
+    intervals = evidence.intervals
+    if intervals is None:
+        return evidence.blind
+    found = _fitted_change(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
+    if found is None:
+        return Undecided("too little change of rotation in half of the recording: whether the clocks drift is unknown")
+    change_s, error_s = found.value, found.error
+    least_s = least_change_s(evidence.sequence, error_s)
+    if least_s > LARGEST_CHANGE_S:
+        known = f"a change of the offset by less than {least_s:.2g} s between the halves would not show"
+        return Undecided(f"too little change of rotation: {known}")
+    if abs(change_s) < least_s:
+        return None
+    return Symptom.warning(
+        count=1,
+        detail=(
+            f"the offset of frames and motion samples changes by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from "
+            "the first half of the recording to the second"
+        ),
+        treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
+    )
+
+
+def _fitted_change(evidence: Evidence, intervals: Intervals) -> Scalar | None:
+    """Return the change (s) by the self-calibration; None where it has no windows in both halves.
+
+    Rotations of half a short recording may agree best at a wrong shift, about which their standard error is too small.
+    """
+    found = evidence.self_calibration
+    if found is not None and found.windows == 1:
+        found = self_calibration(evidence.sequence, evidence.camera_motion, intervals, fewest_windows=2)
+    if found is None or found.windows == 1:
+        return None
+    return Scalar(float(found.value[CHANGE]), float(found.error[CHANGE]))

@@ -1,0 +1,849 @@
+"""Faults of the tracks: sightings that repeat, lack an image, have exchanged coordinates or fit no motion."""
+
+import itertools
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.edits import by_track, split
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.intervals import LEAST_INTERVALS, interval_means, is_comparable, moved_by
+from toolkit.audit.one_step import CORRELATION_SIGMAS, MOST_CORRELATION, errors_are_independent
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.jackknife import jackknife_error
+from toolkit.models.camera_motion import CameraMotion, Neighbours, neighbours
+from toolkit.models.gating import CHI2_3_MEDIAN, LEAST_DISPARITY_PX, mahalanobis_squared
+from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
+from toolkit.models.stereo import disparity_px
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import NO_FEATURES, ONE_ROW_FOR_BOTH, Observations, Sequence, StereoRig, is_left_only
+
+
+def no_sightings(evidence: Evidence) -> Symptom | None:
+    """A recording without any sighting that does not state that it was made without a camera.
+
+    Count the frames if none has a sighting, unless the recording states that it has none.
+    """
+    sequence = evidence.sequence
+    if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
+        return None
+    return Symptom(
+        count=sequence.frame_count,
+        detail=f"none of {sequence.frame_count} frames has a stereo sighting",
+        treatment="only dead reckoning can be compared: check the tracker that made the recording",
+        remedy=None,
+    )
+
+
+def unknown_rows(evidence: Evidence) -> Undecided | None:
+    """Rows of the left and the right image that may differ, in a file that has one for both.
+
+    In a pair that is not rectified, the rows of the right image differ from those of the left one. Files with both rows
+    are refused at reading where these differ, and the front end matches images along rows only. In a file with a single
+    row for both there is nothing to compare, and the effect of wrong rows looks like a wrong principal point.
+
+    Report that the rows cannot be compared where the recording has one row for both images.
+    """
+    sequence = evidence.sequence
+    if ONE_ROW_FOR_BOTH not in sequence.provenance.facts or is_left_only(sequence.observations.uv_px).all():
+        return None
+    return Undecided(
+        f"{ONE_ROW_FOR_BOTH}: whether left and right agree in rows, as rectified pairs do, cannot be checked"
+    )
+
+
+def returning_tracks(evidence: Evidence) -> Symptom | None:
+    """Track ids that are absent for some frames and then return.
+
+    If the tracker recognised the point, an estimator that uses the id closes a loop without knowing it. If the tracker
+    used the id again for another point, an estimator takes two points for one.
+
+    Count the returns; each starts a new track.
+    """
+    observations = evidence.sequence.observations
+    order = by_track(observations)
+    same_track = np.diff(observations.track_id[order]) == 0
+    absent = np.diff(observations.frame[order]) - 1
+    returns = np.zeros(len(observations), dtype=bool)
+    returns[order[1:]] = same_track & (absent > 0)
+    count = int(returns.sum())
+    if count == 0:
+        return None
+    gaps = absent[same_track & (absent > 0)]
+    return Symptom(
+        count=count,
+        detail=f"{count} return(s) of a track after an absence of {gaps.min()} to {gaps.max()} frames",
+        treatment="the track ends before its absence and a new one starts after it",
+        remedy=replace(
+            evidence.sequence,
+            observations=Observations.sorted(observations.frame, split(observations, returns), observations.uv_px),
+        ),
+    )
+
+
+# Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale
+# frame of a moving vehicle and 0 in any other.
+LEAST_STALE_SHARE = 0.9
+# Tracks that must survive into the frame: fewer could repeat by chance where pixels are rounded.
+LEAST_STALE_TRACKS = 4
+# Upper quartile of the pixel steps above which the camera moves (far points hardly move). Measured: at least 0.96 px
+# beside a stale frame, at most 0.05 px with the vehicle parked.
+MOVING_PX = 0.5
+# The samples show motion where they rotate the image by more than this (px) from frame to frame, which no gyro bias
+# does, or where odometry is faster than this (m/s).
+TURNING_PX, DRIVING_MPS = 2.0, 1.0
+
+
+def stale_frames(evidence: Evidence) -> Symptom | None:
+    """Frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves.
+
+    From such a frame on, each track follows a different scene point: its steps before and after agree with the motion,
+    while the step into the stale frame is zero. A standing camera also repeats pixels, which is no fault. Therefore the
+    image must move just before and just after or, at the ends of a recording, the samples must show motion.
+
+    Count the stale frames; every repeated track ends there and a new one starts at the next frame.
+    """
+    sequence = evidence.sequence
+    pairs = neighbours(sequence.observations)
+    moved_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before])
+    step_px = np.where(np.isnan(moved_px[:, 1]), moved_px[:, [0, 2]].max(axis=1), moved_px.max(axis=1))
+    stale = _stale_intervals(max(sequence.frame_count - 1, 0), pairs, step_px, _moving_by_samples(sequence))
+    count = int(stale.sum())
+    if count == 0:
+        return None
+    repeated = np.zeros(len(sequence.observations), dtype=bool)
+    repeated[pairs.after] = stale[pairs.interval] & (step_px == 0.0)
+    return Symptom(
+        count=count,
+        detail=(
+            f"{count} of {sequence.frame_count} frames repeat the pixels of the frame before them exactly while the "
+            f"vehicle moves ({repeated.sum()} sightings)"
+        ),
+        treatment="every repeated track ends there, the repeats are dropped, and a new track starts at the next frame",
+        remedy=_cut_tracks(sequence, repeated),
+    )
+
+
+def _moving_by_samples(sequence: Sequence) -> BoolArray:
+    """Say for each interval (K - 1,) whether, by the samples, the image rotates by pixels or the vehicle drives."""
+    if sequence.motion_kind == "none" or not is_comparable(sequence):
+        return np.zeros(max(sequence.frame_count - 1, 0), dtype=bool)
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
+    step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
+    with np.errstate(over="ignore"):  # by a sample that `implausible` will drop
+        speed_mps, rate_radps = np.linalg.norm(mean[:, :3], axis=1), np.linalg.norm(mean[:, 3:], axis=1)
+    turning = sequence.rig.fx_px * rate_radps * step_s > TURNING_PX
+    return np.asarray(turning | ((sequence.motion_kind == "twist") & (speed_mps > DRIVING_MPS)))
+
+
+def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array, moving_by_samples: BoolArray) -> BoolArray:
+    """Say for each interval whether its tracks repeat while those around it, or at an end the samples, show motion."""
+    survivors = np.bincount(pairs.interval, minlength=intervals)
+    repeats = np.bincount(pairs.interval[step_px == 0.0], minlength=intervals)
+    frozen = (repeats >= LEAST_STALE_SHARE * survivors) & (survivors >= LEAST_STALE_TRACKS)
+    moving = _typical_step_px(intervals, pairs, step_px) > MOVING_PX
+    # The nearest interval on either side that is not frozen; beyond the ends there is none. Intervals with hardly any
+    # surviving track, as at the end of a long freeze, are passed over as well.
+    index, shows_nothing = np.arange(intervals), frozen | (survivors < LEAST_STALE_TRACKS)
+    before = np.maximum.accumulate(np.where(shows_nothing, -1, index))
+    after = np.minimum.accumulate(np.where(shows_nothing, intervals, index)[::-1])[::-1]
+    stays = np.concatenate([moving, [False]])  # index -1 and index `intervals` both read False
+    moves_before = np.where(before < 0, moving_by_samples, stays[before])
+    moves_after = np.where(after == intervals, moving_by_samples, stays[after])
+    stale: BoolArray = frozen & moves_before & moves_after
+    return stale
+
+
+def _typical_step_px(intervals: int, pairs: Neighbours, step_px: Array) -> Array:
+    """Return the upper quartile of the pixel steps (K - 1,) of each interval, zero where no track survives."""
+    order = np.lexsort((step_px, pairs.interval))
+    first = np.searchsorted(pairs.interval, np.arange(intervals + 1))
+    count = np.diff(first)
+    quartile = np.minimum(first[:-1] + (3 * count) // 4, max(order.size - 1, 0))
+    return np.where(count > 0, step_px[order][quartile], 0.0) if order.size else np.zeros(intervals)
+
+
+def _cut_tracks(sequence: Sequence, repeated: BoolArray) -> Sequence:
+    """Drop the repeated sightings (N,) and give their tracks a new id from the next frame on."""
+    observations = sequence.observations
+    order = by_track(observations)
+    starts = np.zeros(len(observations), dtype=bool)
+    starts[order[1:]] = repeated[order[:-1]]
+    track_id, kept = split(observations, starts), ~repeated
+    cut = Observations.sorted(observations.frame[kept], track_id[kept], observations.uv_px[kept])
+    return replace(sequence, observations=cut)
+
+
+# Steps (px) that are tried. Smaller ones are not reported, because they add errors of less than 0.03 px.
+STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
+# Least number of sightings, and least share of rounded ones among the first so many (to look at the rest) and among
+# all. In sound recordings at most an eighth of the coordinates are half-precision numbers by chance.
+LEAST_SIGHTINGS, SOME, NEARLY_ALL = 100, 0.9, 0.999
+# Rounding is a warning from this share of the stated standard deviation on.
+MOST_ROUNDING = 0.5
+
+
+def coarse_pixels(evidence: Evidence) -> Symptom | None:
+    """Sightings that were rounded to whole pixels, to a simple part of one, or to half-precision numbers.
+
+    Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals",
+    1948). The depths of far points suffer most, because a disparity of a few pixels has few steps. Half-precision
+    numbers have steps of half a pixel above 512 px, and of a whole one above 1024 px.
+
+    Report the steps of the coordinates, and what they add to the stated noise.
+    """
+    rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
+    seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
+    if len(seen_px) < LEAST_SIGHTINGS:
+        return None
+    step_px, grid = _step_px(seen_px)
+    if step_px is None:
+        return None
+    rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
+    return Symptom(
+        count=len(seen_px),
+        detail=f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL",
+        treatment="write them with all the digits that the tracker has; depths of far points suffer most",
+        remedy=None,
+        harmful=False,
+        warns=bool(rounding_px > MOST_ROUNDING * stated_px),
+    )
+
+
+def _step_px(uv_px: Array) -> tuple[float | None, str]:
+    """Return the step (px) of coordinates (N, 2), and its description; None where there is none."""
+    some_px = uv_px[:LEAST_SIGHTINGS]  # enough to exclude it in most recordings
+    for step_px in STEPS_PX:
+        if _share_round(some_px, step_px) > SOME and _share_round(uv_px, step_px) > NEARLY_ALL:
+            return step_px, f"uL and uR are multiples of {step_px:g} px"
+    if _share_half(some_px) <= SOME or _share_half(uv_px) <= NEARLY_ALL:
+        return None, ""
+    step_px = float(np.spacing(np.float16(np.median(np.abs(uv_px[:, 0])))))
+    return step_px, f"uL and uR are half-precision numbers, with steps of {step_px:g} px at the median uL"
+
+
+def _share_round(uv_px: Array, step_px: float) -> float:
+    """Return the share of coordinates that are multiples of a step."""
+    steps = uv_px / step_px
+    return float(np.mean(np.abs(steps - np.round(steps)) < 1e-4))
+
+
+def _share_half(uv_px: Array) -> float:
+    """Return the share of coordinates that are half-precision numbers."""
+    with np.errstate(over="ignore"):
+        return float(np.mean(uv_px.astype(np.float16) == uv_px))
+
+
+# From this share of disparities that are not positive on, the order of the coordinates is tested: dropping so many
+# sightings would block.
+SUSPECT_SHARE = 0.2
+# Under the right order at most this share is not positive: 1 % where it was measured.
+SOUND_SHARE = 0.05
+# Rows of a pair differ by noise alone: half of the differences are within so many standard deviations of a pixel.
+ROW_SIGMAS = 5.0
+# Least share of the sightings in tracks with exchanged rows, of which sound recordings at hand have none; and least
+# share of these among the sightings in tracks without disparity, or else the camera's motion may be wrong.
+LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
+# A track may have rows in the place of uL and uR if the mean of its disparities is within so many standard errors of
+# zero. Its distance from the epipolar lines is judged from so many pairs of neighbouring sightings on.
+TRACK_SIGMAS, LEAST_PAIRS = 4.0, 3
+# Inverse depths (1/m) along an epipolar line, from infinity to half a metre.
+_INVERSE_DEPTHS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 23)])
+# A uR that stands for a missing right image is in so many sightings at least, with so many values of uL, and is so many
+# times as frequent as any other uR. In the sound recordings at hand, one with halves of a pixel among them, it is 2.4.
+FEWEST_FILLED, FEWEST_PLACES, TIMES_AS_FREQUENT = 10, 5, 10
+# Frames in which the orders are tried.
+TRIED_FRAMES = 300
+NAMES = ("uL", "uR", "v")
+
+
+def swapped_coordinates(evidence: Evidence) -> Symptom | None:
+    """Image coordinates in the wrong columns: left and right images exchanged, or rows and columns.
+
+    A point in front of a rectified pair is farther left in the right image, so in a sound recording nearly every
+    disparity uL - uR is positive. Where many are not, the five other orders of the three coordinates are tried; the
+    right order is the one under which the tracks follow the measured motion. Where rows and columns of both images are
+    exchanged, uL and uR hold the rows of the two images, which differ by noise alone. The depth is then lost, and there
+    is no repair.
+
+    Rows and columns may be exchanged in some of the tracks only. The camera's own motion, estimated from the other
+    tracks, predicts on which part of its epipolar line a point of unknown depth is seen next (Hartley & Zisserman,
+    "Multiple View Geometry in Computer Vision", section 9.2). A track with exchanged rows and columns follows this line
+    once they are exchanged back.
+
+    A right image that is missing may stand as one value in uR, while uL and v are sound. No two tracks have the same uR
+    to the last digit but by chance, or by rounding, and then many values are as frequent.
+
+    Find the order of the coordinates under which tracks and motion agree; exchange them where it is certain.
+    """
+    sequence = evidence.sequence
+    if (partly := _filled_right(sequence) or _rows_in_some_tracks(evidence)) is not None:
+        return partly
+    disparity = disparity_px(sequence.observations.uv_px)
+    suspect = np.isfinite(disparity) & (disparity <= 0.0)
+    if suspect.sum() <= SUSPECT_SHARE * max(len(disparity), 1):
+        return None
+    if (flat := _flat(sequence, suspect)) is not None:
+        return flat
+    count, share = int(suspect.sum()), suspect.mean()
+    detail = f"{count} of {len(disparity)} sightings have a disparity <= 0 ({share:.0%})"
+    apart_px, noise_px = float(np.nanmedian(np.abs(disparity))), float(np.sqrt(sequence.rig.cov_uv_px2[0, 0]))
+    if apart_px < ROW_SIGMAS * noise_px and share < 1.0 - SUSPECT_SHARE:
+        detail += f" and uL differs from uR by {apart_px:.1f} px only, as the rows of a pair do: u and v are exchanged"
+        why = "the depth is lost with the exchange: correct the file"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
+    explained = [remedy for remedy in _reordered(sequence) if _is_sound(remedy[1])]
+    if len(explained) != 1:
+        why = "no order of the coordinates makes the tracks agree with the measured motion: correct the file"
+        detail += ": left and right, or u and v, are exchanged"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
+    order_name, remedy = explained[0]
+    treatment = "exchanged back, and the tracks agree with the measured motion"
+    return Symptom(count, f"{detail}: {order_name}", treatment, remedy, spoils_vision=True)
+
+
+def _filled_right(sequence: Sequence) -> Symptom | None:
+    """Report right images that are missing and written as one value of uR; these sightings have uL and v alone."""
+    observations = sequence.observations
+    uv_px = observations.uv_px
+    values, counts = np.unique(uv_px[np.isfinite(uv_px[:, 1]), 1], return_counts=True)
+    if not values.size:
+        return None
+    *_, second = [0, *np.sort(counts)[:-1]]
+    filler = float(values[np.argmax(counts)])
+    filled = (uv_px[:, 1] == filler) & (uv_px[:, 0] != filler)  # else the left image is missing as well
+    count, places = int(filled.sum()), np.unique(uv_px[filled, 0]).size
+    if count < max(FEWEST_FILLED, TIMES_AS_FREQUENT * second) or places < FEWEST_PLACES:
+        return None
+    without = uv_px.copy()
+    without[filled, 1] = np.nan
+    return Symptom(
+        count=count,
+        detail=f"{count} of {len(uv_px)} sightings have a uR of {filler:g} at {places} values of uL: no right image",
+        treatment="taken as sightings by the left image alone; leave uR empty where there is none",
+        remedy=_with_pixels(sequence, without),
+        harmful=False,
+    )
+
+
+def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
+    """Report tracks that follow the camera's own motion, known from the others, only with u and v exchanged."""
+    sequence = evidence.sequence
+    candidates = _like_rows(sequence)
+    if (
+        candidates.sum() < max(LEAST_EXCHANGED * candidates.size, 1)
+        or not np.isfinite(sequence.observations.uv_px[:, [0, 2]]).all()
+    ):
+        return None
+    exchanged = _exchanged_rows(sequence, evidence.camera_motion)
+    count = int(exchanged.sum())
+    if count < max(LEAST_EXCHANGED * len(exchanged), MOSTLY * candidates.sum()):
+        return None
+    return Symptom(
+        count=count,
+        detail=(
+            f"{count} of {len(exchanged)} sightings ({count / len(exchanged):.0%}), whole tracks, have a uL that "
+            "differs from uR as the rows of a pair do, and agree with the camera's own motion only if u and v are "
+            "exchanged"
+        ),
+        treatment=(
+            "the depth is lost with the exchange: these and all others that look like rows dropped "
+            f"({candidates.sum()})"
+        ),
+        remedy=replace(sequence, observations=sequence.observations.select(~candidates)),
+    )
+
+
+def _exchanged_rows(sequence: Sequence, camera: CameraMotion) -> BoolArray:
+    """Say for each sighting (N,) whether its track, without disparity, follows the camera's motion only if exchanged.
+
+    Its median distance from the epipolar lines is then less than half of that as given.
+    """
+    candidates = _like_rows(sequence)
+    pairs = neighbours(sequence.observations)
+    pairs = pairs.select(camera.known[pairs.interval] & candidates[pairs.before])
+    exchanged = np.zeros(len(sequence.observations), dtype=bool)
+    if not pairs.before.size:
+        return exchanged
+    T_after_before = se3_inverse(moved_by(camera, sequence))[pairs.interval]
+    uv_px, track_id = sequence.observations.uv_px, sequence.observations.track_id[pairs.before]
+    rows_px = uv_px[:, :2].mean(axis=1)
+    as_given, turned = np.stack([rows_px, uv_px[:, 2]], axis=1), np.stack([uv_px[:, 2], rows_px], axis=1)
+    off_px = [
+        _median_of_each(track_id, _off_line_px(pixels[pairs.before], pixels[pairs.after], T_after_before, sequence.rig))
+        for pixels in (as_given, turned)
+    ]
+    enough = np.unique(track_id, return_counts=True)[1] >= LEAST_PAIRS
+    struck = np.unique(track_id)[enough & (off_px[1] < 0.5 * off_px[0])]
+    return np.asarray(np.isin(sequence.observations.track_id, struck) & candidates)
+
+
+def _like_rows(sequence: Sequence) -> BoolArray:
+    """Say for each sighting (N,) whether the disparities of its track are zero except for the noise of rows."""
+    disparity = disparity_px(sequence.observations.uv_px)
+    _, member, counts = np.unique(sequence.observations.track_id, return_inverse=True, return_counts=True)
+    mean = np.bincount(member, weights=disparity) / counts
+    spread = np.sqrt(np.maximum(np.bincount(member, weights=(disparity - mean[member]) ** 2) / counts, 0.0))
+    sigma = np.minimum(spread, np.sqrt(2.0 * sequence.rig.cov_uv_px2[2, 2]))
+    near = np.abs(mean) <= TRACK_SIGMAS * sigma / np.sqrt(counts)
+    return np.asarray((near & (counts > LEAST_PAIRS))[member])
+
+
+def _off_line_px(before_px: Array, after_px: Array, T_after_before: Array, rig: StereoRig) -> Array:
+    """Return the distances (P,) px of pixels (P, 2) from the epipolar lines of those in the frame before."""
+    focal_px, centre_px = np.array([rig.fx_px, rig.fy_px]), np.array([rig.cx_px, rig.cy_px])
+    ray = np.concatenate([(before_px - centre_px) / focal_px, np.ones((len(before_px), 1))], axis=1)
+    turned = (T_after_before[:, :3, :3] @ ray[:, :, None])[..., 0]
+    seen = turned[:, None] + _INVERSE_DEPTHS[:, None] * T_after_before[:, None, :3, 3]
+    in_front = seen[..., 2] > 0.01
+    at_px = focal_px * seen[..., :2] / np.where(in_front, seen[..., 2], 1.0)[..., None] + centre_px
+    distance = np.where(in_front, np.linalg.norm(at_px - after_px[:, None], axis=2), np.inf)
+    return np.asarray(distance.min(axis=1))
+
+
+def _median_of_each(group: IntArray, values: Array) -> Array:
+    """Return the median of the values (P,) of each group, in the order of the groups' numbers."""
+    order = np.lexsort((values, group))
+    _, first, counts = np.unique(group[order], return_index=True, return_counts=True)
+    return np.asarray(values[order][first + (counts - 1) // 2])
+
+
+def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
+    """Report sightings without disparity: missing ones written as zeros, or one image in the columns of both."""
+    observations = sequence.observations
+    uv_px = observations.uv_px
+    filler, missing = _filler(uv_px)
+    same = uv_px[:, 0] == uv_px[:, 1]
+    of_all = f"of {len(observations)} sightings"
+    if missing.sum() > 0.5 * suspect.sum():
+        count = int(missing.sum())
+        return Symptom(
+            count=count,
+            detail=f"{count} {of_all} are {filler:g} in every coordinate: missing ones, written as {filler:g}",
+            treatment="dropped; a course file has -1 for them, a table no row",
+            remedy=replace(sequence, observations=observations.select(~missing)),
+            harmful=False,
+        )
+    if same.sum() > 0.5 * suspect.sum():
+        return Symptom(
+            count=int(same.sum()),
+            detail=f"{int(same.sum())} {of_all} have a uR that equals uL: one camera's columns stand for both",
+            treatment="without the right image there is no depth: correct the file, or leave uR empty",
+            remedy=None,
+            spoils_vision=True,
+        )
+    return None
+
+
+def _filler(uv_px: Array) -> tuple[float, BoolArray]:
+    """Return the most frequent value among sightings (N, 3) with equal coordinates, and which of them (N,) have it."""
+    alike = (uv_px == uv_px[:, :1]).all(axis=1)
+    if not alike.any():
+        return np.nan, alike
+    values, counts = np.unique(uv_px[alike, 0], return_counts=True)
+    filler = float(values[np.argmax(counts)])
+    return filler, np.asarray(alike & (uv_px[:, 0] == filler))
+
+
+def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
+    """Return the recording in every other order of coordinates, and with left and right exchanged behind the camera."""
+    uv_px = sequence.observations.uv_px
+    orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
+    # A sighting without the right image has nothing to be exchanged with.
+    sequence = replace(sequence, observations=sequence.observations.select(~is_left_only(uv_px)))
+    uv_px = sequence.observations.uv_px
+    whole = [(_order_name(order), uv_px[:, list(order)]) for order in orders]
+    observations = sequence.observations
+    parts = {"whole tracks": _behind(uv_px, observations.track_id), "whole frames": _behind(uv_px, observations.frame)}
+    # Of tracks and frames, the grouping is taken under which the exchange leaves the fewest points behind the camera.
+    kind = min(parts, key=lambda kind: int(np.sum(parts[kind] != (disparity_px(uv_px) <= 0.0))))
+    behind = parts[kind]
+    if behind.mean() < 1.0 - SUSPECT_SHARE:
+        turned = np.where(behind[:, None], uv_px[:, [1, 0, 2]], uv_px)
+        whole.append((f"left and right are exchanged in {behind.mean():.0%} of them, {kind}", turned))
+    return [(order_name, _with_pixels(sequence, pixels)) for order_name, pixels in whole]
+
+
+def _behind(uv_px: Array, group: IntArray) -> BoolArray:
+    """Say for each sighting (N,) whether most of its group, a track or a frame, has a disparity <= 0."""
+    _, member = np.unique(group, return_inverse=True)
+    behind = np.bincount(member, weights=disparity_px(uv_px) <= 0.0) / np.bincount(member)
+    return np.asarray(behind[member] > 0.5)
+
+
+def _is_sound(sequence: Sequence) -> bool:
+    if (disparity_px(sequence.observations.uv_px) <= 0.0).mean() > SOUND_SHARE:
+        return False
+    evidence = Evidence(sequence.truncated(TRIED_FRAMES))
+    if evidence.intervals is None:
+        return False
+    found = evidence.agreement
+    return found.residual_px <= found.limit_px
+
+
+def _order_name(order: tuple[int, ...]) -> str:
+    if order == (1, 0, 2):
+        return "left and right are exchanged"
+    return f"they are in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
+
+
+def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+
+
+# A disparity is doubled if its ratio is nearer to two than to one or four, to allow for noise and for the motion.
+LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
+# Least share and number of doubled tracks among those detected in a frame. Measured: 0.96 to 1 where they are doubled,
+# at most 0.22 in any other frame of the real recordings and 0.40 in simulated ones, where few and far points begin a
+# track.
+LEAST_DOUBLED_SHARE, LEAST_DOUBLED_TRACKS = 0.8, 6
+# Largest inverse of the ratio at infinite depth: halfway between that of doubled tracks, a half, and of any motion,
+# one.
+MOST_AT_INFINITY = 0.75
+# Least share of them that is seen a third time, to know that the disparity stays doubled.
+LEAST_SEEN_AGAIN = 0.5
+
+
+def doubled_disparity(evidence: Evidence) -> Symptom | None:
+    """Tracks whose disparity doubles from their first sighting to their second, and stays doubled.
+
+    A tracker that adds the disparity to an initial guess which already contains it doubles the disparity of every newly
+    detected track. Such points appear at half of their depth, so the camera seems to move at half of its speed. No
+    motion causes this: it would have to halve the depths of near and far points alike in one interval, and then stop.
+
+    Count the doubled tracks; halve the disparity of every sighting of theirs but the first.
+    """
+    observations = evidence.sequence.observations
+    begun = _beginnings(observations)
+    bad_frames = [k for k in np.unique(begun.frame).tolist() if _is_doubled(begun.select(begun.frame == k))]
+    if not bad_frames:
+        return None
+    tracks = begun.track_id[np.isin(begun.frame, bad_frames) & (begun.first_ratio > LEAST_RATIO)]
+    where = f"frame {bad_frames[0]}" if len(bad_frames) == 1 else f"{len(bad_frames)} frames"
+    return Symptom(
+        count=tracks.size,
+        detail=(
+            f"the disparity of {tracks.size} tracks, of nearly all detected in {where}, doubles from their first "
+            "sighting to the second and stays so"
+        ),
+        treatment="halved in every sighting but the first",
+        remedy=replace(evidence.sequence, observations=_halved(observations, tracks)),
+    )
+
+
+class _Beginnings(NamedTuple):
+    """Tracks (T,), frame and disparity (px) of their first sighting, and ratios, second to first and third to second.
+
+    Only tracks whose first ratio is known are contained; an unknown second ratio is NaN.
+    """
+
+    track_id: IntArray
+    frame: IntArray
+    first_px: Array
+    first_ratio: Array
+    second_ratio: Array
+
+    def select(self, rows: BoolArray) -> "_Beginnings":
+        """Return the tracks of a mask (T,)."""
+        return _Beginnings(
+            self.track_id[rows], self.frame[rows], self.first_px[rows], self.first_ratio[rows], self.second_ratio[rows]
+        )
+
+
+def _beginnings(observations: Observations) -> _Beginnings:
+    order = by_track(observations)
+    track_id, frame = observations.track_id[order], observations.frame[order]
+    disparity = disparity_px(observations.uv_px)[order]
+    follows = (np.diff(track_id) == 0) & (np.diff(frame) == 1) & (disparity[:-1] > LEAST_DISPARITY_PX)
+    # From row n to row n + 1; two more rows, because the last sighting may be the only one of its track.
+    ratio = np.full(track_id.size + 1, np.nan)
+    np.divide(disparity[1:], disparity[:-1], out=ratio[: follows.size], where=follows)
+    first = np.flatnonzero(np.diff(track_id, prepend=-1))
+    begun = _Beginnings(track_id[first], frame[first], disparity[first], ratio[first], ratio[first + 1])
+    return begun.select(np.isfinite(begun.first_ratio))
+
+
+def _doubles(ratio: Array) -> BoolArray:
+    return np.asarray((ratio > LEAST_RATIO) & (ratio < LARGEST_RATIO))
+
+
+def _is_doubled(begun: _Beginnings) -> bool:
+    """Say whether nearly all of the tracks double once and keep the doubled disparity."""
+    doubled, again = _doubles(begun.first_ratio), np.isfinite(begun.second_ratio)
+    if doubled.size < LEAST_DOUBLED_TRACKS or doubled.mean() < LEAST_DOUBLED_SHARE or again.mean() < LEAST_SEEN_AGAIN:
+        return False
+    stays = float(np.median(begun.second_ratio[again])) < LEAST_RATIO
+    return stays and _far_ones_double(begun)
+
+
+def _far_ones_double(begun: _Beginnings) -> bool:
+    """Say whether the disparity of far tracks doubles as well; a motion does not change it at infinity.
+
+    If the camera moves forward by t, the inverse of the ratio is 1 - t d / (f b), a straight line in the disparity d.
+    The line through the medians of the farther and the nearer half of the tracks is extrapolated to d = 0.
+    """
+    order = np.argsort(begun.first_px)
+    (far_px, far), (near_px, near) = (
+        (float(np.median(begun.first_px[half])), float(np.median(1.0 / begun.first_ratio[half])))
+        for half in np.array_split(order, 2)
+    )
+    slope = min((near - far) / (near_px - far_px), 0.0) if near_px > far_px else 0.0
+    return far - slope * far_px < MOST_AT_INFINITY
+
+
+def _halved(observations: Observations, tracks: IntArray) -> Observations:
+    later = np.isin(observations.track_id, tracks)
+    later[np.unique(observations.track_id, return_index=True)[1]] = False  # rows are in the order of frames
+    uv_px = observations.uv_px.copy()
+    uv_px[later, 1] += 0.5 * disparity_px(observations.uv_px[later])
+    return Observations(observations.frame, observations.track_id, uv_px)
+
+
+def no_disparity(evidence: Evidence) -> Symptom | None:
+    """Stereo sightings whose disparity is zero or negative: a point at infinity, or behind the camera.
+
+    Count the sightings with uL - uR <= 0 and drop them; their tracks continue.
+    """
+    observations = evidence.sequence.observations
+    bad = disparity_px(observations.uv_px) <= 0.0
+    count = int(bad.sum())
+    if count == 0:
+        return None
+    return Symptom(
+        count=count,
+        detail=f"{count} of {len(observations)} sightings have a disparity <= 0 ({count / len(observations):.2%})",
+        treatment="dropped",
+        remedy=replace(evidence.sequence, observations=observations.select(~bad)),
+    )
+
+
+def left_only(evidence: Evidence) -> Symptom | None:
+    """Sightings by the left image alone: they are used as they are, and reported as information.
+
+    Count the sightings without the right image; warn where there are no others, so that no point has a depth.
+    """
+    uv_px = evidence.sequence.observations.uv_px
+    count = int(is_left_only(uv_px).sum())
+    if count == 0:
+        return None
+    none_else = count == len(uv_px)
+    return Symptom(
+        count=count,
+        detail=f"{count} of {len(uv_px)} sightings ({count / len(uv_px):.0%}) lack the right image",
+        treatment="without any disparity, depths depend on the motion alone" if none_else else "used for uL and v",
+        remedy=None,
+        harmful=False,
+        warns=none_else,
+    )
+
+
+# Least length (s) of a span: every estimator bridges shorter ones by the motion samples.
+LEAST_THIN_S = 0.5
+
+
+def thin_vision(evidence: Evidence) -> Symptom | None:
+    """Times at which the tracks are too few to determine the camera's motion: darkness, a bare wall, a lost tracker.
+
+    Report the spans in which the camera's own motion is not determined.
+    """
+    sequence = evidence.sequence
+    if evidence.spoilt_by or not len(sequence.observations) or not is_comparable(sequence):
+        return None
+    known = evidence.camera_motion.known
+    frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    # A single interval of that length is a gap in the frames, which time-gap reports.
+    spans = [run for run in _runs(~known) if run[1] - run[0] > 1 and frame_s[run[1]] - frame_s[run[0]] >= LEAST_THIN_S]
+    if not spans:
+        return None
+    longest = max(spans, key=lambda span: frame_s[span[1]] - frame_s[span[0]])
+    share = sum(end - begin for begin, end in spans) / known.size
+    seen = len(sequence.observations) / sequence.frame_count
+    return Symptom.warning(
+        count=len(spans),
+        detail=(
+            f"the tracks do not determine the camera's motion for {share:.0%} of the time, the longest at "
+            f"{frame_s[longest[0]]:.1f}-{frame_s[longest[1]]:.1f} s ({seen:.1f} sightings a frame over all)"
+        ),
+        treatment="there every estimate rests on the motion samples, or on a few tracks that may be wrong",
+        spans_ns=tuple((int(sequence.frames_t_ns[begin]), int(sequence.frames_t_ns[end])) for begin, end in spans),
+    )
+
+
+def _runs(marked: BoolArray) -> list[tuple[int, int]]:
+    """Return begin and end of every run of marked entries (n,), the end being the index after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+# Limit of the ratio of the standard deviation to the stated one. 21 sound simulated recordings have 0.98 to 1.00 and
+# real ones, whose noise is assumed, at most 0.62. A tenth of mismatches gives 1.04 to 1.07, three tenths 1.20 to 1.46.
+MOST_SCATTER, SCATTER_SIGMAS = 1.05, 5.0
+# Squared distances that a quarter of the sightings exceed, and one in a thousand (chi-square, 3 degrees of freedom).
+UPPER_QUARTILE, FAR_CHI2 = 4.108, 16.27
+# Beyond this squared distance, 32 standard deviations, a sighting is of another point. Sound real recordings have at
+# most 0.6 % of these, on moving objects and in repeated frames; the limit of their share was chosen with them in view.
+GROSS_CHI2, MOST_GROSS = 1000.0, 0.02
+# Ratios of the squared distances' median to its expectation that agree with the stated noise, also with a fifth of
+# mismatches. The tail must then agree as well, unless there are mismatches: a tenth of sliding tracks gives 2.1 to 5.6
+# % of far distances, sound simulations have 0.06 to 0.12 %.
+USUAL_SCATTER = (0.95, 1.12)
+MOST_FAR, FAR_SIGMAS = 0.008, 3.0
+# Independent errors contradict a noise that is stated this many times too large. With few tracks the scatter is a
+# little too small, because the camera's motion is fitted to them; and a noise overstated on purpose is often less than
+# that.
+MOST_OVERSTATED = 1.5
+# The same limit for correlated errors, whose steps scatter less than the errors. The noise stated of the toolkit's own
+# tracker is 7 times the scatter of its steps on EuRoC's images, and so is that of simulated tracks like it. Chosen with
+# these in view.
+MOST_OVERSTATED_CORRELATED = 10.0
+# Ratio of standard deviations below which tracks are exact, as in a simulation without noise.
+_NO_ERROR = 1e-5
+# If the stated noise alone is wrong, the ratios by the median and by the upper quartile agree to within these factors.
+SAME_RATIO = (0.9, 1.1)
+
+
+def track_scatter(evidence: Evidence) -> Symptom | Undecided | None:
+    """Tracks whose scatter contradicts the stated noise of a sighting: mismatches, or a wrong stated noise.
+
+    A point triangulated in one frame, moved by the camera's own best motion and projected into the next, has a residual
+    of covariance J R J^T + R there, where R is the covariance of a sighting. The motion samples are not used. If R is
+    right, the squared Mahalanobis distances have the upper quartile of the chi-square distribution with three degrees
+    of freedom, which a few gross errors do not change. Every estimator uses R.
+
+    Where R is assumed and a real tracker is more accurate, mismatches do not raise the upper quartile. They are found
+    by their number of gross residuals.
+
+    A scatter far below the stated noise contradicts it too, unless errors are correlated from frame to frame, because
+    an error that lasts along a track is not in its steps. If the errors are independent (``correlated_tracks``), the
+    conclusion is certain.
+
+    Compare the scatter of the tracks about the camera's own motion with the stated noise.
+    """
+    if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
+        return evidence.blind
+    steps = evidence.one_step
+    chi2 = mahalanobis_squared(steps.residual_px, steps.cov_px2)
+    scatter, error = _scatter_ratio(chi2), jackknife_error(_scatter_ratio, chi2)
+    if not np.isfinite(scatter):
+        return evidence.blind
+    if scatter < MOST_SCATTER + SCATTER_SIGMAS * error:
+        return _tail(chi2) or _overstated(evidence, scatter, error)
+    cause = "mismatches, points that move, or noise stated too small"
+    if SAME_RATIO[0] < _nearer_scatter(chi2) / scatter < SAME_RATIO[1]:
+        cause = f"near and far ones equally, so the noise is stated {scatter:.3g} times too small"
+    return _scatter_warning(
+        f"{_scatters(evidence, scatter, error)}; {np.mean(chi2 > FAR_CHI2):.0%} are beyond chance",
+        f"{cause}: estimators give such tracks too much weight",
+    )
+
+
+def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | None:
+    """Report tracks that scatter far less than the stated noise, and whether that noise alone explains it.
+
+    Six parameters of the camera's motion are fitted to the 3 n residuals of an interval, which lowers their scatter.
+    """
+    _, interval, pairs = np.unique(
+        evidence.sequence.observations.frame[evidence.one_step.after], return_inverse=True, return_counts=True
+    )
+    left = float(np.mean(np.maximum(1.0 - 2.0 / pairs, 0.0)[interval]))
+    correlation = evidence.step_correlation
+    if left <= 0.0 or scatter < _NO_ERROR or correlation is None:
+        return None
+    scatter, error = scatter / np.sqrt(left), error / np.sqrt(left)
+    independent = errors_are_independent(correlation)
+    least = 1.0 / (MOST_OVERSTATED if independent else MOST_OVERSTATED_CORRELATED)
+    if scatter + SCATTER_SIGMAS * error > least:
+        return None
+    times = f"{1.0 / scatter:.2g}" if scatter > 0.1 else f"{1.0 / scatter:.0f}"
+    cause = f"the noise is stated {times} times too large, or the errors are constant along tracks"
+    if not independent:
+        cause = f"the noise is stated too large, by less than {times} times as the errors are correlated between frames"
+    symptom = _scatter_warning(
+        _scatters(evidence, scatter, error), f"{cause}: estimators give such tracks too little weight"
+    )
+    if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
+        return symptom
+    # This noise was not stated: it is the one assumed where a recording states none.
+    assumed = f"{symptom.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px sets it"
+    return replace(symptom, treatment=assumed, warns=False)
+
+
+def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
+    sigma_px = " ".join(f"{sigma:.2g}" for sigma in np.sqrt(np.diag(evidence.sequence.rig.cov_uv_px2)))
+    figures = f"{scatter:.2f} +- {error:.2f}" if scatter >= 1.0 else f"{scatter:.2g} +- {error:.1g}"
+    return (
+        f"from frame to frame the tracks scatter {figures} times as much as the stated noise of a sighting explains "
+        f"(uL uR v: {sigma_px} px)"
+    )
+
+
+def _scatter_warning(detail: str, treatment: str) -> Symptom:
+    return Symptom.warning(count=1, detail=detail, treatment=treatment)
+
+
+def _tail(chi2: Array) -> Symptom | None:
+    """Report too many gross distances (P,), or too many far ones where the median agrees with the noise."""
+    gross, error = _gross_share(chi2), jackknife_error(_gross_share, chi2)
+    if gross > MOST_GROSS + SCATTER_SIGMAS * error:
+        return _mismatched(f"{gross:.1%} +- {error:.1%}", f"{np.sqrt(GROSS_CHI2):.0f} times what the noise explains")
+    far, error = _far_share(chi2), jackknife_error(_far_share, chi2)
+    least, most = USUAL_SCATTER
+    if least < _nearer_scatter(chi2) < most and far > MOST_FAR + FAR_SIGMAS * error:
+        return _mismatched(f"{far:.1%} +- {error:.1%}", "the stated noise explains (0.1% do by chance)")
+    return None
+
+
+def _mismatched(share: str, than: str) -> Symptom:
+    return _scatter_warning(
+        f"from frame to frame {share} of the sightings have residuals of more than {than}",
+        "mismatches, exchanged ids, or points that move: estimators must reject as many",
+    )
+
+
+def _scatter_ratio(chi2: Array) -> float:
+    """Return the ratio of the standard deviation to the stated one, by the upper quartile of squared distances (P,)."""
+    return float(np.sqrt(np.quantile(chi2, 0.75) / UPPER_QUARTILE))
+
+
+def _nearer_scatter(chi2: Array) -> float:
+    """Return the same ratio by the median of the squared distances (P,)."""
+    return float(np.sqrt(np.median(chi2) / CHI2_3_MEDIAN))
+
+
+def _gross_share(chi2: Array) -> float:
+    return float(np.mean(chi2 > GROSS_CHI2))
+
+
+def _far_share(chi2: Array) -> float:
+    return float(np.mean(chi2 > FAR_CHI2))
+
+
+def correlated_tracks(evidence: Evidence) -> Symptom | None:
+    """Tracks with correlated errors: the tracked corner drifts, or a stereo match is wrong along the whole track.
+
+    Three sightings of a track give two one-step residuals about the camera's own motion. If the errors of sightings are
+    independent, the error of the second sighting is in both residuals with opposite signs, and their correlation is
+    -1/2. If the errors are a random walk, the residuals are independent and the correlation is 0. A wrong disparity
+    gives a wrong depth and residuals of the same sign.
+
+    Report the correlation of neighbouring one-step residuals where it is not that of independent errors.
+    """
+    if evidence.spoilt_by:
+        return None
+    if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
+        return None
+    found = evidence.step_correlation
+    if found is None:
+        return None
+    value, error = found
+    if value < MOST_CORRELATION + CORRELATION_SIGMAS * error:
+        return None
+    return Symptom.information(
+        count=1,
+        detail=(
+            f"the errors of a track's sightings are correlated: from one step to the next by {value:+.2f} "
+            f"+- {error:.2f}, where independent errors have -0.5"
+        ),
+        treatment="measured, so that tracks count for less (noise.track_weight); 'vislam card' shows the correlation",
+    )
