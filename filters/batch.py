@@ -42,12 +42,12 @@ from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
+from toolkit.measurements import Packet, StereoFrame, StereoRig, is_left_only
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, stacked
-from toolkit.sequence import Packet, StereoFrame, StereoRig, is_left_only
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"

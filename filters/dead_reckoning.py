@@ -3,8 +3,8 @@
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.measurements import Packet
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 0, "the measured motion alone"

@@ -19,11 +19,11 @@ from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, transposed
+from toolkit.measurements import Packet, StereoRig
 from toolkit.models import left_only
 from toolkit.models.gating import huber_threshold, huber_weights, mahalanobis_squared
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import Packet, StereoRig
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the other's uncertainty as noise"

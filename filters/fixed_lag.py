@@ -21,10 +21,9 @@ from filters.smoothing.indeterminate import Recovery, behind_camera
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.measurements import NS_PER_S, Packet
 from toolkit.models.factors import points_of
 from toolkit.models.motion import state_cov
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"

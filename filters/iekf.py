@@ -34,7 +34,7 @@ from filters.kalman.linearisation import AtLatestEstimates, Linearisation
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.measurements import StereoFrame, StereoRig
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"

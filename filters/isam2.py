@@ -29,9 +29,9 @@ from filters.smoothing.linearisation_error import linearised_badly
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.measurements import Packet
 from toolkit.models.factors import L, landmark_keys
 from toolkit.models.motion import state_cov
-from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept; one step a frame, old variables frozen"

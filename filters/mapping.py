@@ -10,10 +10,10 @@ from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.measurements import Packet
 from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 

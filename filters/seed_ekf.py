@@ -16,10 +16,10 @@ from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.measurements import Packet
 from toolkit.models import left_only, stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet
 
 # Used instead of zero, which has no inverse: a bias of 1e-8 rad/s turns the pose by 1e-6 rad in 100 s.
 _FIXED_VARIANCE = 1e-16

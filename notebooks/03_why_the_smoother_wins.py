@@ -26,8 +26,8 @@ import numpy as np
 from recordings import real
 
 from toolkit import Result, compare
-from toolkit.estimator import ladder
 from toolkit.noise import Card
+from toolkit.registry import ladder
 from toolkit.report.card import card_lines
 from toolkit.report.comparison_table import noise_line
 from toolkit.report.messages import consistency_lines

@@ -29,13 +29,13 @@ from toolkit.estimator import Setup
 from toolkit.gate.baseline import Case
 from toolkit.gate.checking import How, check, new_baseline
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
+from toolkit.measurements import Packet, StereoFrame
 from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
 from toolkit.progress import SILENT, silent
 from toolkit.report.gate import gate_text
 from toolkit.report.verify_text import verification_text
 from toolkit.runner import run
-from toolkit.sequence import Packet, StereoFrame
 from toolkit.verify.subject import subject_of
 from toolkit.verify.verification import verify
 

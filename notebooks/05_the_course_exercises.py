@@ -26,9 +26,9 @@ import numpy as np
 
 import toolkit
 from toolkit.datasets import load_sequence
+from toolkit.measurements import Packet
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.sequence import Packet
 
 # %matplotlib inline
 plt.rcParams |= {"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.grid": True, "grid.alpha": 0.3}

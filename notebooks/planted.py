@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from toolkit.geometry import Array, se3
-from toolkit.measured_motion import TwistSamples
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 

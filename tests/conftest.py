@@ -33,11 +33,12 @@ from matplotlib.figure import Figure
 from toolkit import runner
 from toolkit.audit import Audit, Finding
 from toolkit.estimate import Run
-from toolkit.estimator import find
 from toolkit.experiment import pipeline, recording, workers
 from toolkit.experiment.recording import WHOLE, Recording
+from toolkit.measurements import Prior
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import Prior, Sequence
+from toolkit.registry import find
+from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import SCENARIOS, Scenario
 

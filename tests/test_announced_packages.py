@@ -13,7 +13,7 @@ from filters import dead_reckoning
 from toolkit import datasets, discovery, metrics, runner
 from toolkit.cli import main
 from toolkit.errors import DataError, ExtensionError, VislamError
-from toolkit.estimator import find
+from toolkit.registry import find
 from toolkit.simulation import DRIVE, simulate
 
 METRIC = """'''A metric of another project.'''

@@ -18,9 +18,10 @@ from toolkit.api import Result
 from toolkit.audit import faults
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError, VislamError
-from toolkit.estimator import LADDER, Estimator, Setup, defaults, find
+from toolkit.estimator import Estimator, Setup
 from toolkit.experiment import Comparison, Plan
 from toolkit.metrics import describe
+from toolkit.registry import LADDER, defaults, find
 from toolkit.report.comparison_table import comparison_table
 from toolkit.report.figures.style import NamedFigure
 from toolkit.sequence import Sequence

@@ -10,8 +10,8 @@ from toolkit import compilation, runner
 from toolkit.compilation import Compilation
 from toolkit.datasets import load_sequence
 from toolkit.errors import EstimatorError
-from toolkit.estimator import find
 from toolkit.initialization import start_from_truth
+from toolkit.registry import find
 from toolkit.settings import Settings
 
 

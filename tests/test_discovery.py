@@ -8,7 +8,7 @@ import pytest
 
 from toolkit import discovery
 from toolkit.errors import EstimatorError, ExtensionError
-from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
+from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
 from toolkit.settings import DEFAULTS
 
 PACKAGE = "temporary_estimators"

@@ -10,7 +10,8 @@ import pytest
 from toolkit import runner
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.sequence import Packet, Sequence
+from toolkit.measurements import Packet
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, simulate
 
 FRAMES = 6

@@ -14,8 +14,9 @@ from toolkit.experiment import recording
 from toolkit.experiment.recording import Recording
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
+from toolkit.measurements import Prior
 from toolkit.metrics import Evaluation, score_run
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Sequence
 
 
 class Case(NamedTuple):

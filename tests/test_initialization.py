@@ -13,8 +13,9 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, about_z, interpolate_poses, so3_exp, so3_log, yaw_of
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.initialization.adjustment import INFLATION
-from toolkit.measured_motion import ImuSamples
-from toolkit.sequence import Observations, Prior, Sequence
+from toolkit.measurements import Prior
+from toolkit.motion_samples import ImuSamples
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 from toolkit.simulation.scenes import Scene
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline

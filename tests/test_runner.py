@@ -12,7 +12,8 @@ from toolkit import runner
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.sequence import Packet, Sequence
+from toolkit.measurements import Packet
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, noise_free, simulate
 
 FRAMES = 11

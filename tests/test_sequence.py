@@ -8,9 +8,9 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.geometry import se3, se3_exp
-from toolkit.measured_motion import ImuNoise, ImuSamples, TwistNoise, TwistSamples
-from toolkit.resampling import NS_PER_S, Pairing
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, is_held_out
+from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistNoise
+from toolkit.motion_samples import ImuSamples, Pairing, TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, is_held_out
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 RIG = StereoRig(500.0, 500.0, 320.0, 240.0, 0.2, np.eye(4), np.eye(3))

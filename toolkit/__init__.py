@@ -2,12 +2,12 @@
 
 ``toolkit.compare("drive", ["ekf", "batch"])`` runs a comparison. Submodules are imported when first used.
 
-Reading order: sequence (the input; its parts are measured_motion, resampling, track_budget) -> estimator, estimate (the
-output) -> models -> filters/ekf -> filters/batch -> runner (an estimator over a sequence, with divergence) -> metrics
--> experiment -> report. docs/architecture.md has the picture. Before a run: datasets, frontend and simulation make a
-sequence, audit finds its faults, noise measures how noisy it is, initialization finds the first state. gate, evaluation
-and verify judge results; users call cli and api. The lowest layers: settings, files, progress, discovery, compilation,
-arrays, jackknife, geometry, threads, errors.
+Reading order: measurements (what estimators read), sequence (the recording it comes from; its parts are motion_samples,
+track_budget) -> estimator, estimate (the output; answers checks it) -> models -> filters/ekf -> filters/batch -> runner
+(an estimator over a sequence, with divergence) -> metrics -> experiment -> report. docs/architecture.md has the
+picture. Before a run: datasets, frontend and simulation make a sequence, audit finds its faults, noise measures how
+noisy it is, initialization finds the first state. gate, evaluation and verify judge results; users call cli and api.
+The lowest layers: settings, files, progress, discovery, compilation, arrays, jackknife, geometry, threads, errors.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -22,12 +22,13 @@ import numpy as np
 
 from toolkit.errors import VislamError, did_you_mean, type_of
 from toolkit.estimate import Output, Run
-from toolkit.estimator import Build, defaults, find_all
+from toolkit.estimator import Build
 from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.recording import Part
 from toolkit.progress import silent
+from toolkit.registry import defaults, find_all
 from toolkit.report.comparison_table import comparison_table, requested_columns
 from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.sequence import Sequence

@@ -1,8 +1,5 @@
-"""Checks of arrays (shape, rigid transformation), look-up of values in them, and a digest of their content."""
+"""Checks of arrays (shape, rigid transformation), and look-up of values in them."""
 
-import hashlib
-from collections.abc import Iterable
-from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -62,38 +59,3 @@ def rows_of(wanted: IntArray, ascending: IntArray) -> tuple[IntArray, BoolArray]
 def is_among(ids: IntArray, others: IntArray) -> BoolArray:
     """Say which ids (N,) are among others (M,), which are unique; for some hundreds, where numpy.isin is slow."""
     return rows_of(ids, np.sort(others))[1]
-
-
-def content_digest(values: Iterable[object], digits: int | None = None) -> str:
-    """Return the SHA-256, in hexadecimal digits, over arrays, numbers, texts and the fields of dataclasses.
-
-    With ``digits``, floats are rounded first: a number to that many significant digits, an array to that many digits of
-    its largest value. The shape of every array is part of the digest.
-    """
-    digest = hashlib.sha256()
-    for value in values:
-        _feed(digest, value, digits)
-    return digest.hexdigest()
-
-
-def _feed(digest: "hashlib._Hash", value: object, digits: int | None) -> None:
-    if isinstance(value, np.ndarray):
-        counted = value if digits is None or value.dtype.kind != "f" else _rounded(value, digits)
-        digest.update(str(value.shape).encode())
-        digest.update(np.ascontiguousarray(counted).data)
-    elif is_dataclass(value):
-        for field in fields(value):
-            _feed(digest, getattr(value, field.name), digits)
-    elif digits is not None and isinstance(value, float):
-        digest.update(f"{value:.{digits}g}".encode())
-    else:
-        digest.update(repr(value).encode())
-
-
-def _rounded(array: Array, digits: int) -> Array:
-    """Return an array rounded to so many digits of its largest value, without -0.0, whose bits are not those of 0."""
-    finite = np.abs(array[np.isfinite(array)])
-    largest = float(finite.max()) if finite.size else 0.0
-    if largest == 0.0:
-        return array + 0.0
-    return np.round(array, digits - 1 - int(np.floor(np.log10(largest)))) + 0.0

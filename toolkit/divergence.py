@@ -14,11 +14,11 @@ from scipy.special import chdtri
 
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
-from toolkit.measured_motion import TwistSamples
+from toolkit.measurements import NS_PER_S
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import predicted_steps
 from toolkit.models.state import POSE
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 
 # A windowed filter corrects by several frames' tracks at once: five times the motion noise of one frame.

@@ -1,19 +1,12 @@
-"""The output of estimators: the state at one instant, trajectories, landmarks, and everything one run produced.
+"""The output of estimators: the state at one instant, trajectories, landmarks, and everything one run produced."""
 
-An estimator's answers are checked where the runner receives them: they must have the right types and shapes and belong
-to frames of the sequence. Values are not checked: a pose that is not finite is a result (``diverged``), an array of
-another shape is a mistake in the estimator's code, and is named as such before anything computes with it.
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from toolkit.errors import EstimatorError, type_of
 from toolkit.geometry import Array, IntArray, read_only
-from toolkit.sequence import Packet
 
 Status = Literal["ok", "diverged", "failed"]
 STATUS_MEANING: Mapping[Status, str] = {
@@ -27,10 +20,6 @@ Arithmetic = Literal["compiled", "numpy"]
 ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
 # Farther than the Moon: no position. Squares of 1e200 m overflow, and a metric would have no value without saying why.
 FARTHEST_M = 1e9
-# Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
-COV_SIZES = (6, 9, 12, 15)
-_STATE: Mapping[str, tuple[tuple[int, ...], ...]] = {"T_world_imu": ((4, 4),), "v_world": ((3,),), "bias": ((6,),)}
-_COVARIANCE = {"cov": tuple((size, size) for size in COV_SIZES)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,85 +179,3 @@ class Run:
         if causal.cov is None or final.cov is None:
             return causal.cov is final.cov
         return np.array_equal(causal.cov, final.cov, equal_nan=True)
-
-
-def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Estimate | None:
-    """Return an answer of ``step`` to a packet, as it is; ``before`` is the last one that was no None.
-
-    Raises EstimatorError where it is no Estimate of the packet's frame with arrays of the documented shapes.
-    """
-    if answer is None:
-        return None
-    check_state(answer, packet.index)
-    where = f"of its answer to frame {packet.index}"
-    if not isinstance(answer.t_ns, int | np.integer) or answer.t_ns != packet.frame.t_ns:
-        raise EstimatorError(f"t_ns {where} is {answer.t_ns!r}; the frame's is {packet.frame.t_ns}, in whole ns")
-    _check_arrays(answer, _COVARIANCE, where)
-    earlier = None if before is None else before.cov
-    if earlier is not None and answer.cov is not None and earlier.shape != answer.cov.shape:
-        raise EstimatorError(f"cov {where} has shape {answer.cov.shape}, and {earlier.shape} before; keep to one")
-    _check_info(answer.info, where)
-    estimate: Estimate = answer
-    return estimate
-
-
-def check_state(answer: Any, frame: int) -> None:
-    """Raise EstimatorError where an answer of ``step`` to a frame is no Estimate of a pose, velocity and biases."""
-    if not isinstance(answer, Estimate):
-        raise EstimatorError(f"its answer to frame {frame} is {type_of(answer)}; step returns an Estimate or None")
-    _check_arrays(answer, _STATE, f"of its answer to frame {frame}")
-
-
-def checked_finish(answer: Any, frames_t_ns: IntArray, answered: bool) -> Finished:
-    """Return what ``finish`` answered, as it is; ``answered`` says whether any step gave an estimate.
-
-    Raises EstimatorError where it is no Finished, is about stamps that are no frames' (F,), or about nothing at all.
-    """
-    if not isinstance(answer, Finished):
-        raise EstimatorError(f"finish returned {type_of(answer)}; it must return a Finished")
-    trajectory, landmarks = answer.trajectory, answer.landmarks
-    if not isinstance(trajectory, Trajectory):
-        raise EstimatorError(f"the trajectory of its finish is {type_of(trajectory)}; it is a Trajectory")
-    if not isinstance(landmarks, Landmarks):
-        raise EstimatorError(f"the landmarks of its finish are {type_of(landmarks)}; they are Landmarks")
-    if isinstance(answer.log, str) or not isinstance(answer.log, Sequence):
-        raise EstimatorError(f"the log of its finish is {type_of(answer.log)}; it is a tuple of texts")
-    count = len(trajectory)
-    stacked = {name: tuple((count, *one) for one in shapes) for name, shapes in {**_STATE, **_COVARIANCE}.items()}
-    _check_arrays(trajectory, stacked, "of its final trajectory")
-    if (np.diff(trajectory.t_ns) <= 0).any() or not np.isin(trajectory.t_ns, frames_t_ns).all():
-        raise EstimatorError("the stamps of its final trajectory are not those of frames, ascending, in whole ns")
-    _check_array("points_world of its landmarks", landmarks.points_world, ((len(landmarks), 3),), required=True)
-    _check_array("cov of its landmarks", landmarks.cov, ((len(landmarks), 3, 3),), required=False)
-    if not answered and not count:
-        raise EstimatorError("it returned no estimate for any frame, neither in step nor in finish")
-    return answer
-
-
-def _check_arrays(record: Any, shapes: Mapping[str, tuple[tuple[int, ...], ...]], where: str) -> None:
-    for name, allowed in shapes.items():
-        _check_array(f"{name} {where}", getattr(record, name), allowed, required=name == "T_world_imu")
-
-
-def _check_array(what: str, value: Any, shapes: tuple[tuple[int, ...], ...], *, required: bool) -> None:
-    if value is None and not required:
-        return
-    if not isinstance(value, np.ndarray):
-        raise EstimatorError(f"{what} is {type_of(value)}; it is an array of numbers")
-    if value.dtype.kind not in "fiu":
-        raise EstimatorError(f"{what} has the type {value.dtype}; it is an array of real numbers")
-    if value.shape not in shapes:
-        raise EstimatorError(f"{what} has shape {value.shape}; expected {' or '.join(map(str, shapes))}")
-
-
-def _check_info(info: Any, where: str) -> None:
-    if not isinstance(info, Mapping):
-        raise EstimatorError(f"info {where} is {type_of(info)}; it is a dict of numbers by name")
-    for name in _not_numbers(info):
-        raise EstimatorError(f"info {where} has {name!r}: {info[name]!r}; it is a dict of numbers by name")
-
-
-def _not_numbers(info: Mapping[Any, Any]) -> Iterator[Any]:
-    for name, value in info.items():
-        if not isinstance(name, str) or not isinstance(value, float | int | np.number):
-            yield name

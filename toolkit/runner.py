@@ -18,24 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.answers import checked_estimate, checked_finish
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError, in_words, one_line
-from toolkit.estimate import (
-    Estimate,
-    Finished,
-    Landmarks,
-    Run,
-    Status,
-    Timings,
-    Trajectory,
-    checked_estimate,
-    checked_finish,
-)
+from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.measurements import Packet, Prior
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import Packet, Prior, Sequence
+from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.threads import on_one_thread
 

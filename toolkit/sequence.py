@@ -5,39 +5,31 @@ Observations are sparse, one row a sighting. Motion samples are cut at the frame
 from all of them and serves the held-out reprojection error.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
-from toolkit.arrays import check_rigid, content_digest, freeze_arrays, rotation_defect
+from toolkit.arrays import freeze_arrays
 from toolkit.errors import DataError
-from toolkit.geometry import (
-    Array,
-    BoolArray,
-    IntArray,
-    quaternion_from_rotation,
-    read_only,
-    rotation_from_quaternion,
-    se3,
-    se3_inverse,
-)
-from toolkit.measured_motion import (
-    GapTwists,
-    Motion,
+from toolkit.geometry import Array, BoolArray, IntArray, read_only
+from toolkit.measurements import (
+    GRAVITY_WORLD,
+    NS_PER_S,
     MotionKind,
     MotionNoise,
-    MotionSamples,
-    are_of_one_kind,
-    kind_of,
-    motions_between,
+    Packet,
+    Prior,
+    StereoFrame,
+    StereoRig,
+    is_measured,
 )
-from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.motion_samples import Bridges, GapTwists, MotionSamples, are_of_one_kind, kind_of, motions_between
 from toolkit.track_budget import parts_of_view, within_budget
 
-GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
 # The fact stating that the recording has no tracks.
 NO_FEATURES = "no image features in this file"
@@ -47,69 +39,6 @@ EXTRINSIC_UNCERTAIN = "the extrinsic's direction and camera axes are not certain
 ONE_ROW_FOR_BOTH = "one row v stands for both images of a sighting in this file"
 # Longest name of a recording or a trajectory: it becomes part of file names, for which systems allow 255 bytes.
 LONGEST_NAME = 200
-# How far a rotation may be from orthonormal: written with three decimals, and as a product of doubles.
-_MOST_ROTATION_DEFECT, _ORTHONORMAL = 5e-3, 1e-14
-
-
-def _orthonormal(T_imu_cam: Array) -> Array:
-    """Return an extrinsic with its rotation made orthonormal: files write it with few decimals.
-
-    Raises DataError where it is no rigid motion at all.
-    """
-    if T_imu_cam.shape != (4, 4):
-        return T_imu_cam
-    check_rigid("T_imu_cam", T_imu_cam, _MOST_ROTATION_DEFECT)
-    if rotation_defect(T_imu_cam) < _ORTHONORMAL:
-        return T_imu_cam
-    return se3(rotation_from_quaternion(quaternion_from_rotation(T_imu_cam[:3, :3])), T_imu_cam[:3, 3])
-
-
-@dataclass(frozen=True, eq=False)
-class StereoRig:
-    """A rectified stereo pair fixed to the IMU; one measurement is (uL, uR, v) in pixels, uR NaN if only left saw.
-
-    ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
-    ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
-    variance is half of theirs. ``track_weight`` in (0, 1] is the share of its stated information that a sighting
-    carries, because errors along its track and of its neighbours are correlated (:mod:`toolkit.noise`): an update
-    divides the covariance by it. Whether a sighting is an outlier is decided by the stated covariance.
-    """
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    baseline_m: float
-    T_imu_cam: Array
-    cov_uv_px2: Array
-    track_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))
-        freeze_arrays(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
-
-    @cached_property
-    def T_cam_imu(self) -> Array:
-        """The inverse of the extrinsic (4, 4)."""
-        inverse: Array = read_only(se3_inverse(self.T_imu_cam))
-        return inverse
-
-    @cached_property
-    def whitener(self) -> Array:
-        """W (3, 3) with W cov W^T = 1: a residual (..., 3) px becomes one of unit variance by ``residual @ W.T``."""
-        root: Array = read_only(np.linalg.inv(np.linalg.cholesky(self.cov_uv_px2)))
-        return root
-
-
-def is_left_only(uv_px: Array) -> BoolArray:
-    """Say which sightings (uL, uR, v) (..., 3) px lack the right image: their uR is NaN."""
-    return np.asarray(np.isnan(uv_px[..., 1]))
-
-
-def is_measured(uv_px: Array) -> BoolArray:
-    """Say which sightings (..., 3) px are finite, but for the uR of those by the left image alone."""
-    finite = np.isfinite(uv_px)
-    return np.asarray(finite[..., 0] & finite[..., 2] & (finite[..., 1] | is_left_only(uv_px)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,47 +85,6 @@ class Truth:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, t_ns=(None,), T_world_imu=(None, 4, 4), v_world=(None, 3), bias=(None, 6))
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """The state every estimator starts from, at the first frame.
-
-    ``bias`` (6,) is [accel, gyro]. ``cov`` (15, 15) is in GTSAM's tangent order and side: rotation and
-    position (both body frame), velocity (body frame), accelerometer bias, gyro bias. ``source`` says where
-    it came from.
-    """
-
-    T_world_imu: Array
-    v_world: Array
-    bias: Array
-    cov: Array
-    source: str
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
-
-
-@dataclass(frozen=True, eq=False)
-class StereoFrame:
-    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px."""
-
-    t_ns: int
-    track_ids: IntArray
-    uvs_px: Array
-
-    def select(self, rows: BoolArray | IntArray) -> "StereoFrame":
-        """Return the frame with the sightings of a mask (N,) or an index (M,) only."""
-        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows])
-
-
-@dataclass(frozen=True, eq=False)
-class Packet:
-    """Everything between two frames plus the frame; ``motion`` is None in the first packet."""
-
-    index: int
-    motion: Motion | None
-    frame: StereoFrame
 
 
 @dataclass(frozen=True)
@@ -307,7 +195,7 @@ class Sequence:
     def content_hash(self, digits: int | None = None) -> str:
         """Return a SHA-256 over everything an estimator can see and the truth it is scored on.
 
-        With ``digits``, of the same rounded (:func:`toolkit.arrays.content_digest`).
+        With ``digits``, of the same rounded (:func:`content_digest`).
         """
         rig = [getattr(self.rig, each.name) for each in fields(self.rig)]
         # A weight of 1 does not change a hash: baselines of before there was one stay comparable.
@@ -390,3 +278,38 @@ def check_stated(sequence: Sequence) -> None:
             raise DataError(f"{sequence.name}: {key} is not finite; a calibration needs every value")
     if not (np.isfinite(rig.cov_uv_px2).all() and (np.linalg.eigvalsh(rig.cov_uv_px2) > 0.0).all()):
         raise DataError(f"{sequence.name}: rig.cov_uv_px2 is no covariance: its noise must be positive in every axis")
+
+
+def content_digest(values: Iterable[object], digits: int | None = None) -> str:
+    """Return the SHA-256, in hexadecimal digits, over arrays, numbers, texts and the fields of dataclasses.
+
+    With ``digits``, floats are rounded first: a number to that many significant digits, an array to that many digits of
+    its largest value. The shape of every array is part of the digest.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _feed(digest, value, digits)
+    return digest.hexdigest()
+
+
+def _feed(digest: "hashlib._Hash", value: object, digits: int | None) -> None:
+    if isinstance(value, np.ndarray):
+        counted = value if digits is None or value.dtype.kind != "f" else _rounded(value, digits)
+        digest.update(str(value.shape).encode())
+        digest.update(np.ascontiguousarray(counted).data)
+    elif is_dataclass(value):
+        for field in fields(value):
+            _feed(digest, getattr(value, field.name), digits)
+    elif digits is not None and isinstance(value, float):
+        digest.update(f"{value:.{digits}g}".encode())
+    else:
+        digest.update(repr(value).encode())
+
+
+def _rounded(array: Array, digits: int) -> Array:
+    """Return an array rounded to so many digits of its largest value, without -0.0, whose bits are not those of 0."""
+    finite = np.abs(array[np.isfinite(array)])
+    largest = float(finite.max()) if finite.size else 0.0
+    if largest == 0.0:
+        return array + 0.0
+    return np.round(array, digits - 1 - int(np.floor(np.log10(largest)))) + 0.0

@@ -20,6 +20,7 @@ from filters.kalman.track_gate import TestedTracks, TrackTest, WindowPoses
 from filters.kalman.tracks_in_view import FollowedTracks, Information, RootedWindow
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import StereoRig
 from toolkit.models.gating import (
     FEWEST_SIGHTINGS,
     LEAST_DEPTH_M,
@@ -27,7 +28,6 @@ from toolkit.models.gating import (
     MISMATCHED_TRACK_FACTOR,
     huber_threshold,
 )
-from toolkit.sequence import StereoRig
 
 _GATE_RULES = np.array(
     [

@@ -12,10 +12,10 @@ import numpy as np
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, transposed
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import StereoFrame, StereoRig
 
 
 def added_noise(noise_px2: Array, rig: StereoRig) -> Array:

@@ -19,9 +19,9 @@ from filters.kalman.triangulation import triangulate
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
+from toolkit.measurements import Packet, StereoFrame, StereoRig
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet, StereoFrame, StereoRig
 
 
 class Correct(Protocol):

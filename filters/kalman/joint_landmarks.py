@@ -16,9 +16,9 @@ from filters.kalman.multiview import Linearised
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import left_only
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.sequence import StereoFrame, StereoRig
 
 
 class LandmarkSightings(NamedTuple):

@@ -8,9 +8,9 @@ import numpy as np
 from toolkit.arrays import is_among
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.sequence import StereoFrame, StereoRig
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray
-from toolkit.measured_motion import Motion
+from toolkit.measurements import Motion
 from toolkit.models.motion import Increment, MotionModel
 from toolkit.models.state import Prediction
 

@@ -12,8 +12,8 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dgeqrf
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.measurements import StereoRig, is_left_only
 from toolkit.models import left_only, stereo
-from toolkit.sequence import StereoRig, is_left_only
 
 
 class TrackSightings(NamedTuple):

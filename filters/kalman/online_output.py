@@ -5,7 +5,7 @@ from typing import Protocol
 
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.geometry import Array, IntArray
-from toolkit.sequence import Packet
+from toolkit.measurements import Packet
 
 
 class Filter(Protocol):

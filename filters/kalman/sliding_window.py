@@ -22,10 +22,9 @@ from toolkit.arrays import is_among, rows_of
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet, StereoFrame
 
 
 class SlidingWindowFilter:

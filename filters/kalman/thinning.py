@@ -11,9 +11,8 @@ import numpy as np
 
 from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.measured_motion import ImuMotion, Motion, TwistMotion, UnmeasuredMotion, noise_scale_of
+from toolkit.measurements import ImuMotion, Motion, Packet, TwistMotion, UnmeasuredMotion, noise_scale_of
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import Packet
 
 
 class Thinned:

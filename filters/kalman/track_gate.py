@@ -18,8 +18,8 @@ from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import StereoRig
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
-from toolkit.sequence import StereoRig
 
 # Tracks are tested in separate groups where that saves this many padded places in all: about the cost of a group.
 _LEAST_LEFT_OUT = 300

@@ -34,10 +34,10 @@ from filters.kalman.track_gate import WindowPoses
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, transposed
+from toolkit.measurements import StereoRig
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import StereoRig
 from toolkit.settings import Outliers
 
 

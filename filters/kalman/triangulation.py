@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transposed
+from toolkit.measurements import StereoRig, is_left_only
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
-from toolkit.sequence import StereoRig, is_left_only
 
 ITERATIONS, FIRST_DAMPING = 6, 1e-3
 # The landmark is eliminated to first order afterwards, so a fit to better than a hundredth of a sigma has no effect.

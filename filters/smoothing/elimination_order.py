@@ -16,8 +16,8 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import IntArray
+from toolkit.measurements import StereoFrame
 from toolkit.models.factors import L, X, kind_of
-from toolkit.sequence import StereoFrame
 
 Order = Callable[[gtsam.NonlinearFactorGraph, list[StereoFrame]], gtsam.Ordering]
 

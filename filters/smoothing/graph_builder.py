@@ -17,12 +17,12 @@ from filters.smoothing.outlier_check import OutlierCheck, RefusedTracks, relativ
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray
+from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet, StereoFrame
 
 
 @dataclass

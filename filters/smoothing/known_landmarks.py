@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import left_only, stereo
-from toolkit.sequence import StereoFrame, StereoRig
 
 
 class KnownLandmarks:

@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.factors import L, X
 from toolkit.models.stereo import CHANNELS
-from toolkit.sequence import StereoFrame, StereoRig
 
 _FROM_CHANNELS = np.linalg.inv(CHANNELS)
 # Largest growth of the logarithm of the depth in one step; it keeps disparities positive.

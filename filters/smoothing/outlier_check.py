@@ -18,10 +18,10 @@ import numpy as np
 
 from filters.smoothing.known_landmarks import KnownLandmarks
 from toolkit.geometry import Array, BoolArray, se3_exp, se3_inverse, transform
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.settings import Outliers
 
 # One sighting may be rejected as a mismatch and another by chance; three in a row that agree on another point are not

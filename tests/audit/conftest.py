@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toolkit.arrays import content_digest
 from toolkit.audit import Audit, audit, fault
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.measured_motion import TwistSamples
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence
+from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import Observations, Sequence, content_digest
 from toolkit.simulation import SCENARIOS, simulate
 
 # Most faults show in a hundred frames; of a flight as short a gap of two seconds would leave too little.

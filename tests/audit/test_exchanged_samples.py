@@ -8,7 +8,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
 from toolkit.audit.samples import exchanged_samples
-from toolkit.measured_motion import TwistNoise
+from toolkit.measurements import TwistNoise
 from toolkit.models.noise import white_sigma
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

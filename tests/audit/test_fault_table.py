@@ -14,8 +14,8 @@ import pytest
 
 from toolkit.audit import Audit, audit
 from toolkit.geometry import IntArray
+from toolkit.measurements import NS_PER_S
 from toolkit.report.comparison_text import audit_text
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -12,8 +12,8 @@ from toolkit.audit.one_step import errors_are_independent
 from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import camera_motion
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 

@@ -13,8 +13,8 @@ from toolkit.audit import Audit, audit
 from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3
-from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import camera_motion
+from toolkit.motion_samples import TwistSamples
 
 DATA = Path(os.environ.get("VISLAM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 

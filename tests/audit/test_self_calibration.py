@@ -24,9 +24,9 @@ from toolkit.audit.calibration import doubtful, hidden, wrong
 from toolkit.audit.fault import Evidence
 from toolkit.audit.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
 from toolkit.geometry import Array, so3_exp, so3_log
-from toolkit.measured_motion import ImuMotion, ImuNoise
+from toolkit.measurements import ImuMotion, ImuNoise, StereoRig
 from toolkit.models.imu import preintegrate, preintegration_params
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, FLIGHT_REALISTIC, Scenario, faults, noise_free, simulate
 
 # Shares of fx and fy, px of cx and cy, a share of the baseline, rad, m, s: by what the rig is off below.

@@ -10,8 +10,7 @@ from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.samples import overstated_noise
 from toolkit.audit.truth import truth_mismatch
 from toolkit.datasets.trajectories.exchanged_axes import exchanges
-from toolkit.measured_motion import ImuNoise
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S, ImuNoise
 from toolkit.sequence import Sequence, Truth
 from toolkit.simulation import SCENARIOS, faults, simulate
 

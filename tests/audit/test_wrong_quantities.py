@@ -10,7 +10,8 @@ import pytest
 
 from toolkit.audit import Finding, audit
 from toolkit.geometry import Array
-from toolkit.sequence import Observations, Sequence, is_left_only
+from toolkit.measurements import is_left_only
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
 

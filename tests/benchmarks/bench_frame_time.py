@@ -24,10 +24,11 @@ import numpy as np
 from toolkit import runner
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
-from toolkit.estimator import find
 from toolkit.initialization import start_from_measurements
+from toolkit.measurements import Prior
 from toolkit.progress import SILENT
-from toolkit.sequence import Prior, Sequence
+from toolkit.registry import find
+from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
 
 DATA = Path(__file__).parents[2] / os.environ.get("VISLAM_DATA", "../shared/data")

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from toolkit import runner
-from toolkit.estimator import find
+from toolkit.registry import find
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import DRIVE_IMU, simulate

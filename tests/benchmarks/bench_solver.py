@@ -23,8 +23,8 @@ from filters.smoothing.levenberg_marquardt import Solution, Stopping
 from toolkit import runner
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
-from toolkit.estimator import find
 from toolkit.initialization import start_from_measurements
+from toolkit.registry import find
 
 
 def own(

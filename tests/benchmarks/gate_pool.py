@@ -26,15 +26,16 @@ import numpy as np
 from toolkit import runner
 from toolkit.audit import audit
 from toolkit.estimate import Run, Trajectory
-from toolkit.estimator import find
 from toolkit.gate.measuring import reference_s
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
-from toolkit.measured_motion import ImuSamples, MotionNoise, TwistNoise, TwistSamples
+from toolkit.measurements import MotionNoise, Prior, TwistNoise
 from toolkit.metrics import Evaluation, ate, held_out, nees, nis
 from toolkit.metrics.parts.scores import Unavailable
+from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.progress import SILENT
-from toolkit.sequence import Observations, Prior, Sequence
+from toolkit.registry import find
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
 DITHER = 0.05

@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.estimator import find
+from toolkit.measurements import Prior
 from toolkit.models.moving_tracks import without_moving_tracks
+from toolkit.registry import find
 from toolkit.runner import run
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.track_faults import moving_objects
 

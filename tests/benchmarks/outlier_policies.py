@@ -24,9 +24,9 @@ import msgspec
 import numpy as np
 
 from toolkit import compare, runner
-from toolkit.estimator import find
 from toolkit.geometry import Array
 from toolkit.metrics.parts.alignment import fit_yaw
+from toolkit.registry import find
 from toolkit.sequence import Sequence as Recording
 from toolkit.settings import POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, simulate

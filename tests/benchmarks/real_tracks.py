@@ -35,15 +35,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from toolkit.estimator import find
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.geometry import Array
-from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import score_run
 from toolkit.models import stereo
 from toolkit.models.camera_motion import neighbours
 from toolkit.models.noise import twist_noise
 from toolkit.models.stereo import CHANNELS
+from toolkit.motion_samples import TwistSamples
+from toolkit.registry import find
 from toolkit.runner import run
 from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES, Noise, Outliers, Settings

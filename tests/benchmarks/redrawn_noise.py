@@ -22,14 +22,13 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 
 from toolkit.estimate import Trajectory
-from toolkit.estimator import find
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log, transform
 from toolkit.initialization import start_from_measurements
-from toolkit.measured_motion import ImuNoise
+from toolkit.measurements import NS_PER_S, ImuNoise
 from toolkit.metrics.parts.alignment import fit_yaw
 from toolkit.models import stereo
-from toolkit.resampling import NS_PER_S
+from toolkit.registry import find
 from toolkit.runner import run
 from toolkit.sequence import Observations, Sequence, Truth
 from toolkit.settings import Settings, Window

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.estimator import find
 from toolkit.experiment.recording import Part, Prepared, Recording, prepare
-from toolkit.measured_motion import TwistNoise
+from toolkit.measurements import TwistNoise
 from toolkit.metrics import score_run
+from toolkit.registry import find
 from toolkit.runner import run
 
 PARTS = [Part(begin_s, begin_s + 20.0) for begin_s in (0.0, 20.0, 40.0, 60.0, 80.0)]

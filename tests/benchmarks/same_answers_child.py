@@ -149,7 +149,7 @@ def main(words: list[str]) -> None:
     name, frames, out, *estimators = words
     starts = ("toolkit.initialization", "toolkit.start")
     run = first_of(("toolkit.runner",), "run")
-    find = first_of(("toolkit.estimator",), "find")
+    find = first_of(("toolkit.registry", "toolkit.estimator"), "find")
     sequence = sequence_of(name, int(frames))
     prior = first_of(starts, "start_from_measurements")(sequence)
     found = {f"{name}/(input)/{kind}": value for kind, value in read_of(sequence, prior).items()}

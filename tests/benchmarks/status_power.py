@@ -41,11 +41,11 @@ from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Evaluation, ate, score_run
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.progress import SILENT
-from toolkit.resampling import NS_PER_S
 from toolkit.runner import with_divergence
 from toolkit.sequence import Observations
 from toolkit.sequence import Sequence as Recorded

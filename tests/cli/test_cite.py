@@ -7,7 +7,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.datasets import formats
-from toolkit.estimator import discover
+from toolkit.registry import discover
 from toolkit.report.citations import bibtex, citations, references
 
 MINE = '''"""A filter of somebody's own, in one file."""

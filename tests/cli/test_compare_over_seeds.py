@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from toolkit import estimator, progress
+from toolkit import progress, registry
 from toolkit.report.records import read_seeds
 
 Vislam = Callable[..., int]
@@ -78,8 +78,8 @@ def test_a_cluster_needs_a_package_that_is_named(
 def test_the_table_has_the_change_of_each_rung_once(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lowest = estimator.ladder()[:2]
-    monkeypatch.setattr(estimator, "ladder", lambda: lowest)
+    lowest = registry.ladder()[:2]
+    monkeypatch.setattr(registry, "ladder", lambda: lowest)
     words = ("--estimators", "ladder", "--max-frames", "10", "--workers", "1", "--out", "run")
     assert vislam("compare", "drive", *words) == 0
     table = capsys.readouterr().out.partition("notes:")[0]

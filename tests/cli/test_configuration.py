@@ -13,8 +13,8 @@ from toolkit import runner
 from toolkit.cli import parser
 from toolkit.cli.compare import SEQUENCES
 from toolkit.datasets import built_in_names
-from toolkit.estimator import defaults
 from toolkit.metrics import cost, known_metrics
+from toolkit.registry import defaults
 from toolkit.settings import POLICIES
 
 Vislam = Callable[..., int]

@@ -7,7 +7,7 @@ import pytest
 
 import toolkit
 from toolkit.cli import main
-from toolkit.estimator import find
+from toolkit.registry import find
 
 PROJECT = Path(__file__).parents[2]
 SHORT = ["--max-frames", "12", "--figures", "none"]

@@ -11,8 +11,8 @@ import pytest
 
 from toolkit import runner
 from toolkit.estimate import Run, Trajectory
-from toolkit.estimator import find, ladder
 from toolkit.geometry import se3_inverse, se3_log
+from toolkit.registry import find, ladder
 from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES, PolicyName, Settings
 from toolkit.simulation import DRIVE, FLIGHT, simulate

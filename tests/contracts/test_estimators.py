@@ -9,11 +9,13 @@ import pytest
 from toolkit import runner
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Run, Trajectory
-from toolkit.estimator import Build, discover, find
+from toolkit.estimator import Build
 from toolkit.geometry import se3_inverse, se3_log
+from toolkit.measurements import Packet
 from toolkit.models.stereo import triangulate_world
 from toolkit.progress import SILENT
-from toolkit.sequence import Packet, Sequence
+from toolkit.registry import discover, find
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, noise_free, simulate
 from toolkit.verify import promises
 from toolkit.verify.promises import Watched, arrays_of, watch

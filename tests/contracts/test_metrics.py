@@ -7,8 +7,9 @@ from toolkit import metrics
 from toolkit.estimate import Landmarks, Run, Timings, Trajectory
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS
 from toolkit.geometry import se3
-from toolkit.measured_motion import TwistNoise, TwistSamples
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.measurements import StereoRig, TwistNoise
+from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 CONTRACT = [
     "ate_none_m",

@@ -13,9 +13,9 @@ import pytest
 
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Trajectory
-from toolkit.estimator import discover, find
 from toolkit.geometry import Array, about_z, se3_inverse, so3_exp
-from toolkit.measured_motion import TwistNoise
+from toolkit.measurements import TwistNoise
+from toolkit.registry import discover, find
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import FLIGHT, Scenario, simulate
 from toolkit.simulation.scenes import Scene

@@ -3,7 +3,7 @@
 import ast
 from pathlib import Path
 
-from toolkit.estimator import discover
+from toolkit.registry import discover
 
 TOOLKIT = Path(__file__).parents[2] / "toolkit"
 

@@ -12,11 +12,12 @@ from toolkit import runner
 from toolkit.audit import audit
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Run, Trajectory
-from toolkit.estimator import discover, find
 from toolkit.geometry import Array, se3, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
+from toolkit.measurements import Prior
 from toolkit.metrics import score_run
-from toolkit.sequence import Prior, Sequence, is_held_out
+from toolkit.registry import discover, find
+from toolkit.sequence import Sequence, is_held_out
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 from toolkit.simulation.symmetries import STATE_MIRROR, delayed, mirrored, mirrored_poses, renamed, turned
 from toolkit.verify.verification import short

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from toolkit.estimator import discover
+from toolkit.registry import discover
 from toolkit.verify.threads import UNAVAILABLE, digests_at
 
 

@@ -20,7 +20,7 @@ from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.io.plain_pickle import read_dict
 from toolkit.errors import DataError
 from toolkit.geometry import Array, se3, se3_inverse
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 from toolkit.sequence import NO_FEATURES, Sequence
 from toolkit.settings import Frontend
 from toolkit.simulation import DRIVE, simulate

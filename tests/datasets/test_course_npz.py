@@ -13,7 +13,7 @@ import pytest
 from toolkit.datasets import course_npz, load_sequence
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse
-from toolkit.sequence import is_left_only, is_measured
+from toolkit.measurements import is_left_only, is_measured
 
 Course = dict[str, Any]
 Refused = Callable[..., None]

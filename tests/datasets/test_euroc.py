@@ -15,8 +15,9 @@ from toolkit.datasets import euroc, formats, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
-from toolkit.measured_motion import ImuMotion, ImuNoise, ImuSamples
+from toolkit.measurements import ImuMotion, ImuNoise
 from toolkit.models.stereo import project, triangulate
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence
 
 Refused = Callable[..., None]

@@ -11,9 +11,10 @@ from toolkit.datasets import kitti00, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import interpolate_poses, se3_inverse, transform
-from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.measurements import ImuNoise
 from toolkit.models.noise import white_sigma
 from toolkit.models.stereo import project, triangulate
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence
 
 

@@ -15,7 +15,8 @@ from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.measured_motion import NoSamples, TwistChangeNoise
+from toolkit.measurements import TwistChangeNoise
+from toolkit.motion_samples import NoSamples
 from toolkit.settings import Frontend
 
 # Of the rendered drive, as in conftest.

@@ -11,7 +11,7 @@ import pytest
 from toolkit.datasets import kitti_raw, load_sequence
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
-from toolkit.measured_motion import ImuSamples, TwistSamples
+from toolkit.motion_samples import ImuSamples, TwistSamples
 
 FRAMES, STEP_M, SPEED_MPS = 8, 0.05, 0.5
 DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"

@@ -10,9 +10,9 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3_inverse, transform
-from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.measurements import NS_PER_S, ImuNoise
 from toolkit.models.stereo import project, triangulate
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import ImuSamples
 
 Refused = Callable[..., None]
 

@@ -17,7 +17,8 @@ from toolkit.datasets import own_tables
 from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError, OutputError
 from toolkit.estimate import Trajectory
-from toolkit.sequence import Sequence, is_left_only
+from toolkit.measurements import is_left_only
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 Refused = Callable[..., None]

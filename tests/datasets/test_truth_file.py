@@ -23,9 +23,10 @@ from toolkit.geometry import (
     se3_inverse,
     so3_exp,
 )
-from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.motion_samples import ImuSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 Refused = Callable[..., None]
 COUNT, STEP_S, START_S = 200, 0.1, 1.4e9

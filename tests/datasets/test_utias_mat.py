@@ -11,9 +11,9 @@ import scipy.io
 from toolkit.datasets import load_sequence, utias_mat
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, transform
-from toolkit.measured_motion import TwistNoise, TwistSamples
+from toolkit.measurements import NS_PER_S, TwistNoise
 from toolkit.models.stereo import project, triangulate
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 
 Refused = Callable[..., None]

@@ -13,7 +13,7 @@ import pytest
 from toolkit.datasets import load_sequence, vislam_recording
 from toolkit.errors import DataError, OutputError
 from toolkit.geometry import Array
-from toolkit.measured_motion import TwistSamples
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
 

@@ -6,7 +6,7 @@ import pytest
 
 from toolkit.discovery import FoundModule
 from toolkit.errors import EstimatorError
-from toolkit.estimator import EstimatorEntry, find_all, ladder
+from toolkit.registry import EstimatorEntry, find_all, ladder
 
 
 @pytest.mark.parametrize(

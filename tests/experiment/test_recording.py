@@ -11,7 +11,7 @@ from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, recording, run
 from toolkit.experiment.recording import Part, Recording, prepare
-from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
+from toolkit.measurements import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate

@@ -7,9 +7,9 @@ import pytest
 
 from toolkit import discovery, runner
 from toolkit.errors import EstimatorError
-from toolkit.estimator import ENTRY_POINT_GROUP, find
 from toolkit.experiment import Plan, prepared_cases, run
 from toolkit.experiment.workers import Workers
+from toolkit.registry import ENTRY_POINT_GROUP, find
 from toolkit.settings import settings_of
 
 _ESTIMATOR = '''

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.arrays import content_digest
 from toolkit.errors import OutputError
 from toolkit.files.writing import check_writable, replaced_file, uninterrupted
+from toolkit.sequence import content_digest
 
 
 @dataclass(frozen=True)

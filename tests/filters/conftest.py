@@ -18,11 +18,12 @@ from filters.kalman.linearisation import AtLatestEstimates, propagate
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.models.stereo import project, triangulate_world
-from toolkit.sequence import Observations, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import Scenario, simulate
 
 SEED = 11

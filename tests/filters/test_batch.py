@@ -11,7 +11,7 @@ from filters.batch import worth_smoothing
 from filters.smoothing.levenberg_marquardt import Solution, solve
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
-from toolkit.sequence import StereoFrame
+from toolkit.measurements import StereoFrame
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import se3_inverse, se3_log
-from toolkit.measured_motion import TwistMotion
+from toolkit.measurements import TwistMotion
 from toolkit.models import imu
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

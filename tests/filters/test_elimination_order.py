@@ -9,10 +9,11 @@ import pytest
 from filters.smoothing import elimination_order
 from filters.smoothing.elimination_order import by_colamd, cheaper_order, in_time
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model, state_keys
-from toolkit.sequence import Sequence, StereoFrame
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.simulation.faults import standstill
 

@@ -14,8 +14,8 @@ from filters.smoothing.graph_builder import GraphExtension
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, X
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate

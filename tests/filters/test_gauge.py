@@ -19,10 +19,11 @@ from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, Li
 from filters.kalman.sliding_window import SlidingWindowFilter
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, skew
+from toolkit.measurements import Prior
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.models.twist import TWIST_LAYOUT
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT
 
 # Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.

@@ -23,9 +23,10 @@ from filters.kalman.linearisation import AtLatestEstimates, propagate
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model
-from toolkit.sequence import Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

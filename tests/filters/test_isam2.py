@@ -26,7 +26,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
-from toolkit.measured_motion import TwistMotion, TwistNoise
+from toolkit.measurements import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
 from toolkit.models.factors import B, L, V, X, kind_of
 from toolkit.models.motion import motion_model

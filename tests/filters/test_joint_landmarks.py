@@ -11,9 +11,9 @@ from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
 from toolkit.geometry import Array, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
-from toolkit.sequence import StereoFrame
 from toolkit.simulation import FLIGHT, simulate
 
 SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)

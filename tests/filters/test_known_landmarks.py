@@ -9,10 +9,10 @@ import pytest
 from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck
 from toolkit.geometry import se3, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, simulate
 

@@ -5,9 +5,9 @@ import pytest
 
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap, first_sighting
 from toolkit.geometry import Array, se3_exp
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE, simulate
 
 RIG = DRIVE.rig

@@ -11,9 +11,9 @@ from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.geometry import Array, se3_exp, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE
 
 RIG, SEEN = DRIVE.rig, 6

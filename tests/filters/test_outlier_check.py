@@ -8,10 +8,11 @@ import pytest
 from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from toolkit.geometry import se3, se3_inverse
+from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet, Sequence, StereoFrame
+from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 

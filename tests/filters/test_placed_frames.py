@@ -7,10 +7,10 @@ import numpy as np
 from filters.smoothing.known_landmarks import KnownLandmarks
 from filters.smoothing.outlier_check import OutlierCheck, aligned
 from toolkit.geometry import se3_exp, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, simulate
 

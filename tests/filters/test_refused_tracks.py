@@ -11,8 +11,8 @@ from filters.smoothing import outlier_check
 from filters.smoothing.outlier_check import FEWEST_REFUSED, RefusedTracks
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_exp, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
-from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE, simulate
 
 RIG = DRIVE.rig

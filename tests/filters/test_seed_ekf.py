@@ -13,9 +13,9 @@ from scipy.linalg import expm
 from toolkit.estimate import Run
 from toolkit.geometry import Array
 from toolkit.initialization import GYRO_BIAS_SIGMA
-from toolkit.measured_motion import TwistMotion, TwistNoise
+from toolkit.measurements import Prior, StereoFrame, StereoRig, TwistMotion, TwistNoise
 from toolkit.models import twist
-from toolkit.sequence import Prior, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, simulate
 
 SIGMA_PX = 1.0

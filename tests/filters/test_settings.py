@@ -8,7 +8,7 @@ import pytest
 
 from toolkit import runner
 from toolkit.estimate import Run
-from toolkit.estimator import find
+from toolkit.registry import find
 from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings, Window
 from toolkit.simulation import DRIVE, simulate

@@ -10,13 +10,13 @@ import pytest
 from filters.smart import Smart
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
 from toolkit.models.stereo_window import Evaluated, MarginalPrior, StereoWindow
 from toolkit.models.window_solver import solve_window
 from toolkit.progress import SILENT
-from toolkit.sequence import StereoFrame
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

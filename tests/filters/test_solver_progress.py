@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from toolkit import runner
-from toolkit.estimator import find
+from toolkit.registry import find
 from toolkit.simulation import DRIVE, simulate
 
 

@@ -8,10 +8,11 @@ import pytest
 from filters.kalman.thinning import Thinned
 from toolkit import runner
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
-from toolkit.estimator import Setup, find
+from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
+from toolkit.measurements import Packet
 from toolkit.models.motion import motion_model
-from toolkit.sequence import Packet
+from toolkit.registry import find
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, noise_free, simulate
 

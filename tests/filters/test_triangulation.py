@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 
 from filters.kalman.triangulation import triangulate
 from toolkit.geometry import se3, se3_inverse, so3_exp, transform
+from toolkit.measurements import StereoRig
 from toolkit.models import stereo
-from toolkit.sequence import StereoRig
 
 RIG = StereoRig(450.0, 455.0, 360.0, 240.0, 0.11, np.eye(4), np.diag([1.0, 1.0, 0.5]))
 

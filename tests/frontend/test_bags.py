@@ -28,8 +28,9 @@ from toolkit.datasets.io import bag_reader
 from toolkit.datasets.io.bag_topics import ROLES
 from toolkit.errors import DataError
 from toolkit.geometry import so3_exp
-from toolkit.measured_motion import ImuNoise, ImuSamples, TwistSamples
+from toolkit.measurements import ImuNoise
 from toolkit.models.noise import mems_imu
+from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.settings import Frontend
 
 TF = "tf2_msgs/msg/TFMessage"

@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.gate.measuring import fingerprint
-from toolkit.measured_motion import ImuSamples
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

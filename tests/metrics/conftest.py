@@ -8,9 +8,10 @@ import pytest
 
 from toolkit.estimate import Landmarks, Run, Timings, Trajectory
 from toolkit.geometry import Array, about_z, se3, se3_exp, se3_inverse, so3_exp, transform
-from toolkit.measured_motion import ImuNoise, ImuSamples, TwistNoise, TwistSamples
+from toolkit.measurements import ImuNoise, StereoRig, TwistNoise
 from toolkit.models import stereo
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.motion_samples import ImuSamples, TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 PERIOD_NS = 100_000_000
 # Camera axes (right, down, forward) in IMU axes (forward, left, up), a little above and ahead of it.

@@ -14,9 +14,10 @@ import pytest
 
 from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.geometry import Array, about_z, se3, se3_exp, se3_inverse, so3_exp, transform
+from toolkit.measurements import Prior
 from toolkit.metrics import score_run
 from toolkit.models import stereo
-from toolkit.sequence import Observations, Prior, Sequence
+from toolkit.sequence import Observations, Sequence
 
 FRAMES, STEP_M, PERIOD_S = 400, 2.2, 0.1
 # Sums of a few hundred squares of hundreds of metres in doubles, through SVDs whose order may change with LAPACK,

@@ -8,10 +8,10 @@ import pytest
 
 from toolkit.estimate import Run
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
-from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import Evaluation, held_out_over_motion
 from toolkit.metrics.held_out_over_motion import ERROR, RATIO
 from toolkit.metrics.parts.scores import Unavailable
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 
 PERIOD_S = 0.1

@@ -7,9 +7,10 @@ import pytest
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse, so3_exp
+from toolkit.measurements import Prior
 from toolkit.metrics import Evaluation, score_run
 from toolkit.metrics.parts.consistency import chi2_quantile, nees_band, nees_over_time
-from toolkit.sequence import Prior, Truth
+from toolkit.sequence import Truth
 
 POSES = 4000
 KEYS = ("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "nees_pose_in_band_percent")

@@ -7,8 +7,9 @@ import pytest
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, se3, se3_exp, se3_inverse
+from toolkit.measurements import Prior
 from toolkit.metrics import score_run
-from toolkit.sequence import Prior, Truth
+from toolkit.sequence import Truth
 
 FRAMES = 4000
 KEYS = ("nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean")

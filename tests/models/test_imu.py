@@ -15,10 +15,9 @@ import pytest
 from toolkit.datasets import load_sequence
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
-from toolkit.measured_motion import ImuMotion
+from toolkit.measurements import GRAVITY_WORLD, ImuMotion
 from toolkit.models import imu
 from toolkit.models.factors import B, V, X
-from toolkit.sequence import GRAVITY_WORLD
 from toolkit.simulation import FLIGHT, noise_free, simulate
 
 PARAMS = imu.preintegration_params(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))

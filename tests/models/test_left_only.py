@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import se3_exp, transform
+from toolkit.measurements import StereoFrame
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE
 
 # Correlated, with a v that errs like uL: where v is the mean of two rows the left one alone errs more.

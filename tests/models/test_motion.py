@@ -8,10 +8,11 @@ import pytest
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
+from toolkit.measurements import Packet
 from toolkit.models.factors import joint_cov
 from toolkit.models.motion import motion_model, predicted, state_keys
 from toolkit.models.state import Belief
-from toolkit.sequence import Packet, Sequence
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 each_motion = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])

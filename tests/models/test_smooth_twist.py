@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
-from toolkit.measured_motion import TwistChangeNoise, UnmeasuredMotion
+from toolkit.measurements import TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.smooth_twist import SmoothTwist, smooth_factor, twist_change_cov

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import se3_exp
-from toolkit.measured_motion import TwistMotion, TwistNoise
+from toolkit.measurements import TwistMotion, TwistNoise
 from toolkit.models.factors import B, X
 from toolkit.models.motion import motion_model
 from toolkit.models.stacked_factors import StackedFactors, linear_factors, stacked

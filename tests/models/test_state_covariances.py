@@ -11,7 +11,7 @@ import pytest
 from filters.smoothing import indeterminate
 from toolkit.estimate import Run, Trajectory
 from toolkit.geometry import Array
-from toolkit.measured_motion import TwistNoise
+from toolkit.measurements import TwistNoise
 from toolkit.models import state_covariances
 from toolkit.models.factors import L, X, joint_cov, linear_factor
 from toolkit.models.motion import MotionModel, state_cov, state_keys

@@ -18,10 +18,11 @@ from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.geometry import Array, se3_exp
 from toolkit.initialization import start_from_measurements
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.camera_motion import triangulation_jacobian
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.sequence import Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT
 
 # Pixels are of the order of 1e3 and Jacobian entries of 1e4 (px / rad at 40 m): 1e-9 of the largest entry of a

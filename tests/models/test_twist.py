@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log
-from toolkit.measured_motion import TwistMotion, TwistNoise
+from toolkit.measurements import TwistMotion, TwistNoise
 from toolkit.models import twist
 from toolkit.models.factors import B, X
 from toolkit.simulation import DRIVE, simulate

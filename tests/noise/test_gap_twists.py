@@ -7,7 +7,8 @@ import pytest
 
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.measured_motion import GapTwists, NoSamples, TwistChangeNoise, TwistMotion, motions_between
+from toolkit.measurements import TwistChangeNoise, TwistMotion
+from toolkit.motion_samples import GapTwists, NoSamples, motions_between
 from toolkit.noise import with_gap_twists
 from toolkit.sequence import Sequence
 from toolkit.settings import Noise

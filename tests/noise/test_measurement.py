@@ -11,7 +11,8 @@ from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, IntArray
-from toolkit.measured_motion import NoSamples, TwistChangeNoise
+from toolkit.measurements import TwistChangeNoise
+from toolkit.motion_samples import NoSamples
 from toolkit.noise import measured_noise
 from toolkit.noise.motion import MotionScale, motion_scale
 from toolkit.noise.stretches import MotionFit, Stretch

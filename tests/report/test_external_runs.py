@@ -14,8 +14,8 @@ from toolkit.errors import DataError
 from toolkit.estimate import Run, Trajectory
 from toolkit.experiment.references import external_runs, reference_runs
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
-from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import score_run
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 
-from toolkit.estimator import defaults, discover
+from toolkit.registry import defaults, discover
 from toolkit.report.figures import FigureFormat, save
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.report.looks import COLOURS, look_numbers

@@ -10,15 +10,15 @@ import pytest
 
 from toolkit.audit import Finding
 from toolkit.errors import VislamError
-from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Scores, known_metrics
+from toolkit.registry import discover
 from toolkit.report import prose
 from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.messages import note_lines
 from toolkit.report.table import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

@@ -11,10 +11,9 @@ import pytest
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array
-from toolkit.measured_motion import ImuSamples
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
-from toolkit.resampling import cut_at
+from toolkit.motion_samples import ImuSamples, cut_at
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
 

@@ -9,8 +9,8 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, so3_exp
+from toolkit.measurements import NS_PER_S
 from toolkit.models.stereo import CHANNELS, triangulate
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.simulation import SCENARIOS, faults, simulate, track_faults
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
-from toolkit.measured_motion import ImuMotion, ImuNoise, ImuSamples, TwistMotion, TwistSamples
+from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise, TwistMotion
 from toolkit.models import stereo
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.sequence import Sequence, Truth
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
 from toolkit.simulation.sensors import Imu

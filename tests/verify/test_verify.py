@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.answers import COV_SIZES
 from toolkit.cli import main
-from toolkit.estimate import COV_SIZES, Estimate
+from toolkit.estimate import Estimate
 from toolkit.verify import verification
 from toolkit.verify.promises import covariance_fault, inconsistency
 

@@ -26,9 +26,9 @@ from toolkit.audit.one_step import errors_are_independent
 from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, MEDIAN_TO_MEAN_ERROR, Scalar, median, median_error
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import STRETCHES
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # A ratio must be so many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio of the

@@ -40,9 +40,8 @@ from toolkit.audit.robust import (
 )
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
-from toolkit.measured_motion import MotionKind
+from toolkit.measurements import NS_PER_S, MotionKind
 from toolkit.models.camera_motion import CameraMotion, camera_motion
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # With an IMU: duration (s) of a displacement of the camera, whose noise hardly grows with the duration, and length (s)

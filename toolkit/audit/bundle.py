@@ -23,11 +23,11 @@ import numpy as np
 
 from toolkit.audit.intervals import interval_means, subdivided
 from toolkit.geometry import Array, IntArray, se3, se3_exp, skew, so3_exp, so3_log
-from toolkit.measured_motion import ImuNoise, TwistMotion, TwistNoise, motions_between
+from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistMotion, TwistNoise
 from toolkit.models.gating import CHI2_3_MEDIAN
 from toolkit.models.stereo import project, projection_jacobian
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.motion_samples import motions_between
+from toolkit.sequence import Sequence
 
 # Difference of a bias (rad/s, and m/s^2 or rad) for the difference quotients.
 _DIFFERENCE = 1e-4

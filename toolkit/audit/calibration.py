@@ -32,9 +32,10 @@ from toolkit.audit.robust import Scalar, median_error, slope
 from toolkit.audit.self_calibration import OFF_BY, RIGHT, RIGHT_SIGMAS, SelfCalibration, self_calibration
 from toolkit.geometry import Array, BoolArray
 from toolkit.jackknife import jackknife_error
-from toolkit.measured_motion import MotionKind, TwistSamples
+from toolkit.measurements import MotionKind, Prior, StereoRig, is_measured
 from toolkit.models.camera_motion import CameraMotion, camera_motion
-from toolkit.sequence import Prior, Sequence, StereoRig, is_measured
+from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import Sequence
 
 
 class Limits(NamedTuple):

@@ -19,10 +19,10 @@ from toolkit.audit.intervals import LEAST_INTERVALS, Integral, Intervals
 from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, slope, spread
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
-from toolkit.measured_motion import TwistSamples
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.resampling import NS_PER_S, Pairing
+from toolkit.motion_samples import Pairing, TwistSamples
 from toolkit.sequence import Sequence, Truth
 
 # Range of the search, and its step in intervals.

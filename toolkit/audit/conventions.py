@@ -13,7 +13,7 @@ from toolkit.audit.intervals import Intervals, interval_means
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp, so3_log
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
 
 # A mirror image of the scene reverses the turns about two axes and the motion along the third.

@@ -7,10 +7,10 @@ import numpy as np
 from toolkit.audit.robust import Scalar, median_error
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
-from toolkit.measured_motion import ImuSamples, NoSamples, TwistSamples
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.noise import white_sigma
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import ImuSamples, NoSamples, TwistSamples
 from toolkit.sequence import Sequence, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.

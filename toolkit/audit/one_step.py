@@ -13,11 +13,10 @@ from toolkit.audit.intervals import moved_as_measured, moved_by
 from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.jackknife import jackknife_error
-from toolkit.measured_motion import TwistChangeNoise, TwistNoise
+from toolkit.measurements import NS_PER_S, TwistChangeNoise, TwistNoise
 from toolkit.models.camera_motion import CameraMotion, triangulation_jacobian, usable_pairs
 from toolkit.models.gating import LEAST_DEPTH_M, MAD_TO_SIGMA
 from toolkit.models.stereo import project, projection_jacobian, triangulate
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # Median one-step residual (px) beyond which samples and tracks disagree. Sound recordings have 0.3 to 3.1 px, the

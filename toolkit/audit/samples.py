@@ -22,11 +22,11 @@ from toolkit.audit.intervals import (
 from toolkit.audit.one_step import median_one_step_px
 from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, BoolArray, se3
-from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, TwistNoise, TwistSamples
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise, is_measured
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.models.noise import white_sigma
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, is_measured
+from toolkit.motion_samples import ImuSamples, TwistSamples
+from toolkit.sequence import Sequence
 
 COORDINATES = ("uL", "uR", "v")
 CHANNELS = {"twist": ("velocity", "rate of rotation"), "imu": ("accelerometer", "gyro")}

@@ -28,11 +28,10 @@ from toolkit.audit.intervals import Intervals, interval_means, moved_as_measured
 from toolkit.audit.robust import LEVEL
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.measured_motion import MotionKind
+from toolkit.measurements import NS_PER_S, MotionKind, is_left_only
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.stereo import disparity_px, triangulate
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, is_left_only
+from toolkit.sequence import Sequence
 
 # Time (s) between key frames, approximate length (s) of a window, and least number of key frames of one. There is one
 # window or an even number, so that no window contains the middle of the recording, where the clock may change.

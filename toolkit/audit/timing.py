@@ -15,10 +15,10 @@ from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas,
 from toolkit.audit.self_calibration import self_calibration
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
-from toolkit.measured_motion import ImuNoise, MotionNoise, MotionSamples, NoSamples, TwistNoise, TwistSamples
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.motion_samples import Bridges, MotionSamples, NoSamples, TwistSamples
 from toolkit.sequence import Sequence
 
 # A step this many times the usual (median) one is a gap: one missing stamp makes a step of 2, two make 3.

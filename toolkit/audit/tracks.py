@@ -12,12 +12,12 @@ from toolkit.audit.intervals import LEAST_INTERVALS, interval_means, is_comparab
 from toolkit.audit.one_step import CORRELATION_SIGMAS, MOST_CORRELATION, errors_are_independent
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.jackknife import jackknife_error
+from toolkit.measurements import NS_PER_S, StereoRig, is_left_only
 from toolkit.models.camera_motion import CameraMotion, Neighbours, neighbours
 from toolkit.models.gating import CHI2_3_MEDIAN, LEAST_DISPARITY_PX, mahalanobis_squared
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 from toolkit.models.stereo import disparity_px
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import NO_FEATURES, ONE_ROW_FOR_BOTH, Observations, Sequence, StereoRig, is_left_only
+from toolkit.sequence import NO_FEATURES, ONE_ROW_FOR_BOTH, Observations, Sequence
 
 
 def no_sightings(evidence: Evidence) -> Symptom | None:

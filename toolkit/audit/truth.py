@@ -14,9 +14,9 @@ from toolkit.audit.intervals import LEAST_INTERVALS, interval_means, is_comparab
 from toolkit.audit.robust import Scalar, chance_sigmas, median_error
 from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
-from toolkit.measured_motion import ImuSamples
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion, camera_motion
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence, Truth
 
 # Length (s) of a window: long enough for the noise of single frames to be small, and five seconds have ten of them.

@@ -264,9 +264,9 @@ def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
 
 def _plan(requested: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
-    from toolkit.estimator import defaults
     from toolkit.experiment import Plan
     from toolkit.experiment.recording import Part
+    from toolkit.registry import defaults
 
     request, settings = requested.request, requested.settings
     sequences = request.sequences or SEQUENCES
@@ -295,8 +295,8 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     """Raise UsageError for a trajectory whose name stands for something else."""
     if not trajectories:
         return
-    from toolkit.estimator import find_all
     from toolkit.experiment.comparison import plain_name
+    from toolkit.registry import find_all
     from toolkit.report.export import TRUTH
     from toolkit.sequence import LONGEST_NAME
 

@@ -57,7 +57,7 @@ def _known_names() -> dict[str, tuple[str, ...]]:
     """Return the names that arguments take without having them as choices, by the argument's destination."""
     from toolkit import datasets, metrics
     from toolkit.audit import faults
-    from toolkit.estimator import discover
+    from toolkit.registry import discover
     from toolkit.settings import describe
 
     return {

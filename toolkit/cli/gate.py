@@ -166,9 +166,9 @@ def _check_seeds_are_options(assignments: list[str]) -> None:
 def _cases(options: argparse.Namespace) -> list[Case]:
     """Return the cases the command line asks for."""
     from toolkit.datasets import is_drawn_from_a_seed
-    from toolkit.estimator import defaults, find_all
     from toolkit.gate.baseline import Case
     from toolkit.gate.measuring import located
+    from toolkit.registry import defaults, find_all
 
     if not options.sequences:
         raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import add_output_arguments, command
 
 if TYPE_CHECKING:
-    from toolkit.estimator import EstimatorEntry
+    from toolkit.registry import EstimatorEntry
     from toolkit.settings import Described
 
 _INDENT = "  "
@@ -47,7 +47,7 @@ def _entries(kind: str) -> Mapping[str, str]:
     """Return the names of a kind with their one-line summaries."""
     from toolkit import datasets, metrics
     from toolkit.audit import faults
-    from toolkit.estimator import discover
+    from toolkit.registry import discover
     from toolkit.settings import describe
 
     entries: Mapping[str, Callable[[], Mapping[str, str]]] = {

@@ -27,8 +27,9 @@ from toolkit.errors import DataError, ExtensionError, did_you_mean, type_of
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
+from toolkit.measurements import StereoRig
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, check_stated, why_not_sightings
+from toolkit.sequence import Observations, Provenance, Sequence, check_stated, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Tracks
 
 # Names of a folder that are listed in the message for a name that is not in it.

@@ -28,9 +28,9 @@ from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, StampedPair, matched_corners, track_images
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray
-from toolkit.measured_motion import ImuSamples, MotionSamples, TwistSamples
+from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.progress import SILENT, Progress
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Provenance, Truth
 from toolkit.sequence import Sequence as Recording
 from toolkit.settings import DEFAULTS, Frontend

@@ -40,17 +40,11 @@ from toolkit.frontend import (
 )
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
-from toolkit.measured_motion import TwistSamples
+from toolkit.measurements import StereoRig
 from toolkit.models.noise import pixel_covariance, twist_noise
+from toolkit.motion_samples import TwistSamples
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import (
-    EXTRINSIC_UNCERTAIN,
-    NO_FEATURES,
-    Observations,
-    Provenance,
-    Sequence,
-    StereoRig,
-)
+from toolkit.sequence import EXTRINSIC_UNCERTAIN, NO_FEATURES, Observations, Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
 
 _NOT_SEEN = -1.0

@@ -12,9 +12,10 @@ from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count,
 from toolkit.datasets.io.npz_archive import NpzArchive, array_names, corners_of, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
-from toolkit.measured_motion import TwistSamples
+from toolkit.measurements import StereoRig
 from toolkit.models.noise import pixel_covariance, twist_noise
-from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig
+from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence
 
 CITES = ("geiger2013kitti",)
 _NOT_SEEN = -1.0

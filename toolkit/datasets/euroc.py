@@ -42,9 +42,10 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified, track_images
 from toolkit.geometry import Array
-from toolkit.measured_motion import ImuSamples
+from toolkit.measurements import StereoRig
+from toolkit.motion_samples import ImuSamples
 from toolkit.progress import Progress
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
+from toolkit.sequence import Observations, Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation import sensors, world
 from toolkit.simulation.filming import is_simulated, with_scene_errors

@@ -12,9 +12,10 @@ import numpy as np
 from toolkit.datasets.io.fields import stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_inverse
-from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig
+from toolkit.motion_samples import ImuSamples
+from toolkit.sequence import ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence
 
 CITES = ("geiger2013kitti", "gtsam")
 # The first IMU sample is followed by a gap of 1.92 s, which covers frames 0 to 13.

@@ -30,8 +30,8 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.measured_motion import NoSamples
 from toolkit.models.noise import unmeasured_motion
+from toolkit.motion_samples import NoSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend

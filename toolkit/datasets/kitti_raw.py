@@ -36,10 +36,10 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
-from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, NoSamples, TwistSamples
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise
 from toolkit.models.noise import twist_noise, unmeasured_motion
+from toolkit.motion_samples import ImuSamples, MotionSamples, NoSamples, TwistSamples
 from toolkit.progress import SILENT, Progress
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend
 

@@ -23,8 +23,9 @@ from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import read_input, read_text_input
 from toolkit.geometry import IntArray, se3, se3_inverse
-from toolkit.measured_motion import ImuNoise, ImuSamples
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.measurements import ImuNoise, StereoRig
+from toolkit.motion_samples import ImuSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 CITES = ("geneva2020openvins",)
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"

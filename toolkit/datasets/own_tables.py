@@ -22,9 +22,10 @@ from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, TwistNoise, TwistSamples
+from toolkit.measurements import GRAVITY_WORLD, ImuNoise, MotionNoise, StereoRig, TwistNoise
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
-from toolkit.sequence import GRAVITY_WORLD, ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
+from toolkit.sequence import ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, Truth
 
 TRACKS, ONE_ROW, TWO_ROWS = ("track_id", "uL", "uR"), ("v",), ("vL", "vR")
 IMU = ("ax", "ay", "az", "gx", "gy", "gz")

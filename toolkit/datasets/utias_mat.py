@@ -18,10 +18,10 @@ from toolkit.datasets.io.fields import Fields, check_frame_count, rectified_obse
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input, read_input
 from toolkit.geometry import Array, IntArray, se3, so3_exp
-from toolkit.measured_motion import TwistNoise, TwistSamples
+from toolkit.measurements import NS_PER_S, StereoRig, TwistNoise
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 CITES = ("clement2015battle", "geiger2013kitti")
 _NOT_SEEN = -1.0

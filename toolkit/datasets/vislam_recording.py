@@ -18,18 +18,9 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input, read_text_input
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array
-from toolkit.measured_motion import (
-    ImuNoise,
-    ImuSamples,
-    MotionNoise,
-    MotionSamples,
-    NoSamples,
-    TwistChangeNoise,
-    TwistNoise,
-    TwistSamples,
-)
-from toolkit.resampling import ImuPairing, Pairing
-from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth, why_not_sightings
+from toolkit.measurements import ImuNoise, MotionNoise, Prior, StereoRig, TwistChangeNoise, TwistNoise
+from toolkit.motion_samples import ImuPairing, ImuSamples, MotionSamples, NoSamples, Pairing, TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, Truth, why_not_sightings
 
 SCHEMA = "vislam.recording/1"
 _TEXT, _ARRAYS = "recording.json", "recording.npz"

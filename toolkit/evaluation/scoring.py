@@ -33,6 +33,7 @@ from toolkit.datasets.trajectories.poses import PosesFile, StatedApart, check_or
 from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
 from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
@@ -45,7 +46,6 @@ from toolkit.metrics.parts.consistency import (
 )
 from toolkit.metrics.parts.evaluation import AgainstTruth, PairsAgainstTruth
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.resampling import NS_PER_S
 
 COVERAGE = Metric(
     TIME_COVERAGE,

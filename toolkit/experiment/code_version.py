@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from toolkit import datasets, estimator, metrics
+from toolkit import datasets, metrics, registry
 
 # Distributions by their name in a manifest.
 NUMERIC_PACKAGES = {
@@ -21,7 +21,7 @@ NUMERIC_PACKAGES = {
 # The toolkit's layers above the experiment, which it cannot import: they change no result.
 _ABOVE = ("api.py", "cli", "evaluation", "gate", "report", "verify")
 _CODE = (".py", ".so", ".pyd")
-_ANNOUNCED = (estimator.ENTRY_POINT_GROUP, metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP)
+_ANNOUNCED = (registry.ENTRY_POINT_GROUP, metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP)
 
 
 @cache

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from toolkit.audit import Finding
     from toolkit.estimate import Output, Run, Status
     from toolkit.geometry import Array
+    from toolkit.measurements import Prior
     from toolkit.noise import Card, MeasuredNoise
-    from toolkit.sequence import Prior
     from toolkit.sequence import Sequence as Recorded
 
 Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"]

@@ -16,9 +16,9 @@ from scipy.special import chdtri
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Row
 from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics.correction_trend import NOTHING_CORRECTED, TREND
 from toolkit.models.state import POSE, POSITION, ROTATION
-from toolkit.resampling import NS_PER_S
 
 # Squared distance of two consistent estimates of a pose, over its degrees of freedom, that is exceeded once in a
 # million.

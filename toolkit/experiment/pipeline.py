@@ -11,7 +11,7 @@ from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
-from toolkit.estimator import LADDER, Build, EstimatorEntry, check_options, find_all
+from toolkit.estimator import Build
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
@@ -20,6 +20,7 @@ from toolkit.experiment.references import check_names, external_runs, reference_
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
+from toolkit.registry import LADDER, EstimatorEntry, check_options, find_all
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings, SettingsError
 from toolkit.threads import MOST_WORKERS

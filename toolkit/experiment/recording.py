@@ -15,11 +15,11 @@ from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.measurements import NS_PER_S, Prior
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.noise import Card, MeasuredNoise, card_of, measured_noise, with_gap_twists
 from toolkit.progress import SILENT, Progress
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence, why_not_sightings
+from toolkit.sequence import Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.threads import on_one_thread

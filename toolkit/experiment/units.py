@@ -9,13 +9,14 @@ from toolkit import runner
 from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Arithmetic, ArithmeticOfRuns, Output, Run, Status
-from toolkit.estimator import Build, EstimatorEntry, find
+from toolkit.estimator import Build
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, repeated, score_run
 from toolkit.metrics.parts.consistency import body_errors, nees_over_time, nis_over_time
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.progress import Progress
+from toolkit.registry import EstimatorEntry, find
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
 

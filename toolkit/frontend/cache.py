@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.arrays import content_digest
 from toolkit.errors import DataError, OutputError
 from toolkit.files.reading import read_input
 from toolkit.files.writing import replaced_file
 from toolkit.frontend.cameras import RectifiedPair
 from toolkit.frontend.images import StampedPair
+from toolkit.sequence import content_digest
 from toolkit.settings import Frontend
 
 # Raised with every change of the front end that changes its tracks.

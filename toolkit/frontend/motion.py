@@ -17,8 +17,8 @@ import numpy as np
 
 from toolkit.frontend.cameras import RectifiedPair
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_exp, skew, transform, transposed
+from toolkit.measurements import StereoRig
 from toolkit.models import stereo
-from toolkit.sequence import StereoRig
 
 _FEWEST_OF_A_POSE = 8
 _ITERATIONS, _CONFIDENCE = 200, 0.999

@@ -4,7 +4,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from toolkit.estimator import check_options, find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
 from toolkit.gate.case_check import USUAL_TERMS, CaseVerdicts, CheckTerms, check_case
@@ -13,6 +12,7 @@ from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.significance import check_pairs
 from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
+from toolkit.registry import check_options, find_all
 from toolkit.settings import DEFAULTS, Settings
 
 

@@ -20,7 +20,6 @@ import numpy as np
 from toolkit.datasets import built_ins
 from toolkit.errors import EstimatorError, VislamError
 from toolkit.estimate import Output, Run, Status
-from toolkit.estimator import find
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import (
     OUTPUTS,
@@ -36,6 +35,7 @@ from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
 from toolkit.geometry import Array
 from toolkit.progress import Progress
+from toolkit.registry import find
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
 

@@ -25,7 +25,7 @@ class Timer:
     def where(self, requested: Json) -> Json:
         """Return where the toolkit and each estimator come from; an estimator that is not there has no file."""
         from toolkit.errors import VislamError
-        from toolkit.estimator import find
+        from toolkit.registry import find
 
         files: dict[str, str | None] = {}
         for name in requested["estimators"]:
@@ -58,8 +58,8 @@ class Timer:
     def run(self, requested: Json) -> Json:
         """Run an estimator over the recording; return its seconds of processor time, and how it ended."""
         from toolkit import runner
-        from toolkit.estimator import find
         from toolkit.progress import SILENT
+        from toolkit.registry import find
 
         name, prepared = requested["estimator"], self._prepared
         gc.collect()

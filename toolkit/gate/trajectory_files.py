@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from toolkit.arrays import content_digest
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import range_s
 from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
@@ -20,12 +19,13 @@ from toolkit.datasets.trajectories.poses import check_order
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import unreadable
 from toolkit.geometry import Array, IntArray
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
 from toolkit.metrics.ate import position_rmse, rotation_rmse_deg
 from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_sim3, fit_yaw
 from toolkit.metrics.parts.association import Matched, distance_along, median_period_ns, poses_at
 from toolkit.metrics.rpe import hundred_metres_percent
-from toolkit.resampling import NS_PER_S
+from toolkit.sequence import content_digest
 
 Align = Literal["se3", "yaw", "sim3"]
 TIME_COVERAGE = "time_coverage_percent"

@@ -12,12 +12,12 @@ import numpy as np
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, IntArray
 from toolkit.initialization.first_guess import FirstGuess
-from toolkit.measured_motion import ImuNoise, Motion
+from toolkit.measurements import ImuNoise, Motion, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import B, L, StereoFactors, X, joint_cov
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, MOST_MISMATCHED, chi2_bound
 from toolkit.models.motion import Increment, MotionModel, motion_model, state_keys
-from toolkit.sequence import Sequence, StereoFrame
+from toolkit.sequence import Sequence
 
 # Standard deviations: of the pose that fixes the gauge (rad, m), and of biases before any measurement (m/s^2, rad/s).
 GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, se3, se3_exp, se3_inverse, so3_exp, so3_log
-from toolkit.measured_motion import ImuMotion, ImuNoise
+from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import huber_weights
 from toolkit.models.imu import Preintegration, preintegrate, preintegration_params
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # Iterations for the gyro's bias: the second corrects for the linearisation of the first.

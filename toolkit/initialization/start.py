@@ -23,10 +23,9 @@ from toolkit.initialization.adjustment import (
     adjusted,
 )
 from toolkit.initialization.first_guess import guess_from_vision, guess_with_imu, levelling
-from toolkit.measured_motion import ImuMotion, TwistChangeNoise, TwistNoise
+from toolkit.measurements import NS_PER_S, ImuMotion, Packet, Prior, StereoFrame, TwistChangeNoise, TwistNoise
 from toolkit.models import stereo
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Packet, Prior, Sequence, StereoFrame
+from toolkit.sequence import Observations, Sequence
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
 # Without enough vision: sigma of the unknown speed (m/s), and of the tilt (rad), by an acceleration of 1 m/s^2.

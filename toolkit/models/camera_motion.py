@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log
+from toolkit.measurements import NS_PER_S, StereoRig
 from toolkit.models.gating import CHI2_3_MEDIAN, LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence, StereoRig
+from toolkit.sequence import Observations, Sequence
 
 # After this many iterations the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of convergence.
 ITERATIONS = 6

@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import left_only
-from toolkit.sequence import StereoFrame, StereoRig
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 # A key is a character above an index of this many bits (gtsam/inference/Symbol.h); making a Symbol takes several times

@@ -13,10 +13,9 @@ import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, skew, so3_exp
-from toolkit.measured_motion import ImuMotion, ImuNoise, Motion
+from toolkit.measurements import ImuMotion, ImuNoise, Motion, Prior
 from toolkit.models.factors import B, V, X, joint_prior, latest_values
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction, with_velocity_turned
-from toolkit.sequence import Prior
 
 IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.sequence import StereoRig, is_left_only
+from toolkit.measurements import StereoRig, is_left_only
 
 _U_RIGHT = 1
 _SEEN = np.ix_([0, 2], [0, 2])

@@ -16,13 +16,13 @@ import numpy as np
 
 from toolkit.estimate import Estimate, Trajectory
 from toolkit.geometry import Array
-from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise
+from toolkit.measurements import Motion, MotionNoise, Prior, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
 from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Sequence
 
 
 class Increment(Protocol):

@@ -24,12 +24,13 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_adjoint, se3_exp, se3_inverse, skew, transform, transposed
+from toolkit.measurements import Packet, Prior, StereoRig, is_left_only
 from toolkit.models.camera_motion import RIDGE
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, Belief, Prediction
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
-from toolkit.sequence import Packet, Prior, Sequence, StereoRig, is_held_out, is_left_only
+from toolkit.sequence import Sequence, is_held_out
 
 # One in a thousand sound sightings is rejected, and one in a thousand correct motions is taken to be impossible.
 PROBABILITY = 0.999

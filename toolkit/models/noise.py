@@ -3,9 +3,8 @@
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
-from toolkit.measured_motion import ImuNoise, TwistChangeNoise, TwistNoise
+from toolkit.measurements import NS_PER_S, ImuNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.gating import MAD_TO_SIGMA
-from toolkit.resampling import NS_PER_S
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
 TRACKED_PIXEL_SIGMA_PX = 0.5

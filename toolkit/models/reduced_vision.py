@@ -14,8 +14,8 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
+from toolkit.measurements import StereoRig
 from toolkit.models import left_only, stereo
-from toolkit.sequence import StereoRig
 
 # Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
 _BEHIND_NORM = 100.0

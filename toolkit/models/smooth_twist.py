@@ -17,10 +17,9 @@ import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian, skew
-from toolkit.measured_motion import Motion, TwistChangeNoise, UnmeasuredMotion
+from toolkit.measurements import Motion, Prior, TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X, joint_prior, latest_values
 from toolkit.models.state import POSE, ROTATION, Belief, Layout, Prediction, with_velocity_turned
-from toolkit.sequence import Prior
 
 _VELOCITY, _TURN = slice(6, 9), slice(9, 12)
 SMOOTH_LAYOUT = Layout(12, _VELOCITY, None, _TURN)

@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
-from toolkit.sequence import Prior
+from toolkit.measurements import Prior
 
 ROTATION, POSITION, POSE = slice(0, 3), slice(3, 6), slice(0, 6)
 

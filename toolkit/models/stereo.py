@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, se3_inverse, skew, transform, transposed
-from toolkit.sequence import StereoRig
+from toolkit.measurements import StereoRig
 
 # (c, d, v) = CHANNELS @ (uL, uR, v): the mean column, the disparity, the row.
 CHANNELS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])

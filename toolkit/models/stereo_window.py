@@ -14,10 +14,10 @@ import numpy as np
 from scipy.linalg import cholesky
 
 from toolkit.geometry import Array, IntArray
+from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.reduced_vision import ReducedVision, RobustCamera, Sightings, Vision, seen_from
-from toolkit.sequence import StereoFrame, StereoRig
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,14 +13,15 @@ from toolkit.audit.intervals import interval_means
 from toolkit.audit.robust import Scalar, slope
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.measured_motion import TwistSamples
+from toolkit.measurements import is_left_only
 from toolkit.models.camera_motion import camera_motion, neighbours
 from toolkit.models.gating import LEAST_DISPARITY_PX, MAD_TO_SIGMA
 from toolkit.models.stereo import CHANNELS, disparity_px
+from toolkit.motion_samples import TwistSamples
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight
 from toolkit.noise.measurement import adjusted_stretches, measured_noise
 from toolkit.noise.stretches import Adjusted
-from toolkit.sequence import Sequence, check_runnable, is_left_only
+from toolkit.sequence import Sequence, check_runnable
 
 # Sightings between which residuals are compared, at most.
 LAGS = 8

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.measured_motion import GapTwists, TwistMotion, TwistNoise, TwistSamples, motions_between
+from toolkit.measurements import NS_PER_S, TwistMotion, TwistNoise
 from toolkit.models.camera_motion import camera_motion, neighbours
-from toolkit.resampling import NS_PER_S
+from toolkit.motion_samples import GapTwists, TwistSamples, motions_between
 from toolkit.sequence import Sequence
 
 # With fewer changes of the twist between neighbouring intervals that vision saw, their variance is not known.

@@ -11,11 +11,11 @@ import numpy as np
 from toolkit.errors import EstimatorError, OutputError
 from toolkit.files.writing import replaced_file
 from toolkit.frontend.cache import folder
-from toolkit.measured_motion import MotionNoise
+from toolkit.measurements import MotionNoise, StereoRig
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight, track_weight
 from toolkit.noise.motion import MotionScale, motion_scale
 from toolkit.noise.stretches import Adjusted, MotionFit, Stretch, stretches
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Sequence
 
 # Raised with every change of the measurement that changes what it finds.
 _MEASUREMENT = 2

@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 from toolkit.audit.edits import keep_frames
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse
 from toolkit.initialization.first_guess import guess_with_imu
-from toolkit.measured_motion import ImuMotion, MotionNoise
+from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior, StereoRig
 from toolkit.models import left_only
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import chi2_bound
@@ -25,8 +25,7 @@ from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
 from toolkit.models.state import Belief
 from toolkit.models.stereo_window import Evaluated, StereoWindow, TrackedWindow
 from toolkit.models.window_solver import solve_window
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet, Prior, Sequence, StereoRig
+from toolkit.sequence import Sequence
 
 # A stretch has this many frames: most tracks end within it, and a dense matrix holds its states. There are as many
 # stretches as the recording has room for, at most six.

@@ -16,7 +16,7 @@ from pathlib import Path
 from toolkit import datasets
 from toolkit.discovery import FoundModule, shown_name
 from toolkit.errors import EstimatorError, no_such
-from toolkit.estimator import discover
+from toolkit.registry import discover
 from toolkit.report.records import read_manifest
 from toolkit.report.run_directory import MANIFEST
 

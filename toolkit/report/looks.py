@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from toolkit.estimator import defaults, discover, ladder
+from toolkit.registry import defaults, discover, ladder
 
 # How many colours there are; a number beyond them has the colours over again, in other dashes.
 COLOURS = 7

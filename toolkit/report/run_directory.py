@@ -27,6 +27,7 @@ from toolkit.files.documents import to_line, to_text
 from toolkit.files.reading import read_input
 from toolkit.files.writing import check_parent, check_replaceable, replaced_directory
 from toolkit.geometry import Array
+from toolkit.measurements import NS_PER_S
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
 from toolkit.report.comparison_text import report_text
@@ -46,7 +47,6 @@ from toolkit.report.records import (
     read_seeds_report,
 )
 from toolkit.report.scores_json import metrics_document, seeds_document
-from toolkit.resampling import NS_PER_S
 
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
 _Rows = list[tuple[str, Output]]

@@ -22,12 +22,12 @@ from toolkit.arrays import rows_of
 from toolkit.errors import OutputError
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
-from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import MAD_TO_SIGMA
+from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
 from toolkit.simulation.renderer import Eye, Lens, LensModel, Sensor, exposed, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate

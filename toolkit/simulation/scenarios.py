@@ -17,9 +17,8 @@ from zlib import crc32
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3, so3_exp
-from toolkit.measured_motion import ImuNoise, TwistNoise
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import GRAVITY_WORLD, Observations, Prior, Provenance, Sequence, StereoRig, Truth
+from toolkit.measurements import GRAVITY_WORLD, NS_PER_S, ImuNoise, Prior, StereoRig, TwistNoise
+from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, SceneOf, hall, road

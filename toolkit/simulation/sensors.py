@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
-from toolkit.measured_motion import ImuNoise, ImuSamples, MotionSamples, TwistNoise, TwistSamples
+from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistNoise
 from toolkit.models.stereo import CHANNELS, project
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, StereoRig
+from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
+from toolkit.sequence import Observations
 from toolkit.simulation.track_noise import TrackNoise
 from toolkit.simulation.trajectory import SmoothTrajectory
 from toolkit.simulation.world import CameraLimits, Tracks

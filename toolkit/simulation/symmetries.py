@@ -11,9 +11,9 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.measured_motion import ImuSamples, MotionSamples, TwistSamples
-from toolkit.resampling import Bridges, Pairing
-from toolkit.sequence import Observations, Prior, Sequence, StereoRig, Truth, is_left_only
+from toolkit.measurements import Prior, StereoRig, is_left_only
+from toolkit.motion_samples import Bridges, ImuSamples, MotionSamples, Pairing, TwistSamples
+from toolkit.sequence import Observations, Sequence, Truth
 
 # Reflections of the y-axis of body and world, and of the x-axis of the camera; a rotation vector keeps
 # its component along the reflected axis, and the other two change sign.

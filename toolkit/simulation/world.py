@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.measurements import StereoRig
 from toolkit.models.stereo import project
-from toolkit.sequence import StereoRig
 
 # Poses projected at a time: bounds the memory of the (poses, 3, landmarks) intermediate.
 _POSES_AT_ONCE = 64

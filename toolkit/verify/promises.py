@@ -9,12 +9,14 @@ from itertools import zip_longest
 
 import numpy as np
 
+from toolkit.answers import COV_SIZES, check_state
 from toolkit.errors import EstimatorError
-from toolkit.estimate import COV_SIZES, Estimate, Finished, Run, check_state
+from toolkit.estimate import Estimate, Finished, Run
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
+from toolkit.measurements import Packet
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
-from toolkit.sequence import Packet, Sequence
+from toolkit.sequence import Sequence
 
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12

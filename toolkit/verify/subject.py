@@ -8,7 +8,8 @@ from typing import cast
 
 from toolkit.discovery import shown_name
 from toolkit.errors import EstimatorError
-from toolkit.estimator import Build, cannot_import, discover, find
+from toolkit.estimator import Build
+from toolkit.registry import cannot_import, discover, find
 
 _MODULE = re.compile(r"\w+(\.\w+)+")
 

@@ -18,8 +18,9 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.frontend import RectifiedPair, already_rectified, rectified
 from toolkit.geometry import Array, se3
-from toolkit.measured_motion import MotionNoise, MotionSamples, TwistSamples
+from toolkit.measurements import MotionNoise
 from toolkit.models.noise import mems_imu, twist_noise
+from toolkit.motion_samples import MotionSamples, TwistSamples
 
 _NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
 _STATED = "the noise of the IMU is as its file states it"

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from toolkit.errors import DataError, VislamError, printable
 from toolkit.files.reading import is_regular, open_input
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 Kind = Literal["ros1", "mcap", "sqlite", "folder"]
 _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}

@@ -23,8 +23,7 @@ from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.errors import DataError
 from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 from toolkit.geometry import Array, se3_inverse
-from toolkit.measured_motion import ImuNoise
-from toolkit.sequence import StereoRig
+from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.simulation.filming import is_simulated
 from toolkit.simulation.scenarios import stereo_cov_px2
 

@@ -18,8 +18,8 @@ from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
-from toolkit.measured_motion import ImuSamples
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Truth
 
 # Long enough that the noise of single truth poses is small, short enough that the gyro's mean gives the rotation.

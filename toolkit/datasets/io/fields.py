@@ -13,7 +13,7 @@ import numpy.typing as npt
 from toolkit.arrays import check_rigid, check_shape
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Observations
 
 # How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.

@@ -15,8 +15,8 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import ImageTracks, RectifiedPair, StampedPair
 from toolkit.geometry import Array, IntArray
+from toolkit.measurements import StereoRig
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import StereoRig
 from toolkit.settings import Tracks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")

@@ -17,7 +17,7 @@ from toolkit.errors import DataError, printable
 from toolkit.frontend import Camera, Pinhole
 from toolkit.frontend.cameras import Distortion
 from toolkit.geometry import Array, rotation_from_quaternion, se3, se3_inverse
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 # Of the planar encodings the first plane is the brightness.
 _GREY = {

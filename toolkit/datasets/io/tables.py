@@ -22,7 +22,7 @@ from toolkit.datasets.io.fields import probable_unit, probable_unit_of_ns, stamp
 from toolkit.errors import DataError, nearest, printable
 from toolkit.files.reading import is_regular, open_input, read_input, read_text_input
 from toolkit.geometry import Array, IntArray
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 _LONGEST_LINE = 1 << 16
 _GZIP_MAGIC = b"\x1f\x8b"

@@ -12,7 +12,7 @@ from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order
 from toolkit.datasets.trajectories.poses import check_order
 from toolkit.geometry import Array, IntArray, interpolate_poses
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Sequence, Truth
 
 _KIND = "a truth file is TUM text, one pose a line"

@@ -8,8 +8,8 @@ import numpy as np
 from toolkit.datasets.trajectories.poses import OtherOrder
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
-from toolkit.measured_motion import TwistSamples
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,

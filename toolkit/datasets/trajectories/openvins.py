@@ -16,7 +16,7 @@ from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, StatedApa
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, quaternion_from_rotation
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 COLUMNS = "t qx qy qz qw x y z vx vy vz bgx bgy bgz bax bay baz"
 RECORDED_COLUMNS = "t x y z qx qy qz qw Pr11 ... Pt33"

@@ -13,7 +13,7 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.files.reading import read_text_input
 from toolkit.geometry import Array, IntArray
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1
 # Digits before the point that fit with nanoseconds into 64 bits, unless the first is 9.

@@ -13,7 +13,7 @@ from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import quaternion_from_rotation
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 
 COLUMNS = "t x y z qx qy qz qw"
 KIND = "a TUM file is text, one pose a line"

@@ -26,6 +26,7 @@ from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
+from toolkit.measurements import Packet, Prior, StereoFrame, StereoRig, is_left_only
 from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
@@ -35,7 +36,7 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief, Layout
 from toolkit.models.state_covariances import state_covs
-from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is_left_only
+from toolkit.sequence import Sequence
 
 # A sighting whose residual at the truth is this improbable is a mismatch and adds no information.
 _MISMATCH_PROBABILITY = 1e-6

@@ -17,10 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.measurements import StereoRig
 from toolkit.metrics.parts.association import finite_poses
 from toolkit.metrics.parts.residuals import reprojection_errors_px
 from toolkit.models import left_only
-from toolkit.sequence import Observations, StereoRig
+from toolkit.sequence import Observations
 
 # Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
 FEWEST_VIEWS = 3

@@ -3,9 +3,9 @@
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
+from toolkit.measurements import is_left_only
 from toolkit.metrics.parts.association import Matched
 from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
-from toolkit.sequence import is_left_only
 
 # Cap of the error of an observation. A point behind the camera, or one that is not finite, has this error, so that no
 # run gains by losing its points.

@@ -7,8 +7,8 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.measured_motion import TwistNoise, TwistSamples
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S, TwistNoise
+from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Observations, Sequence, Truth
 from toolkit.simulation.faults.parts import ns, span_s, with_pixels
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.resampling import NS_PER_S
+from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Sequence
 
 

@@ -1,77 +1,32 @@
-"""The measured motion of the IMU: the samples of a recording, their noise, and the motion of one interval.
-
-There are three kinds: measured body twists, the samples of an IMU, and no measurement of the motion.
-"""
+"""The motion samples of a recording, and how they are cut at the frame times, once for all estimators."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self, get_args
+from itertools import pairwise
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
 from toolkit.arrays import freeze_arrays
 from toolkit.geometry import Array, IntArray, read_only
-from toolkit.resampling import NS_PER_S, Bridges, ImuPairing, Pairing, cut_at
+from toolkit.measurements import (
+    NS_PER_S,
+    ImuMotion,
+    ImuNoise,
+    Motion,
+    MotionKind,
+    MotionNoise,
+    TwistChangeNoise,
+    TwistMotion,
+    TwistNoise,
+    UnmeasuredMotion,
+)
 
-
-@dataclass(frozen=True, eq=False)
-class TwistNoise:
-    """Continuous white-noise densities of a measured body twist, per axis (3,), and of the gyro bias' walk.
-
-    Units: m/s/sqrt(Hz), rad/s/sqrt(Hz), rad/s^2/sqrt(Hz).
-    """
-
-    velocity_noise_density: Array
-    gyro_noise_density: Array
-    gyro_random_walk: Array
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walk stays."""
-        velocity, gyro = factor * self.velocity_noise_density, factor * self.gyro_noise_density
-        return replace(self, velocity_noise_density=velocity, gyro_noise_density=gyro)
-
-
-@dataclass(frozen=True)
-class ImuNoise:
-    """Continuous noise densities of an IMU, with Kalibr's names.
-
-    Units: m/s^2/sqrt(Hz), rad/s/sqrt(Hz), m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz).
-    """
-
-    accel_noise_density: float
-    gyro_noise_density: float
-    accel_random_walk: float
-    gyro_random_walk: float
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walks stay."""
-        accel, gyro = factor * self.accel_noise_density, factor * self.gyro_noise_density
-        return replace(self, accel_noise_density=accel, gyro_noise_density=gyro)
-
-
-@dataclass(frozen=True, eq=False)
-class TwistChangeNoise:
-    """Densities of the white noise on the change of an unmeasured twist, per axis (3,), in the IMU frame.
-
-    Units: m/s^2/sqrt(Hz) of the velocity, rad/s^2/sqrt(Hz) of the turn rate.
-    """
-
-    velocity_change_density: Array
-    turn_change_density: Array
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, velocity_change_density=(3,), turn_change_density=(3,))
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its densities scaled."""
-        velocity, turn = factor * self.velocity_change_density, factor * self.turn_change_density
-        return replace(self, velocity_change_density=velocity, turn_change_density=turn)
-
-
-MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
+# Which sample describes the motion between two stamps: the one at its start, the one at its end, or their mean.
+Pairing = Literal["start", "end", "mean"]
+# How IMU samples describe the motion: the mean of two neighbours from stamp to stamp, or each sample for the time
+# around it, half-way to its neighbours.
+ImuPairing = Literal["mean", "middle"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +69,7 @@ class ImuSamples(_TwoVectors):
     """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame.
 
     ``pairing`` says how samples describe the motion: the mean of two neighbours from one stamp to the next, or each
-    sample for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
+    sample for the time around its stamp (see :func:`cut_at`).
     """
 
     VECTORS = ("accel_mps2", "gyro_radps")
@@ -143,45 +98,6 @@ class NoSamples:
 
 
 MotionSamples = TwistSamples | ImuSamples | NoSamples
-
-
-@dataclass(frozen=True, eq=False)
-class TwistMotion:
-    """The twists of one interval: durations (n,) s, linear (n, 3) m/s and angular velocity (n, 3) rad/s."""
-
-    dt_s: Array
-    v_mps: Array
-    w_radps: Array
-    noise_scale: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ImuMotion:
-    """The IMU of one interval: durations (n,) s, mid-interval accel (n, 3) m/s^2 and gyro (n, 3) rad/s."""
-
-    dt_s: Array
-    accel_mps2: Array
-    gyro_radps: Array
-    noise_scale: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class UnmeasuredMotion:
-    """An interval in which no motion was measured: its duration (1,) s."""
-
-    dt_s: Array
-
-
-Motion = TwistMotion | ImuMotion | UnmeasuredMotion
-
-
-def noise_scale_of(motion: TwistMotion | ImuMotion) -> Array:
-    """Return the factors (n, 2) on the noise of a motion's linear and angular samples."""
-    return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale
-
-
-MotionKind = Literal["twist", "imu", "none"]
-MOTION_KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
     (TwistSamples, TwistNoise, "twist"),
     (ImuSamples, ImuNoise, "imu"),
@@ -197,6 +113,30 @@ def kind_of(samples: MotionSamples) -> MotionKind:
 def are_of_one_kind(samples: MotionSamples, noise: MotionNoise) -> bool:
     """Say whether a noise is that of samples of its kind."""
     return any(isinstance(samples, one) and isinstance(noise, other) for one, other, _ in _KINDS)
+
+
+@dataclass(frozen=True, eq=False)
+class Bridges:
+    """Spans (B,) without measured motion, in which samples were interpolated; these are noisier than the others.
+
+    ``noise_scale`` (B, 2) multiplies the standard deviation of the white noise there, of linear and angular samples.
+    """
+
+    begin_t_ns: IntArray
+    end_t_ns: IntArray
+    noise_scale: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, begin_t_ns=(None,), end_t_ns=(None,), noise_scale=(None, 2))
+
+    def scale_over(self, begin_ns: int, dt_s: Array) -> Array | None:
+        """Return the factors (n, 2) over successive pieces (n,) from a stamp on, or None where all was measured."""
+        middle_t_ns = begin_ns + np.rint((np.cumsum(dt_s) - 0.5 * dt_s) * NS_PER_S).astype(np.int64)
+        inside = (middle_t_ns[:, None] > self.begin_t_ns) & (middle_t_ns[:, None] < self.end_t_ns)  # (n, B)
+        if not inside.any():
+            return None
+        scale: Array = read_only(np.where(inside[:, :, None], self.noise_scale, 1.0).max(axis=1))
+        return scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,3 +189,42 @@ def motions_between(
         scale = None if bridges is None else bridges.scale_over(begin_ns, dt_s)
         part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]), scale)
         yield TwistMotion(*part) if twist else ImuMotion(*part)
+
+
+def cut_at(
+    frames_t_ns: IntArray, t_ns: IntArray, values: Array, pairing: Pairing | ImuPairing
+) -> Iterator[tuple[Array, Array]]:
+    """Yield, for each interval between frames (K,), durations (n,) s and the values (n, d) that hold over them.
+
+    The samples, stamps (S,) and values (S, d), must span the frames. An interval is divided at the samples
+    inside it, with ``middle`` half-way between them; at the frames themselves ``mean`` interpolates linearly.
+
+    The noise of the values equals that of the samples only where no sample contributes to two intervals. With the mean
+    of neighbours, an interval of n samples has ``(n - 1/2) / n`` of the variance and a covariance of ``1 / 4 n`` with
+    each neighbouring interval, which adds up to the whole variance over many intervals. With ``middle``, no sample is
+    shared where the frames are half-way between samples.
+    """
+    ends = _half_way(t_ns) if pairing == "middle" else t_ns
+    inside = ends[(ends > frames_t_ns[0]) & (ends < frames_t_ns[-1])]
+    knots = np.union1d(inside, frames_t_ns)
+    dt_s = np.diff(knots) / NS_PER_S
+    rows = _paired(t_ns, values, knots, pairing)
+    for begin, end in pairwise(np.searchsorted(knots, frames_t_ns)):
+        yield dt_s[begin:end], rows[begin:end]
+
+
+def _half_way(t_ns: IntArray) -> IntArray:
+    return np.asarray(t_ns[:-1] + np.diff(t_ns) // 2)
+
+
+def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing | ImuPairing) -> Array:
+    """Return the value (n, d) that describes each of the n intervals between knots."""
+    if pairing == "middle":
+        return values[np.searchsorted(_half_way(t_ns), knots[:-1], side="right")]
+    if pairing == "start":
+        return values[np.searchsorted(t_ns, knots[:-1], side="right") - 1]
+    if pairing == "end":
+        return values[np.searchsorted(t_ns, knots[1:], side="left")]
+    relative_s, knots_s = (t_ns - knots[0]) / NS_PER_S, (knots - knots[0]) / NS_PER_S
+    at_knots: Array = np.stack([np.interp(knots_s, relative_s, column) for column in values.T], axis=1)
+    return 0.5 * (at_knots[:-1] + at_knots[1:])
