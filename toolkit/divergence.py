@@ -15,8 +15,8 @@ from scipy.special import chdtri
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.measurements import NS_PER_S
+from toolkit.models.corrections import predicted_steps
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.models.motion import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence

@@ -1,26 +1,8 @@
-"""Progress of long work, with the time left: a bar on a terminal, a line from time to time in a log.
+"""What long work reports its progress to; :mod:`toolkit.cli.progress_display` shows it."""
 
-The loop that reports progress is the same with a bar and without any display (``SILENT``).
-"""
-
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol, TextIO
-
-from toolkit.errors import printable
-
-# Seconds before the first line and between two lines where the stream is a file or a pipe. For long work the interval
-# grows to a twentieth of the time so far, and to five minutes at most.
-LOG_EVERY_S = 10.0
-_SELDOM_AFTER_S, _MOST_SELDOM = 200.0, 30.0
-_FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
-_LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
-# The first steps include one-time work such as reading and compiling; before this share is done, the time left is a
-# guess.
-_LEAST_SHARE = 0.02
-_LOG_FORMAT_BEFORE = "{desc} {percentage:.0f} % [{elapsed}]"
+from typing import Protocol
 
 
 class Progress(Protocol):
@@ -50,88 +32,3 @@ ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 def silent(_label: str) -> Iterator[Progress]:
     """Begin a piece of work without a display."""
     yield SILENT
-
-
-def on_stream(stream: TextIO) -> ProgressFor:
-    """Return a display of progress on a stream: one line, drawn anew, on a terminal, else a line now and then."""
-
-    @contextmanager
-    def shown(named: str) -> Iterator[Progress]:
-        label = printable(named)
-        if not stream.isatty():
-            yield _Log(label, stream)
-            return
-        bar = _Bar(label, stream)
-        try:
-            yield bar
-        finally:
-            bar.close()
-
-    return shown
-
-
-class _Bar:
-    """A line on a terminal that redraws itself and is gone when the work is done."""
-
-    def __init__(self, label: str, stream: TextIO) -> None:
-        from tqdm import tqdm
-
-        self._label, self._stage = label, ""
-        self._bar = tqdm(desc=label, total=0, file=stream, leave=False, dynamic_ncols=True, bar_format=_FORMAT)
-
-    def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Show that ``done`` of ``total`` steps are taken."""
-        if stage != self._stage:
-            self._stage = stage
-            self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label, refresh=False)
-        if total != self._bar.total or done < self._bar.n:
-            self._bar.reset(total)
-        if done > self._bar.n:
-            self._bar.update(done - self._bar.n)
-
-    def close(self) -> None:
-        """Take the line away."""
-        self._bar.close()
-
-
-class _Log:
-    """A line now and then in a file or a pipe; work that is soon done leaves none."""
-
-    def __init__(self, label: str, stream: TextIO) -> None:
-        self._label, self._stream = label, stream
-        self._done, self._total, self._began_s = 0, 0, time.monotonic()
-        self._first_s = self._shown_s = self._began_s
-
-    def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Write a line if enough time has passed since the last one."""
-        now_s = time.monotonic()
-        if total != self._total or done < self._done:
-            self._began_s = now_s
-        self._done, self._total = done, total
-        times_longer = min(max((now_s - self._first_s) / _SELDOM_AFTER_S, 1.0), _MOST_SELDOM)
-        if now_s - self._shown_s < LOG_EVERY_S * times_longer:
-            return
-        from tqdm import tqdm
-
-        label = f"{self._label}, {stage}" if stage else self._label
-        line = _LOG_FORMAT if done >= _LEAST_SHARE * total else _LOG_FORMAT_BEFORE
-        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=line)
-        self._stream.write(f"{meter}\n")
-        self._stream.flush()
-        self._shown_s = now_s
-
-
-def of_this_process() -> ProgressFor:
-    """Return a display of progress on standard error."""
-    return on_stream(sys.stderr)
-
-
-def print_above(text: str) -> None:
-    """Print a text on standard output, above the line that shows progress where there is one."""
-    if not sys.stderr.isatty():
-        print(text, flush=True)
-        return
-    from tqdm import tqdm
-
-    tqdm.write(text, file=sys.stdout)
-    sys.stdout.flush()

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from toolkit import progress, registry
+from toolkit import registry
+from toolkit.cli import progress_display
 from toolkit.report.records import read_seeds
 
 Vislam = Callable[..., int]
@@ -19,7 +20,7 @@ QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10")
 def test_a_run_directory_over_seeds(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "LOG_EVERY_S", float("inf"))  # work that is soon done leaves no line
+    monkeypatch.setattr(progress_display, "LOG_EVERY_S", float("inf"))  # work that is soon done leaves no line
     assert vislam("compare", "drive", *QUICK, "--seeds", "3", "--seed", "1", "--workers", "1", "--out", "run") == 0
     messages = capsys.readouterr()
     assert messages.err == ""

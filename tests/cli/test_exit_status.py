@@ -306,7 +306,7 @@ def test_a_reader_that_goes_away_costs_no_results(
 
     monkeypatch.setattr("toolkit.cli._give_up_output", lambda: None)
     with monkeypatch.context() as patched:
-        patched.setattr("toolkit.progress.print_above", gone)
+        patched.setattr("toolkit.cli.progress_display.print_above", gone)
         assert vislam(*QUICK, "--out", "run") == 141
     with monkeypatch.context() as patched:
         patched.setattr("toolkit.report.card.card_text", gone)

@@ -2,7 +2,8 @@
 
 Reading order: arguments (what commands share, and how one is declared), settings_arguments (the options that change
 settings), then the commands about one thing in a file each: compare, evaluate, runs, recordings, gate, parts. Beside
-them completion, for shells. Here: how a command is run, and what becomes of errors, signals and its output.
+them progress_display, and completion for shells. Here: how a command is run, and what becomes of errors, signals and
+its output.
 """
 
 import errno

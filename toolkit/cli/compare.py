@@ -142,9 +142,9 @@ def compare(options: argparse.Namespace) -> int:
     """Run estimators on the same measurements of each SEQUENCE and compare them: a table here, and a run directory
     with report, metrics, trajectories, landmarks and figures.
     """
+    from toolkit.cli.progress_display import of_this_process, print_above
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.files.documents import to_line
-    from toolkit.progress import of_this_process, print_above
     from toolkit.report.comparison_table import requested_columns
     from toolkit.report.comparison_text import comparison_text
     from toolkit.report.prose import width_of_output

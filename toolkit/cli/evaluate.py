@@ -91,11 +91,11 @@ def evaluate(options: argparse.Namespace) -> int:
     """Score trajectory files against the truth, without a recording: every error with its alignment, time coverage,
     medians over runs, ranks and paired tests over sequences, failures counted. See docs/evaluate.md.
     """
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.evaluation.gathering import gather
     from toolkit.evaluation.scoring import Terms
     from toolkit.evaluation.standings import evaluate
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.progress import of_this_process
     from toolkit.report.evaluation_files import check_evaluation_directory, write_evaluation
 
     (ranked_by,), columns = _metrics((options.metric,)), _metrics(options.columns)

@@ -98,12 +98,12 @@ def baseline(options: argparse.Namespace) -> int:
         return _baseline_of_trajectories(options)
     if options.align or options.gap:
         raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.files.writing import check_writable, write_text
     from toolkit.gate.baseline import releases_in_a_name
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
-    from toolkit.progress import of_this_process
     from toolkit.report.manifest import made_here
 
     _check_seeds_are_options(options.set)
@@ -291,10 +291,10 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _check_of_estimators(options: argparse.Namespace) -> Check:
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline_file import check_releases, load_baseline
     from toolkit.gate.checking import How, check
-    from toolkit.progress import of_this_process
 
     if options.speed_against and options.skip_speed:
         raise UsageError("--speed-against and --skip-speed exclude each other")

@@ -124,8 +124,8 @@ def verify(options: argparse.Namespace) -> int:
     deterministic, on any number of threads; it changes nothing it was given; its numbers are finite, its
     covariances sound and honest; it survives every planted fault. What failed is named, with what to do.
     """
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.files.documents import to_text
-    from toolkit.progress import of_this_process
     from toolkit.report.prose import width_of_output
     from toolkit.report.verify_text import verification_document, verification_text
     from toolkit.verify.subject import subject_of

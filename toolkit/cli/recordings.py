@@ -45,8 +45,8 @@ def check_data(options: argparse.Namespace) -> int:
     """Find the faults of a recording from its data alone and say which of them are repaired when it is used. Fails
     on a fault that is not repaired.
     """
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.recording import audited_recording
-    from toolkit.progress import of_this_process
     from toolkit.report.comparison_text import audit_text
     from toolkit.report.prose import width_of_output
 
@@ -73,10 +73,10 @@ def card(options: argparse.Namespace) -> int:
     """Fit the noise of a recording's tracks and say what they are like: how errors along a track are correlated,
     how many are at odds with the motion, how vision's scale compares with the measured motion. No truth is used.
     """
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.recording import recording_card
     from toolkit.files.documents import to_text
     from toolkit.files.writing import check_writable, write_text
-    from toolkit.progress import of_this_process
     from toolkit.report.card import card_record, card_text
     from toolkit.report.prose import width_of_output
 
@@ -113,10 +113,10 @@ def tracks(options: argparse.Namespace) -> int:
     """
     import msgspec
 
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.datasets import load_images
     from toolkit.files.writing import check_parent
     from toolkit.frontend.stills import write_stills, write_video
-    from toolkit.progress import of_this_process
 
     frontend = requested_settings(options).frontend
     if options.topics is not None:
@@ -210,7 +210,7 @@ def simulate(options: argparse.Namespace) -> int:
 
 def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     """Render the images, with the time that is left, and say what was written."""
-    from toolkit.progress import of_this_process
+    from toolkit.cli.progress_display import of_this_process
     from toolkit.simulation.filming import Filming, check_filmable, film, pair_count, size_gb
 
     check_filmable(scenario, options.out)

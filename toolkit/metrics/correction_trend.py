@@ -18,8 +18,7 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
-from toolkit.models.corrections import Correction, CorrectionTest
-from toolkit.models.motion import PredictedStep, predicted_steps
+from toolkit.models.corrections import Correction, CorrectionTest, PredictedStep, predicted_steps
 from toolkit.models.state import Belief
 
 ORDER = 73

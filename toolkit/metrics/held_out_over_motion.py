@@ -15,7 +15,8 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import FEWEST_VIEWS, errors_left_out
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
-from toolkit.models.motion import belief_at, integrated, motion_model
+from toolkit.models.corrections import belief_at, integrated
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence
 
 ORDER = 61

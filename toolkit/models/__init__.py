@@ -8,6 +8,5 @@ belief, prediction), ``motion`` (what a motion model offers filters and graphs) 
 
 For a window that eliminates its landmarks: ``stereo_window``, ``reduced_vision``, ``window_solver``. From the tracks
 alone: ``camera_motion``. What moves against the motion: ``moving_tracks``. To judge an estimate:
-``motion.predicted_steps`` (its steps beside the measured motion) and ``corrections`` (tested against the covariance
-they take away).
+``corrections`` (its steps beside the measured motion, tested against the covariance that they removed).
 """

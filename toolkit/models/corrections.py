@@ -1,4 +1,4 @@
-"""Corrections of a state by measurements, tested against the covariance by which they reduced the state's.
+"""A trajectory beside the measured motion, and its corrections tested against the covariance that they removed.
 
 A consistent estimator's correction of the predicted state has the covariance of the prediction minus that of the
 answer, and is independent of earlier corrections: its estimates are a martingale (for innovations Mehra and Peschon
@@ -6,13 +6,22 @@ answer, and is independent of earlier corrections: its estimates are a martingal
 has as its covariance the sum of their reductions.
 """
 
+from collections import abc
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
 
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
-from toolkit.models.state import Belief
+from toolkit.measurements import Motion
+from toolkit.models.imu import ImuModel
+from toolkit.models.motion import Increment, MotionModel, motion_model
+from toolkit.models.state import Belief, Prediction
+from toolkit.models.twist import TwistModel
+from toolkit.sequence import Sequence
 
 # Directions in which a correction reduces the variance by less than this share are not tested: there rounding
 # dominates, and in smoothers relinearisation. Six tests wrongly rejected a sound IMU, all by directions with shares
@@ -55,3 +64,52 @@ class Correction:
 def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     """Test the correction of a belief by measurements against the reduction of its covariance."""
     return Correction.of(before, after).test(np.sqrt(np.diag(before.cov)))
+
+
+def integrated(
+    model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
+) -> abc.Sequence[Increment]:
+    """Return the motions between frames, each integrated about its own bias (6,), vectorised if the model allows it."""
+    if isinstance(model, TwistModel | ImuModel) and motions:
+        return model.integrate_each(motions, biases)
+    return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
+
+
+def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
+    """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
+    d = model.layout.size
+    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
+    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
+    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
+
+
+class PredictedStep(NamedTuple):
+    """A step between the rows ``start`` and ``end``: the state at its start, its length and the predicted motion.
+
+    The belief has no covariance, because that of the trajectory may have another layout.
+    """
+
+    start: int
+    end: int
+    belief: Belief
+    dt_s: float
+    prediction: Prediction
+
+
+def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
+    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames."""
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    intervals = list(_intervals(trajectory, sequence))
+    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
+    increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
+    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
+        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), increment.predict(belief))
+
+
+def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
+    """Yield the motions between neighbouring frames if the trajectory has both, with the rows of these."""
+    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
+    for before, packet in pairwise(sequence.packets()):
+        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
+        if start is not None and end is not None and packet.motion is not None:
+            yield start, end, packet.motion

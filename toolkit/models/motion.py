@@ -3,18 +3,15 @@
 A motion model integrates the measurements between two frames once, about a bias. A filter predicts from that increment
 (mean, F, Q), a smoother makes its factors from the same one. Each implementation is a file:
 :mod:`toolkit.models.twist`, :mod:`toolkit.models.imu` and, where nothing was measured,
-:mod:`toolkit.models.smooth_twist`. ``predicted_steps`` predicts each step of a given trajectory.
+:mod:`toolkit.models.smooth_twist`.
 """
 
-from collections import abc
-from collections.abc import Iterator, Mapping
-from itertools import pairwise
-from typing import NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import Protocol
 
 import gtsam
-import numpy as np
 
-from toolkit.estimate import Estimate, Trajectory
+from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.measurements import Motion, MotionNoise, Prior, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import EliminatedGraph, joint_cov
@@ -22,7 +19,6 @@ from toolkit.models.imu import ImuModel
 from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
-from toolkit.sequence import Sequence
 
 
 class Increment(Protocol):
@@ -93,15 +89,6 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     return ImuModel(noise, gravity_world)
 
 
-def integrated(
-    model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
-) -> abc.Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,), vectorised if the model allows it."""
-    if isinstance(model, TwistModel | ImuModel) and motions:
-        return model.integrate_each(motions, biases)
-    return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
-
-
 def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Array) -> Array:
     """Return the covariance (d, d) of state k, whose attitude is given, in the order and on the side of an Estimate.
 
@@ -115,48 +102,3 @@ def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Beli
     if motion is None:
         return belief
     return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
-
-
-def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
-    """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
-    d = model.layout.size
-    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
-    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
-
-
-class PredictedStep(NamedTuple):
-    """A step between the rows ``start`` and ``end``: the state at its start, its length and the predicted motion.
-
-    The belief has no covariance, because that of the trajectory may have another layout.
-    """
-
-    start: int
-    end: int
-    belief: Belief
-    dt_s: float
-    prediction: Prediction
-
-
-def layout_of(sequence: Sequence) -> Layout:
-    """Return the layout of the error state for a sequence's kind of motion."""
-    return motion_model(sequence.noise, sequence.gravity_world).layout
-
-
-def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
-    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames."""
-    model = motion_model(sequence.noise, sequence.gravity_world)
-    intervals = list(_intervals(trajectory, sequence))
-    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
-    increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
-    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
-        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), increment.predict(belief))
-
-
-def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
-    """Yield the motions between neighbouring frames if the trajectory has both, with the rows of these."""
-    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
-    for before, packet in pairwise(sequence.packets()):
-        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
-        if start is not None and end is not None and packet.motion is not None:
-            yield start, end, packet.motion

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from toolkit import progress
+from toolkit.cli import progress_display as progress
 
 
 class Terminal(io.StringIO):
