@@ -221,7 +221,7 @@ def _derived_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("camera_motion", "step_correlation"):
             patch.setattr(fault, name, _once(getattr(fault, name), _tracks))
-        for name in ("agreement", "alignment", "self_calibration"):
+        for name in ("agreement", "self_calibration"):
             patch.setattr(fault, name, _once(getattr(fault, name), Sequence.content_hash))
         patch.setattr(fault, "truth_clock", _once(fault.truth_clock, _tracks_and_truth))
         yield

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
-from toolkit.audit.alignment import TranslationFit, is_excluded, is_there, metres, way_gone
+from toolkit.audit.alignment import Position, is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence
 from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, se3, so3_exp
@@ -231,7 +231,7 @@ def test_what_slip_could_feign_is_no_place_of_the_camera(clean_recording: Make) 
     clean = clean_recording("drive")
     evidence = Evidence(clean)
     assert evidence.intervals is not None
-    exact = TranslationFit(Scalar(0.0, 0.0), np.zeros(3), 1e-12 * np.eye(3))
+    exact = Position(np.zeros(3), 1e-12 * np.eye(3))
     ahead, aside = (way_gone(clean, evidence.intervals, exact, way) for way in np.eye(3)[:2])
     assert ahead.error > 0.64  # the way of travel is not quite the x axis
     turning = np.abs(clean.motion.w_radps[:, 2]) > 0.3

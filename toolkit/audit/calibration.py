@@ -6,18 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from toolkit.audit.alignment import (
-    LARGEST_SCALE_ERROR,
     MOST_SIGMAS,
     SYSTEMATIC_RAD,
-    SYSTEMATIC_SCALE,
-    angle_of,
+    Position,
+    Turn,
+    VelocityFit,
     is_there,
     metres,
     share_of_way,
     turn_by_rotations,
-    turn_by_velocities,
 )
-from toolkit.audit.bundle import BASELINE, CENTRE, FOCAL, GYRO_BIAS, LATE, LEVER, TURN
+from toolkit.audit.bundle import BASELINE, CENTRE, FOCAL, GYRO_BIAS, LATE, TURN
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import (
     LEAST_INTERVALS,
@@ -29,7 +28,7 @@ from toolkit.audit.intervals import (
 )
 from toolkit.audit.one_step import errors_are_independent, own_one_step_px
 from toolkit.audit.robust import Scalar, median_error, slope
-from toolkit.audit.self_calibration import OFF_BY, RIGHT, RIGHT_SIGMAS, SelfCalibration, self_calibration
+from toolkit.audit.self_calibration import RIGHT, RIGHT_SIGMAS, SelfCalibration, self_calibration
 from toolkit.geometry import Array, BoolArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import MotionKind, Prior, StereoRig, is_measured
@@ -82,6 +81,12 @@ LIMITS: dict[MotionKind, Limits] = {
     ),
 }
 BESIDE = {"imu": "IMU", "twist": "odometry"}
+
+
+def _unfitted(kind: MotionKind) -> str:
+    """Say why there may be no self-calibration."""
+    unseen = f"no tracks are long enough to be compared with the {BESIDE[kind]}"
+    return f"{unseen}, or no calibration near the given one fits them"
 
 
 class Wrong(NamedTuple):
@@ -524,111 +529,71 @@ def _inverse_slope(measured: Array, seen: Array) -> float:
     return 1.0 / found if found > 0.0 else np.inf
 
 
-# Limits of an axis: so many standard errors (by the self-calibration, as many as for its other unknowns) beyond what
-# sound recordings at hand have (m). The velocities of cars are those of another point, or slip: 0.43 to 0.85 m along x
-# in all seven. With IMUs the regression is off by 0.06 m at most, a self-calibration by nothing.
-LEVER_SIGMAS, SYSTEMATIC_M, SYSTEMATIC_FITTED_M = 5.0, {"twist": 0.6, "imu": 0.05}, 0.015
+# Limits of an axis: so many standard errors beyond what sound recordings at hand have (m). The velocities of cars are
+# those of another point, or slip: 0.43 to 0.85 m along x in all seven.
+LEVER_SIGMAS, SYSTEMATIC_M = {"twist": 5.0, "imu": 4.0}, {"twist": 0.6, "imu": 0.015}
 # An axis along which the standard error of the position is larger than this (m) is not judged.
 LARGEST_ERROR_M = 0.25
 # Where only a camera farther off than this (m) would be found, the finding is undecided and says so.
 HIDDEN_M = {"twist": 1.2, "imu": 0.5}
-# The prior of the self-calibration is removed again, by the share of the information that comes from the data; the
-# share is no less than this.
-LEAST_BY_DATA = 1e-3
 # A position that a mistake in the file explains must be so far (m) from the given one. The second number (m) is the
 # systematic error that is added to the standard errors.
 LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
-class _Place(NamedTuple):
-    """Correction of the camera's position in the IMU frame, its standard errors, and its limits, (3,) m each.
-
-    ``slip`` names the mistake in writing the file that explains the correction, if there is one.
-    """
-
-    lacking_m: Array
-    error_m: Array
-    least_m: Array
-    slip: str = ""
-
-
 def lever_arm(evidence: Evidence) -> Symptom | Undecided | None:
-    """A camera at another position than the extrinsic says, or velocities of another point of the vehicle.
+    """Report the axes along which the camera is not at the position of the extrinsic.
 
     In a turn of rate w, a camera whose position is wrong by p moves by w x p more than expected, so that residuals
-    appear in turns only. The data do not show which of the two is wrong. With an IMU the self-calibration, which
-    follows points over seconds, is used where it finds a calibration near the given one. The regression of
-    `parts.alignment` over a few seconds has errors that last as long as these and that its standard errors do not
-    contain.
-
-    Report the axes along which the camera is not at the position of the extrinsic.
+    appear in turns only. The data do not show whether the camera is elsewhere or the velocities are of another point.
+    With an IMU the self-calibration decides, which follows points over seconds.
     """
     if evidence.intervals is None:
         return evidence.blind
-    found, kind = _place(evidence), evidence.sequence.motion_kind
-    if found is None or not (decidable := found.error_m < LARGEST_ERROR_M).any():
-        errors = "" if found is None else f" to {', '.join(f'{error:.1f}' for error in found.error_m)} m"
-        return Undecided(f"too little rotation: the camera's position along x, y and z is not known{errors}")
-    off = decidable & (np.abs(found.lacking_m) > found.least_m)
-    if not off.any() and not found.slip:
-        return _hidden(found, decidable, HIDDEN_M[kind])
+    found, kind, T_imu_cam = evidence.position, evidence.sequence.motion_kind, evidence.sequence.rig.T_imu_cam
+    if found is None:
+        return Undecided(f"the camera's position: {_unfitted(kind)}")
+    if not (decidable := found.error_m < LARGEST_ERROR_M).any():
+        errors = ", ".join(f"{error:.1f}" for error in found.error_m)
+        return Undecided(f"too little rotation: the camera's position along x, y and z is known to {errors} m only")
+    least_m = SYSTEMATIC_M[kind] + LEVER_SIGMAS[kind] * found.error_m
+    off, slip = decidable & (np.abs(found.lacking_m) > least_m), _slip(found, T_imu_cam) if kind == "imu" else ""
+    if not off.any() and not slip:
+        far = np.flatnonzero(decidable & (least_m > HIDDEN_M[kind])).tolist()
+        parts = ", ".join(f"{least_m[k]:.1f} m along {'xyz'[k]}" for k in far)
+        hidden = f"too little rotation: a camera that is off by less than {parts} would not show"
+        return Undecided(hidden) if far else None
     axes = np.flatnonzero(off if off.any() else decidable).tolist()
     axes_m = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
-    given = metres(evidence.sequence.rig.T_imu_cam[:3, 3])
     return Symptom.warning(
         count=len(axes),
         detail=(
-            f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} from {given}, its "
-            f"position in T_imu_cam{found.slip}"
+            f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} from "
+            f"{metres(T_imu_cam[:3, 3])}, its position in T_imu_cam{slip}"
         ),
         treatment=f"check the translation of T_imu_cam{other_point}",
     )
 
 
-def _hidden(found: _Place, decidable: BoolArray, most_m: float) -> Undecided | None:
-    """Return how far off the camera could be along the judged axes without being found, where that is far."""
-    far = np.flatnonzero(decidable & (found.least_m > most_m)).tolist()
-    if not far:
-        return None
-    parts = ", ".join(f"{found.least_m[k]:.1f} m along {'xyz'[k]}" for k in far)
-    return Undecided(f"too little rotation: a camera that is off by less than {parts} would not show")
-
-
-def _place(evidence: Evidence) -> _Place | None:
-    """Return the position by the self-calibration or, where there is none, by the regression."""
-    fitted, regressed = evidence.self_calibration, evidence.alignment
-    if fitted is not None:
-        by_data = np.maximum(1.0 - (fitted.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
-        error_m = fitted.error[LEVER] / np.sqrt(by_data)
-        slip = _slip(fitted.value[LEVER], fitted.cov[LEVER, LEVER], evidence.sequence.rig.T_imu_cam)
-        return _Place(
-            fitted.value[LEVER] / by_data, error_m, SYSTEMATIC_FITTED_M + LIMITS["imu"].sigmas * error_m, slip
-        )
-    if regressed is None:
-        return None
-    least_m = SYSTEMATIC_M[evidence.sequence.motion_kind] + LEVER_SIGMAS * regressed.lever_error_m
-    return _Place(regressed.lever_m, regressed.lever_error_m, least_m)
-
-
-def _slip(lacking_m: Array, cov_m2: Array, T_imu_cam: Array) -> str:
+def _slip(found: Position, T_imu_cam: Array) -> str:
     """Return in words the mistake in the translation that puts the camera where it was found; empty if none does."""
     given = T_imu_cam[:3, 3]
     meant = {"its sign were changed": -given, "it were that of the inverse": -T_imu_cam[:3, :3].T @ given}
-    likely = {how: place for how, place in meant.items() if _explains(place - given, lacking_m, cov_m2)}
+    likely = {how: place for how, place in meant.items() if _explains(place - given, found)}
     if not likely:
         return ""
-    how, place = min(likely.items(), key=lambda one: float(np.linalg.norm(one[1] - given - lacking_m)))
+    how, place = min(likely.items(), key=lambda one: float(np.linalg.norm(one[1] - given - found.lacking_m)))
     return f", as if {how}: {metres(place)}"
 
 
-def _explains(way_m: Array, lacking_m: Array, cov_m2: Array) -> bool:
+def _explains(way_m: Array, found: Position) -> bool:
     """Say whether the camera is at the end of a vector (3,) m from the given position, and not beside the vector."""
     if float(np.linalg.norm(way_m)) < LEAST_APART_M:
         return False
-    cov_m2 = cov_m2 + SLIP_M**2 * np.eye(3)
-    share = share_of_way(lacking_m, cov_m2, way_m)
-    beside = lacking_m - share.value * way_m
+    cov_m2 = found.cov_m2 + SLIP_M**2 * np.eye(3)
+    share = share_of_way(found.lacking_m, cov_m2, way_m)
+    beside = found.lacking_m - share.value * way_m
     return is_there(share) and float(beside @ np.linalg.solve(cov_m2, beside)) <= MOST_SIGMAS**2
 
 
@@ -703,19 +668,18 @@ def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> 
     if found is not None:
         doubt = doubtful(found, rig, kind) if kind == "imu" else None  # with odometry `steady_difference` reports it
         return _Calibration(wrong(found, rig, kind), "; ".join(filter(None, (doubt, hidden(found, kind)))) or None)
-    unseen = f"no tracks are long enough to be compared with the {BESIDE[kind]}"
-    return _Calibration([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
+    return _Calibration([], f"the intrinsics: {_unfitted(kind)}")
 
 
 def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
     """Judge the rotation of the camera by the motion from frame to frame, which does not determine the intrinsics."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
-    whole = None if evidence.alignment is None else evidence.alignment.by_velocities
-    turn = turn_by_rotations(intervals, rig.T_imu_cam) if whole is None else turn_by_velocities(whole)
+    by_velocities = evidence.velocity_fit
+    turn = turn_by_rotations(intervals, rig.T_imu_cam) if by_velocities is None else by_velocities.turn
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
         return _Calibration([], _undecided(float(least_rad.min()), kind == "twist"))
-    angle, error = angle_of(turn)
+    angle, error = turn.angle
     summary = (
         f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
         f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
@@ -737,85 +701,67 @@ def _is_off(ratio: Scalar, systematic: float) -> bool:
     return abs(ratio.value - 1.0) > RATIO_SIGMAS * ratio.error + systematic
 
 
-# Where only an error larger than this share would be found, the finding is undecided and says so.
-LARGEST_HIDDEN_SCALE = 0.08
+# Limit of the scale beyond chance (with an IMU, four standard errors), and the largest standard error with which it is
+# judged. Sound recordings have up to 0.044 +- 0.007 with the odometry of cars. Chosen with them in view.
+SYSTEMATIC_SCALE, LARGEST_SCALE_ERROR = {"twist": 0.03, "imu": 0.025}, 0.02
+# Where only an error larger than this share would be found, the finding is undecided and says so. With an IMU, only
+# vision determines the scale once the IMU's noise is large: the limit is about the drift of a stereo system with one.
+LARGEST_HIDDEN_SCALE = {"twist": 0.08, "imu": 0.01}
 # With odometry `steady_difference` reports a scale from chance on. Where chance is more than this share, the finding is
 # undecided: an error of 2 % in all disparities makes the errors on `drive` six times as large.
 LARGEST_CHANCE = 0.02
-# The same limit with an IMU, where only vision determines the scale over the times at which the IMU's noise is large.
-# It is about the drift of a stereo system with an IMU, one percent of the distance.
-LARGEST_HIDDEN_BESIDE_IMU = 0.01
 
 
 def vision_scale(evidence: Evidence) -> Symptom | Undecided | None:
-    """Steps of vision that are longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
+    """Report steps of vision longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
 
-    A relative error of all depths scales every step of the camera by the same factor. With odometry the velocities show
-    it, with an IMU the accelerations.
-
-    Compare the camera's translation with the measured one; a ratio beyond MOST_RATIO is a `disagreement`.
+    A relative error of all depths scales every step of the camera by the same factor. Odometry's velocities show it;
+    with an IMU it is the baseline of the self-calibration. A ratio beyond MOST_RATIO is a `disagreement`.
     """
     if evidence.intervals is None:
         return evidence.blind
-    kind, found = evidence.sequence.motion_kind, evidence.alignment
-    known = found is not None and found.scale.error <= LARGEST_SCALE_ERROR
-    least = np.inf if found is None else SYSTEMATIC_SCALE[kind] + found.scale_by_chance
-    if found is None or not known or abs(found.scale.value) < least:
-        return _unseen(evidence, least if known else np.inf)
+    if evidence.velocity_fit is not None:
+        return _scale_beside_odometry(evidence.velocity_fit)
+    return _scale_beside_imu(evidence.self_calibration)
+
+
+def _scale_beside_odometry(found: VelocityFit) -> Symptom | Undecided | None:
     scale, error = found.scale
-    if kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO:
-        return None  # reported as a disagreement
-    measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
-    if kind == "imu":
-        measured, causes = "IMU's", ": check K and the baseline"
-    return Symptom.warning(
-        count=1,
-        detail=(
-            f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
-            f"{'longer' if scale > 0.0 else 'shorter'} than the {measured}"
-        ),
-        treatment=f"disparities, baseline or focal length are wrong{causes}",
-    )
-
-
-def _unseen(evidence: Evidence, least: float) -> Undecided | None:
-    """Return the smallest error of the scale that would be found, where it is large.
-
-    With an IMU it is that of the self-calibration, where there is one, else that of the regression.
-    ``least`` is the limit of the regression's scale, infinite where the scale is not judged.
-    """
-    found, fitted = evidence.alignment, evidence.self_calibration
-    if fitted is not None:
-        hidden = hidden_baseline(fitted, "imu")
-        if hidden < LARGEST_HIDDEN_BESIDE_IMU:
-            return None
-        factor = float(np.exp(fitted.value[BASELINE]))
-        seen = (
-            f"tracks and IMU fit a baseline {factor:.3f} +- {factor * fitted.error[BASELINE]:.3f} times the given one"
-        )
-        return Undecided(f"too little change of velocity: {seen}, and less than {100.0 * hidden:.1f} % would not show")
-    if found is None:
-        return Undecided("too little change of velocity: the scale of vision against the samples is unknown")
-    scale, error = found.scale
-    if not np.isfinite(least):
-        share = 100.0 * (SYSTEMATIC_SCALE[evidence.sequence.motion_kind] + found.scale_by_chance)
-        known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would not show"
+    least = SYSTEMATIC_SCALE["twist"] + found.scale_by_chance
+    if error > LARGEST_SCALE_ERROR:
+        known = f"known to {100.0 * error:.0f} %, a fault of less than {100.0 * least:.0f} % would not show"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
-    if least + abs(scale) < LARGEST_HIDDEN_SCALE:
-        return _unseen_at_all(scale, error, found.scale_by_chance + abs(scale))
-    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
-    hidden = least + abs(scale)
-    return Undecided(
-        f"{known}, as in recordings without faults: a fault of less than {100.0 * hidden:.0f} % would not show"
-    )
+    if abs(scale) >= least:
+        cause = (
+            "disparities, baseline or focal length are wrong, or wheels: check K, the baseline and the samples' unit"
+        )
+        is_scale = 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO  # else reported as a disagreement
+        return Symptom.warning(1, _steps(found.scale, "odometry"), cause) if is_scale else None
+    off = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
+    hidden, by_chance = least + abs(scale), found.scale_by_chance + abs(scale)
+    if hidden >= LARGEST_HIDDEN_SCALE["twist"]:
+        sound = f"as in recordings without faults: a fault of less than {100.0 * hidden:.0f} % would not show"
+        return Undecided(f"{off}, {sound}")
+    within = f"within chance: a scale that is off by less than {100.0 * by_chance:.1f} % would not show"
+    return None if by_chance < LARGEST_CHANCE else Undecided(f"{off}, {within}")
 
 
-def _unseen_at_all(scale: float, error: float, hidden: float) -> Undecided | None:
-    """Return, with odometry, the scale below which not even `steady_difference` reports it, where it is large."""
-    if hidden < LARGEST_CHANCE:
-        return None
-    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, within chance"
-    return Undecided(f"{known}: a scale that is off by less than {100.0 * hidden:.1f} % would not show")
+def _scale_beside_imu(found: SelfCalibration | None) -> Symptom | Undecided | None:
+    if found is None:
+        return Undecided(f"the scale of vision: {_unfitted('imu')}")
+    factor, error = float(np.exp(found.value[BASELINE])), float(found.error[BASELINE])
+    if abs(found.value[BASELINE]) > SYSTEMATIC_SCALE["imu"] + LIMITS["imu"].sigmas * error:
+        cause = "disparities, baseline or focal length are wrong: check K and the baseline"
+        return Symptom.warning(1, _steps(Scalar(1.0 / factor - 1.0, error / factor), "IMU"), cause)
+    hidden = hidden_baseline(found, "imu")
+    seen = f"tracks and IMU fit a baseline {factor:.3f} +- {factor * error:.3f} times the given one"
+    unseen = f"too little change of velocity: {seen}, and less than {100.0 * hidden:.1f} % would not show"
+    return None if hidden < LARGEST_HIDDEN_SCALE["imu"] else Undecided(unseen)
+
+
+def _steps(scale: Scalar, measured: str) -> str:
+    size = f"vision's steps are {100.0 * abs(scale.value):.1f} +- {100.0 * scale.error:.1f} %"
+    return f"{size} {'longer' if scale.value > 0.0 else 'shorter'} than the {measured}'s"
 
 
 # Excess beyond chance (a share, rad) that tracks which drift from image to image cause in simulations without slip.
@@ -831,9 +777,10 @@ def steady_difference(evidence: Evidence) -> Symptom | None:
 
     Report differences of scale and direction that are beyond chance and below the limits of a fault.
     """
-    if evidence.intervals is None or evidence.sequence.motion_kind != "twist":
+    found = evidence.velocity_fit
+    if found is None:
         return None
-    differences = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
+    differences = [one for one in (_scale(evidence, found), _direction(evidence, found.turn)) if one is not None]
     if not differences:
         return None
     return Symptom.information(
@@ -846,31 +793,23 @@ def steady_difference(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _scale(evidence: Evidence) -> str | None:
-    found = evidence.alignment
-    if found is None or found.scale.error > LARGEST_SCALE_ERROR or found.by_velocities is None:
-        return None
+def _scale(evidence: Evidence, found: VelocityFit) -> str | None:
     scale, error = found.scale
     beyond = abs(scale) - found.scale_by_chance
-    if not 0.0 < beyond < SYSTEMATIC_SCALE["twist"] or not _exceeds_track_drift(evidence, beyond, SCALE_BY_TRACK_DRIFT):
+    if error > LARGEST_SCALE_ERROR or not 0.0 < beyond < SYSTEMATIC_SCALE["twist"]:
         return None
-    return (
-        f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
-        f"{'longer' if scale > 0.0 else 'shorter'} than the odometry's"
-    )
+    if not _exceeds_track_drift(evidence, beyond, SCALE_BY_TRACK_DRIFT):
+        return None
+    return _steps(found.scale, "odometry")
 
 
-def _direction(evidence: Evidence) -> str | None:
-    found = evidence.alignment
-    if found is None or found.by_velocities is None:
-        return None
-    turn = turn_by_velocities(found.by_velocities)
+def _direction(evidence: Evidence, turn: Turn) -> str | None:
     beyond_rad = float((np.abs(turn.rad) - turn.by_chance_rad).max())
     if not 0.0 < beyond_rad < SYSTEMATIC_RAD["twist"]:
         return None
     if not _exceeds_track_drift(evidence, beyond_rad, TURN_BY_TRACK_DRIFT_RAD):
         return None
-    angle, error = angle_of(turn)
+    angle, error = turn.angle
     return (
         f"the camera moves at an angle of {angle:.3f} +- {error:.3f} rad to the velocities, equivalent to "
         f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.alignment import alignment, chained, is_excluded, is_there, metres, way_gone
+from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.intervals import Intervals, interval_means
+from toolkit.audit.intervals import Intervals, chained, interval_means
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp, so3_log
@@ -302,7 +302,7 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConventi
     """Return the position (3,) m of a reading's camera, or its other one where turns show that, and doubt in words."""
     here, other = reading.T_imu_cam[:3, 3], reading.other_m
     turned = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=reading.T_imu_cam))
-    found = alignment(turned, evidence.camera_motion, intervals)
+    found = evidence.after(turned).position
     if found is None or np.linalg.norm(other - here) < NEAR_M:
         return here, ""
     share = way_gone(turned, intervals, found, other - here)
@@ -346,7 +346,7 @@ def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
 
     A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like a
     rigid transform, it puts the camera at p = -R_imu_cam t instead of t. Turns distinguish the two, because the
-    camera's velocity differs from the IMU's by w x p. The regression of `parts.alignment` over the whole recording
+    camera's velocity differs from the IMU's by w x p. The regression of `alignment` over the whole recording
     estimates the position, with the scale and the rotation of the camera as further unknowns. Where it lies between p
     and t decides.
 
@@ -354,7 +354,7 @@ def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
     """
     if evidence.intervals is None:
         return evidence.blind
-    if evidence.intervals.v_mps is None or evidence.alignment is None:
+    if evidence.velocity_fit is None:
         return None  # without velocities lever-arm estimates the position
     rig = evidence.sequence.rig
     rotation, given = rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3]
@@ -362,7 +362,7 @@ def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
     apart_m = float(np.linalg.norm(candidate - given))
     if apart_m == 0.0:
         return None
-    share = way_gone(evidence.sequence, evidence.intervals, evidence.alignment, candidate - given)
+    share = way_gone(evidence.sequence, evidence.intervals, evidence.velocity_fit.position, candidate - given)
     if is_excluded(share):
         return None
     where = (

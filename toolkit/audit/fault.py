@@ -5,12 +5,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-from toolkit.audit.alignment import IntegratedGravity, TranslationFit, alignment, integrated_gravity
+import numpy as np
+
+from toolkit.audit.alignment import IntegratedGravity, Position, VelocityFit, integrated_gravity, velocity_fit
 from toolkit.audit.clocks import TruthClock, truth_clock
 from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.one_step import Agreement, OneStep, agreement, one_step, step_correlation
 from toolkit.audit.robust import Scalar
 from toolkit.audit.self_calibration import SelfCalibration, self_calibration
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -133,9 +136,12 @@ class Evidence:
         return agreement(self.sequence, self.camera_motion)
 
     @cached_property
-    def alignment(self) -> TranslationFit | None:
-        """The scale of vision and the position of the camera; None without ``intervals``, or where undetermined."""
-        return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
+    def velocity_fit(self) -> VelocityFit | None:
+        """The camera's scale and pose by the velocities of odometry; None without ``intervals`` or velocities."""
+        if self.intervals is None or self.intervals.v_mps is None:
+            return None
+        step_s = float(np.median(np.diff(self.sequence.frames_t_ns))) / NS_PER_S
+        return velocity_fit(self.intervals, self.sequence.rig.T_imu_cam, step_s)
 
     @cached_property
     def self_calibration(self) -> SelfCalibration | None:
@@ -143,6 +149,12 @@ class Evidence:
         if self.intervals is None or self.sequence.motion_kind != "imu":
             return None
         return self_calibration(self.sequence, self.camera_motion, self.intervals)
+
+    @cached_property
+    def position(self) -> Position | None:
+        """The camera's position by odometry's velocities, or by the self-calibration with an IMU."""
+        found = self.self_calibration if self.sequence.motion_kind == "imu" else self.velocity_fit
+        return None if found is None else found.position
 
     @cached_property
     def integrated_gravity(self) -> IntegratedGravity:
@@ -167,7 +179,7 @@ class Evidence:
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
             known = ["camera_motion", "one_step", "step_correlation"]
             if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
-                known += ["intervals", "agreement", "alignment", "self_calibration", "integrated_gravity"]
+                known += ["intervals", "agreement", "velocity_fit", "self_calibration", "integrated_gravity"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

@@ -91,6 +91,14 @@ class Integral(NamedTuple):
         return np.asarray(self.up_to[row] + since_s * (self.values[row] + 0.5 * since_s * slope))
 
 
+def chained(step: Array) -> Array:
+    """Return the products (n + 1, d, d) of the first 0, 1, ... n matrices (n, d, d)."""
+    products = np.tile(np.eye(step.shape[1]), (len(step) + 1, 1, 1))
+    for k in range(len(step)):
+        products[k + 1] = products[k] @ step[k]
+    return products
+
+
 def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Array:
     """Return the mean (K - 1, d) over each interval between frames of linearly interpolated samples (S, d)."""
     return Integral.of(t_ns, values).means(frames_t_ns)

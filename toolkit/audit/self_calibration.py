@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from toolkit.audit.alignment import chained
+from toolkit.audit.alignment import Position
 from toolkit.audit.bundle import (
     COMMON,
     GYRO_BIAS,
+    LEVER,
     RIGHT_SHIFT,
     Calibration,
     ImuStrides,
@@ -24,7 +25,7 @@ from toolkit.audit.bundle import (
     reduce,
     twist_strides,
 )
-from toolkit.audit.intervals import Intervals, interval_means, moved_as_measured, moved_by
+from toolkit.audit.intervals import Intervals, chained, interval_means, moved_as_measured, moved_by
 from toolkit.audit.robust import LEVEL
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
@@ -60,6 +61,8 @@ STRAYED = 10.0
 # Prior standard deviations of the corrections: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. A result
 # beyond them is not accepted.
 OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3, 5.0, 0.1], [2, 2, 1, 3, 3, 1, 1, 3, 3, 1, 1])
+# Least share of the information on the camera's position that is taken to come from the data.
+LEAST_BY_DATA = 1e-3
 # The first unknowns are those of a rectified pair. The errors of the right image are fixed at zero, and estimated only
 # where one step from the converged calibration has them beyond so many standard errors. Few recordings need them; in
 # all others they would make focal length and baseline less certain.
@@ -70,6 +73,8 @@ RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}
 # cars (rad) replaces the bias of an accelerometer. A result is accepted up to the last two numbers, because the data
 # may not determine the position.
 POINT_M, PAIRING_S, SLIP_RAD, MOST_POINT_M, MOST_SLIP_RAD = 2.0, 0.06, 0.02, 10.0, 0.1
+# With an IMU the position is accepted up to this distance (m), far beyond its prior: `lever_arm` reports it.
+MOST_LEVER_M = 2.0
 
 
 def _beside_odometry(point_m: float, slip_rad: float) -> Array:
@@ -78,7 +83,10 @@ def _beside_odometry(point_m: float, slip_rad: float) -> Array:
 
 
 PRIOR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(POINT_M, SLIP_RAD)}
-NEAR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(MOST_POINT_M, MOST_SLIP_RAD)}
+NEAR: dict[MotionKind, Array] = {
+    "imu": np.concatenate([OFF_BY[:8], np.full(3, MOST_LEVER_M), OFF_BY[11:]]),
+    "twist": _beside_odometry(MOST_POINT_M, MOST_SLIP_RAD),
+}
 
 
 class SelfCalibration(NamedTuple):
@@ -96,6 +104,13 @@ class SelfCalibration(NamedTuple):
     def error(self) -> Array:
         """The standard errors (21,)."""
         return np.sqrt(np.diag(self.cov))
+
+    @property
+    def position(self) -> Position:
+        """The camera's position without its prior, by the share of the information that comes from the data."""
+        by_data = np.maximum(1.0 - (self.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
+        root = np.sqrt(by_data)
+        return Position(self.value[LEVER] / by_data, self.cov[LEVER, LEVER] / root / root[:, None])
 
 
 def self_calibration(
