@@ -1,4 +1,4 @@
-"""Comparisons within a program say what the command line says, from a script, a notebook or standard input."""
+"""Comparisons within a program say what the command line says, from a script or a notebook."""
 
 import os
 import subprocess
@@ -32,10 +32,10 @@ pytestmark = pytest.mark.usefixtures("audited_once")
 FRAMES = 20
 RECORDING = Path(__file__).parents[1] / "data" / "drive_small"
 
-# A comparison in two processes, and what a reader would do with it; the same program in three surroundings.
+# A comparison in two processes, and what a reader would do with it; the same program in two surroundings.
 PROGRAM = textwrap.dedent(f"""
     import toolkit
-    from toolkit.estimator import find
+    from toolkit.registry import find
 
     def build(setup):
         return find("dead-reckoning").load()(setup)
@@ -132,12 +132,8 @@ def test_a_table_has_the_columns_requested_in_their_order_by_key_or_name(result:
 def test_an_unknown_column_is_refused(result: Result) -> None:
     with pytest.raises(VislamError, match=r"no metric is called ate_se3; did you mean ate_se3_m\?"):
         result.table("ate_se3")
-
-
-@pytest.mark.parametrize("column", [3, ["ATE SE(3)"], None])
-def test_a_column_is_a_name(result: Result, column: Any) -> None:
-    with pytest.raises(SettingsError, match=r"a column is .*; give names, as in table\('ATE SE\(3\)', 'nis_mean'\)"):
-        result.table(column)
+    with pytest.raises(SettingsError, match="a column is an int; give names"):
+        result.table(3)  # type: ignore[arg-type]
 
 
 def test_mappings_of_a_result_are_looked_into_and_shown_like_any(result: Result) -> None:
@@ -159,24 +155,10 @@ def test_figures_that_there_are_not_are_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("source", "seed", "why"),
-    [
-        (3, 0, "a SEQUENCE is a path or a built-in name, not 3"),
-        ("drive", "a", "seed is 'a', expected a whole number"),
-        ("drive", -1, "seed is -1, expected a whole number"),
-    ],
-)
-def test_a_sequence_is_loaded_by_a_name_and_a_whole_number(source: Any, seed: Any, why: str) -> None:
-    with pytest.raises(DataError, match=why):
-        toolkit.load_sequence(source, seed=seed)
-
-
-def test_a_table_is_text_and_markdown(result: Result) -> None:
-    shown = result.table("ATE SE(3)")
-    assert " ATE SE(3) [mm] |" in shown._repr_markdown_()
-    assert "dead-reckoning" in str(shown)
-    assert repr(shown) == str(shown)
+def test_a_sequence_is_loaded_by_a_name_and_a_whole_number() -> None:
+    for source, seed, why in ((3, 0, "not 3"), ("drive", "a", "seed is 'a'"), ("drive", -1, "seed is -1")):
+        with pytest.raises(DataError, match=why):
+            toolkit.load_sequence(source, seed=seed)  # type: ignore[arg-type]
 
 
 def test_a_result_shows_its_table(result: Result, over: Result) -> None:
@@ -193,12 +175,6 @@ def test_figures_come_by_name(result: Result, over: Result) -> None:
     assert result.figures["top_all"] is result.figures["top_all"]
     with pytest.raises(VislamError, match=r"there is no figure 'top_batch'; there are top_all, .*top_ekf"):
         result.figures["top_batch"]
-
-
-def test_the_band_of_errors_over_seeds_is_named(over: Result) -> None:
-    figure = over.figures["errors_over_seeds"]
-    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
-    assert "quartiles (lines: medians)" in [text.get_text() for legend in legends for text in legend.get_texts()]
 
 
 def test_a_figure_is_drawn_without_those_that_come_after_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,45 +258,33 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
 @pytest.mark.parametrize(
     ("requested", "why"),
     [
-        ({"max_frames": 1}, "max_frames is 1"),
-        ({"workers": 0}, "workers is 0"),
-        ({"every": 0}, "every is 0"),
-        ({"from_s": -1.0}, "from -1 s to the end"),
-        ({"from_s": 5.0, "to_s": 2.0}, "from 5 s to 2 s"),
-        ({"to_s": float("nan")}, "from 0 s to nan s"),
-        ({"settings": "window"}, "settings is a str"),
+        ({"max_frames": 1}, "max_frames: expected integer >= 2"),
+        ({"max_frames": 2.5}, "max_frames: expected integer or null, got number"),
+        ({"max_frames": True}, "max_frames: expected integer"),
+        ({"every": np.array([2])}, "every: expected integer, got"),
+        ({"workers": 0}, "workers is 0; it is a number of processes, 1 to 1024"),
+        ({"workers": 2, "scheduler": "tcp://host:1"}, "scheduler and workers exclude each other"),
+        ({"from_s": -1.0}, "from_s: expected number >= 0"),
+        ({"from_s": 5.0, "to_s": 2.0}, "from 5 s to 2 s: a part begins and ends"),
+        ({"to_s": 10**400}, "to_s: number out of range"),
+        ({"seed": 1.0}, "seed: expected integer"),
+        ({"truth": 3}, "truth: expected string or null, got integer"),
+        ({"truth": "gt.tum", "seeds": 2}, "truth and seeds exclude each other"),
+        ({"trajectories": "est.tum"}, "trajectories: expected object, got string"),
+        ({"trajectories": {3: "est.tum"}}, "an int for a name, 3; give a text"),
         ({"estimators": []}, "there is nothing to compare"),
-        ({"estimators": [3]}, "estimators has an int, expected names"),
-        ({"estimators": 3}, "estimators has an int, expected names"),
-        ({"estimators": {"mine": find("ekf").load()}}, "functions build\\(setup\\) go by name into own"),
-        ({"own": [find("ekf").load()]}, "own is a list; give a dict, by name"),
-        ({"trajectories": "est.tum"}, "trajectories is a str; give a dict, by name"),
-        ({"max_frames": 2.5}, "max_frames is 2.5, expected a whole number"),
-        ({"every": 1.5}, "every is 1.5, expected a whole number"),
-        ({"workers": "2"}, "workers is '2', expected a whole number"),
-        ({"from_s": "1"}, "from_s is '1', expected a number"),
-        ({"to_s": None, "resume": "somewhere"}, "there is one seed: give seeds"),
-        ({"own": {"ekf": print}}, "own has a function called ekf, and so has estimators"),
-        ({"source": None}, "source is None; give one recording"),
-        ({"workers": 10**9}, "workers is 1000000000; it is a number of processes, 1 to 1024"),
-        ({"max_frames": True}, "max_frames is True, expected a whole number"),
-        ({"seed": 1.0}, "seed is 1.0, expected a whole number"),
-        ({"truth": 3}, "truth is an int; give a path"),
-        ({"trajectories": {"theirs": 3}}, r"trajectories\['theirs'\] is an int; give a path"),
-        ({"trajectories": {3: "est.tum"}}, "trajectories has an int for a name, 3; give a text"),
-        ({"seeds": 2, "resume": 3}, "resume is an int; give a path"),
-        ({"own": {"mine": 3}}, "own has 'mine': an int; give functions"),
-        ({"own": {"": print}}, "own has '': a builtin_function_or_method; give functions build"),
-        ({"settings": {3: 4}}, "settings has an int for a key, 3; settings have names"),
-        ({"settings": {"window.lag_s": 3.0}}, r"write \{'window': \{'lag_s': ...\}\}, or in TOML window.lag_s without"),
+        ({"estimators": [3]}, r"estimators\[0\]: expected string, got integer"),
+        ({"estimators": {"mine": find("ekf").load()}}, r"functions build\(setup\) go by name into own"),
         ({"estimators": "dead-reckoning,ekf"}, r"several names as a list: \['dead-reckoning', 'ekf'\]"),
-        ({"settings": {"window": {"lag_s": np.array([1.0, 2.0])}}}, "window.lag_s is a ndarray; give a number"),
-        ({"settings": {"noise": np.zeros(3)}}, "noise is a ndarray; give"),
-        ({"settings": {"estimators": {"ekf": np.zeros(3)}}}, "estimators.ekf is a ndarray; give"),
-        ({"scheduler": 5}, "scheduler is an int; give a text"),
-        ({"every": np.array([2])}, r"every is array\(\[2\]\), expected a whole number"),
-        ({"to_s": 10**400}, "to_s is 10+, expected a number"),
+        ({"own": [find("ekf").load()]}, "own is a list; give a dict, by name"),
+        ({"own": {"mine": 3}}, "own has 'mine': an int; give functions"),
+        ({"own": {"ekf": print}}, "own has a function called ekf, and so has estimators"),
         ({"source": ["drive", "flight"]}, "source is a list; give one recording"),
+        ({"resume": "somewhere"}, "there is one seed: give seeds"),
+        ({"settings": "window.lag_s=3"}, "settings is a str"),
+        ({"settings": {3: 4}}, "an int for a name, 3; give a text"),
+        ({"settings": {"window.lag_s": 3.0}}, r"write \{'window': \{'lag_s': ...\}\}, or in TOML window.lag_s without"),
+        ({"settings": {"window": {"lag_s": np.array([1.0, 2.0])}}}, "window.lag_s is a ndarray; give a number"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_before_anything_runs(
@@ -382,10 +346,6 @@ def as_script(folder: Path) -> str:
     return surrounded(["unguarded.py"], None, folder)
 
 
-def from_standard_input(folder: Path) -> str:
-    return surrounded(["-"], PROGRAM, folder)
-
-
 def in_a_notebook(folder: Path) -> str:
     """Run it as a kernel does: each statement executed in the namespace of a main module without a file."""
     kernel = textwrap.dedent("""
@@ -397,7 +357,7 @@ def in_a_notebook(folder: Path) -> str:
     return surrounded(["-c", kernel], PROGRAM, folder)
 
 
-@pytest.mark.parametrize("run", [as_script, from_standard_input, in_a_notebook])
+@pytest.mark.parametrize("run", [as_script, in_a_notebook])
 def test_it_runs_in_processes_from_anywhere_and_once(tmp_path: Path, run: Callable[[Path], str]) -> None:
     """No guard around the main program, no file to import again: and what the program prints, it prints once."""
     reported = run(tmp_path)

@@ -1,7 +1,9 @@
 """Settings: documented key by key, read from TOML and the command line, wrong ones answered with the nearest."""
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,10 +17,15 @@ from toolkit.settings import (
     Settings,
     SettingsError,
     as_values,
+    assigned,
     describe,
     settings_of,
-    with_assignments,
+    with_changes,
 )
+
+
+def _with(given: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    return with_changes(given, dict(map(assigned, assignments)))
 
 
 def test_every_setting_is_described_with_its_default() -> None:
@@ -75,7 +82,7 @@ def test_a_wrong_setting_is_refused_in_one_line_that_names_it(given: dict[str, o
 )
 def test_a_setting_of_an_earlier_version_is_answered_with_what_there_is_now(key: str, now: str) -> None:
     with pytest.raises(SettingsError, match=f"there is no setting {key}: .*{now}"):
-        settings_of(with_assignments({}, (f"{key}=true",)), "--set")
+        settings_of(_with({}, (f"{key}=true",)), "--set")
 
 
 @pytest.mark.parametrize("key", ["track_weight", "motion_scale"])
@@ -89,14 +96,14 @@ def test_a_noise_is_measured_or_a_number_within_its_range(key: str, value: objec
 
 def test_assignments_take_values_as_toml_writes_them_and_bare_words() -> None:
     given = {"window": {"lag_s": 1.0}}
-    merged = with_assignments(given, ("window.landmarks=7", "start=truth", "noise.pixel_sigma_px=0.7"))
+    merged = _with(given, ("window.landmarks=7", "start=truth", "noise.pixel_sigma_px=0.7"))
     assert given == {"window": {"lag_s": 1.0}}
     read = settings_of(merged, "--set")
     assert (read.window.lag_s, read.window.landmarks, read.start, read.noise.pixel_sigma_px) == (1.0, 7, "truth", 0.7)
 
 
 def test_the_word_none_is_no_value_where_a_setting_may_have_none() -> None:
-    read = settings_of(with_assignments({}, ("outliers.filter_huber=none", "outliers.policy=none")), "--set")
+    read = settings_of(_with({}, ("outliers.filter_huber=none", "outliers.policy=none")), "--set")
     assert (read.outliers.policy, read.outliers.filter_huber) == ("none", None)
     assert settings_of({"window": {"lag_s": "none"}}, "run.toml") == DEFAULTS
     with pytest.raises(SettingsError, match="expected integer, got string"):
@@ -105,7 +112,7 @@ def test_the_word_none_is_no_value_where_a_setting_may_have_none() -> None:
 
 def test_single_values_hold_on_top_of_a_policy_in_whatever_order_they_are_named() -> None:
     both = ("outliers.gate_probability=0.9", "outliers.policy=gate")
-    one, other = (settings_of(with_assignments({}, order), "--set").outliers for order in (both, both[::-1]))
+    one, other = (settings_of(_with({}, order), "--set").outliers for order in (both, both[::-1]))
     assert one == other
     assert (one.policy, one.gate_probability, one.joint_huber) == ("gate", 0.9, None)
 
@@ -113,7 +120,7 @@ def test_single_values_hold_on_top_of_a_policy_in_whatever_order_they_are_named(
 @pytest.mark.parametrize("text", ["window.lag_s", "=3", "start.early=3"])
 def test_an_assignment_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(SettingsError):
-        settings_of(with_assignments({"start": "truth"}, (text,)), "--set")
+        settings_of(_with({"start": "truth"}, (text,)), "--set")
 
 
 def test_a_file_that_is_not_toml_is_refused_with_its_place(tmp_path: Path) -> None:
@@ -167,7 +174,7 @@ def test_the_page_documents_every_setting_as_it_is() -> None:
 )
 def test_a_value_of_another_type_is_shown_with_the_unit_it_should_be_in(assignment: str, why: str) -> None:
     with pytest.raises(SettingsError) as raised:
-        settings_of(with_assignments({}, [assignment]), "the command line")
+        settings_of(_with({}, [assignment]), "the command line")
     assert str(raised.value) == f"the command line: {why}"
 
 
@@ -175,4 +182,4 @@ def test_a_default_is_shown_as_it_can_be_written() -> None:
     switches = {one.key: one.default for one in describe() if one.default in ("true", "false")}
     assert {"noise.bridge_gaps", "metrics.bound"} <= switches.keys()
     for key, default in switches.items():
-        assert settings_of(with_assignments({}, [f"{key}={default}"]), "here") == Settings()
+        assert settings_of(_with({}, [f"{key}={default}"]), "here") == Settings()

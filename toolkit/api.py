@@ -10,25 +10,23 @@
     result.metrics["batch", "final"]      # every metric of one line of the table
 """
 
-import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from toolkit.errors import VislamError, did_you_mean, type_of
 from toolkit.estimate import Output, Run
 from toolkit.estimator import Build
-from toolkit.experiment import Comparison, Plan, Record
+from toolkit.experiment import Comparison, Record
 from toolkit.experiment import run as run_plan
-from toolkit.experiment.configuration import Configuration, Request
-from toolkit.experiment.recording import Part
+from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
 from toolkit.progress import silent
-from toolkit.registry import defaults, find_all
+from toolkit.registry import find_all
 from toolkit.report.comparison_table import comparison_table, requested_columns
 from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
@@ -39,9 +37,18 @@ if TYPE_CHECKING:
 
     from toolkit.report.figures import FigureChoice, FigureFormat
 
-Named = TypeVar("Named")
 Source = str | Path | Sequence
 Names = str | Iterable[str]
+
+
+class _Run(Struct, frozen=True):
+    """How a comparison is run, beside what is compared: seeds, processes, and where outcomes are kept."""
+
+    seed: Annotated[int, Meta(ge=0)] | None = None
+    seeds: Annotated[int, Meta(ge=1)] | None = None
+    workers: int | None = None
+    scheduler: str | None = None
+    resume: str | None = None
 
 
 def compare(  # noqa: PLR0913 - keyword arguments that all have a default
@@ -74,116 +81,72 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     directory in which every run over seeds is kept as it ends, and found by the next comparison of it.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
-    trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
-    used, OutputError where what is to be kept cannot be written.
+    trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,
+    ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
-    named = (() if own else defaults()) if estimators is None else _names("estimators", estimators)
-    plan = Plan(
-        sources=(_source(source),),
-        estimators=named,
-        own=_own_beside(named, own),
-        settings=_with_seeds(settings, None if seed is None else _whole("seed", seed), seeds),
-        truth=None if truth is None else _path("truth", truth),
-        trajectories=_paths("trajectories", trajectories),
-        keep=frozenset(_names("keep", keep)),
-        max_frames=None if max_frames is None else _whole("max_frames", max_frames),
-        part=Part(_number("from_s", from_s), None if to_s is None else _number("to_s", to_s), _whole("every", every)),
-        workers=None if workers is None else _whole("workers", workers),
-        scheduler=None if scheduler is None else _text("scheduler", scheduler),
+    if not isinstance(source, str | Path | Sequence):
+        raise SettingsError(f"source is {type_of(source)}; give one recording: a path, a built-in name, a Sequence")
+    given = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s, "to_s": to_s}
+    given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", keep), "every": every}
+    request = record_of(Request, _plain({key: value for key, value in given.items() if value is not None}), "")
+    how = {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
+    run = record_of(_Run, _plain(how), "")
+    plan = plan_of(
+        Configuration(request, _with_seeds(settings, run)),
+        (source if isinstance(source, Sequence) else str(source),),
+        _checked_own(own, request.estimators or ()),
+        run.workers,
+        run.scheduler,
     )
-    if resume is not None and plan.settings.seeds == 1:
+    if run.resume is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
-    return Result(run_plan(plan, silent, () if resume is None else (_path("resume", resume),))[0])
+    return Result(run_plan(plan, silent, () if run.resume is None else (Path(run.resume),))[0])
 
 
-def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapping[str, Build]:
-    own = _by_name("own", given)
-    for name, build in own.items():
-        if not name or not callable(build):
+def _names(what: str, given: Names | None) -> Any:
+    """Return names as a tuple; what is not one or several is left to be refused by its type."""
+    if isinstance(given, str) and "," in given:
+        raise SettingsError(f"{what} is {given!r}; give several names as a list: {given.split(',')}")
+    if isinstance(given, str):
+        return (given,)
+    if isinstance(given, Mapping) and any(map(callable, given.values())):
+        raise SettingsError(f"{what} is {type_of(given)}; functions build(setup) go by name into own")
+    return tuple(given) if isinstance(given, Iterable) else given
+
+
+def _checked_own(own: Mapping[str, Build] | None, named: Iterable[str]) -> Mapping[str, Build] | None:
+    if own is not None and not isinstance(own, Mapping):
+        raise SettingsError(f"own is {type_of(own)}; give a dict, by name")
+    for name, build in (own or {}).items():
+        if not isinstance(name, str) or not name or not callable(build):
             raise SettingsError(f"own has {name!r}: {type_of(build)}; give functions build(setup), each by a name")
-    both = sorted(set(find_all(named)) & set(own))
+    both = sorted(set(find_all(named)) & set(own)) if own else []
     if both:
         raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
     return own
 
 
-def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
+def _with_seeds(settings: Settings | Mapping[str, Any], run: _Run) -> Settings:
     if not isinstance(settings, Settings | Mapping):
         raise SettingsError(f"settings is {type_of(settings)}; give nested values, as {{'seeds': 3}}")
-    values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
-    given = {"first_seed": seed, "seeds": seeds}
-    return settings_of(_plain(values | {key: value for key, value in given.items() if value is not None}), "settings")
+    values = as_values(settings) if isinstance(settings, Settings) else _plain(settings)
+    given = {"first_seed": run.seed, "seeds": run.seeds}
+    return settings_of({**values, **{key: value for key, value in given.items() if value is not None}}, "settings")
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested values with Python's numbers in the place of NumPy's."""
-    strange = [key for key in values if not isinstance(key, str)]
-    if strange:
-        raise SettingsError(f"settings has {type_of(strange[0])} for a key, {strange[0]!r}; settings have names")
-    return {
-        key: _plain(value) if isinstance(value, Mapping) else value.item() if isinstance(value, np.generic) else value
-        for key, value in values.items()
-    }
+def _plain(values: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return nested values with Python's numbers in the place of NumPy's and paths as texts."""
+    if strange := [key for key in values if not isinstance(key, str)]:
+        raise SettingsError(f"there is {type_of(strange[0])} for a name, {strange[0]!r}; give a text")
+    return {key: _plain_value(value) for key, value in values.items()}
 
 
-def _source(given: Source) -> str | Sequence:
-    if isinstance(given, str | Path | Sequence):
-        return given if isinstance(given, Sequence) else str(given)
-    raise SettingsError(f"source is {type_of(given)}; give one recording: a path, a built-in name, a Sequence")
-
-
-def _names(what: str, given: Names) -> tuple[str, ...]:
-    if isinstance(given, str):
-        if "," in given:
-            raise SettingsError(f"{what} is {given!r}; give several names as a list: {given.split(',')}")
-        return (given,)
-    functions = isinstance(given, Mapping) and any(map(callable, given.values()))
-    listed = isinstance(given, Iterable) and not functions
-    names: tuple[Any, ...] = tuple(given) if listed else (given,)
-    strange = [one for one in names if not isinstance(one, str)]
-    if strange:
-        otherwise = "; functions build(setup) go by name into own" if what == "estimators" else ""
-        raise SettingsError(f"{what} has {type_of(strange[0])}, expected names{otherwise}")
-    return names
-
-
-def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named]:
-    if given is not None and not isinstance(given, Mapping):
-        raise SettingsError(f"{what} is {type_of(given)}; give a dict, by name")
-    strange = [name for name in given or {} if not isinstance(name, str)]
-    if strange:
-        raise SettingsError(f"{what} has {type_of(strange[0])} for a name, {strange[0]!r}; give a text")
-    return given or {}
-
-
-def _text(what: str, given: str) -> str:
-    if isinstance(given, str):
-        return given
-    raise SettingsError(f"{what} is {type_of(given)}; give a text")
-
-
-def _path(what: str, given: str | Path) -> Path:
-    if isinstance(given, str | Path):
-        return Path(given)
-    raise SettingsError(f"{what} is {type_of(given)}; give a path")
-
-
-def _paths(what: str, given: Mapping[str, str | Path] | None) -> dict[str, Path]:
-    return {name: _path(f"{what}[{name!r}]", file) for name, file in _by_name(what, given).items()}
-
-
-def _number(what: str, given: float) -> float:
-    try:
-        return float(operator.truediv(given, 1.0))
-    except (TypeError, OverflowError) as error:
-        raise SettingsError(f"{what} is {given!r}, expected a number") from error
-
-
-def _whole(what: str, given: int) -> int:
-    if not isinstance(given, bool):
-        with suppress(TypeError):
-            return operator.index(given)
-    raise SettingsError(f"{what} is {given!r}, expected a whole number")
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _plain(value)
+    if isinstance(value, Path):
+        return str(value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,7 +173,15 @@ class Result:
     @cached_property
     def metrics(self) -> Mapping[tuple[str, Output], Mapping[str, float | None]]:
         """Every metric by estimator and output: the value of the run, or the mean over the seeds whose runs are ok."""
-        return _Metrics({(row.estimator, row.output): _Values(row.value) for row in self.comparison.rows})
+        from toolkit.metrics import describe
+
+        keys = describe()
+        return _Metrics(
+            {
+                (row.estimator, row.output): _Values((key, row.value(key)) for key in keys)
+                for row in self.comparison.rows
+            }
+        )
 
     @property
     def runs(self) -> Mapping[str, Run]:
@@ -234,10 +205,11 @@ class Result:
         for what, value, known in (("figures", figures, FigureChoice), ("figure_format", figure_format, FigureFormat)):
             if value not in get_args(known):
                 raise SettingsError(f"{what} is {value!r}; there are {', '.join(get_args(known))}")
-        target = _path("directory", directory)
+        if not isinstance(directory, str | Path):
+            raise SettingsError(f"directory is {type_of(directory)}; give a path")
         requested = Configuration(Request(), self.comparison.settings)
-        write_run(self.comparison, target, MadeBy("toolkit.compare", requested, figure_format, figures))
-        return target
+        write_run(self.comparison, Path(directory), MadeBy("toolkit.compare", requested, figure_format, figures))
+        return Path(directory)
 
     def __repr__(self) -> str:
         seeds = f", {len(self.comparison.seeds)} seeds" if self.comparison.over_seeds else ""
@@ -269,27 +241,18 @@ class _NotThereError(VislamError, KeyError):
     __str__ = Exception.__str__  # a KeyError's would put it in quotes
 
 
-class _Values(Mapping[str, float | None]):
-    """The metrics of one line by key."""
+class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):
+    """Metrics by estimator and output; a line that is not there is answered with those that are."""
 
-    def __init__(self, value_of: Callable[[str], float | None]) -> None:
-        from toolkit.metrics import describe
+    def __missing__(self, key: object) -> Mapping[str, float | None]:
+        raise _NotThereError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")
 
-        self._value_of, self._keys = value_of, describe()
 
-    def __getitem__(self, key: str) -> float | None:
-        if key not in self._keys:
-            raise _NotThereError(f"no metric is called {key}{did_you_mean(str(key), list(self._keys))}")
-        return self._value_of(key)
+class _Values(dict[str, float | None]):
+    """The metrics of one line by key; one that is not there is answered with the nearest."""
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._keys)
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
+    def __missing__(self, key: object) -> float | None:
+        raise _NotThereError(f"no metric is called {key}{did_you_mean(str(key), list(self))}")
 
 
 class _Figures(Mapping[str, "Figure"]):
@@ -302,37 +265,20 @@ class _Figures(Mapping[str, "Figure"]):
         self._drawn: dict[str, Figure] = {}
 
     def __getitem__(self, name: str) -> "Figure":
-        while name not in self._drawn and self._draw_next():
-            pass
-        if name not in self._drawn:
-            raise _NotThereError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
+        while name not in self._drawn:
+            figure = next(self._coming, None)
+            if figure is None:
+                raise _NotThereError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
+            self._drawn[figure.name] = figure.figure
         return self._drawn[name]
 
     def __iter__(self) -> Iterator[str]:
-        while self._draw_next():
-            pass
+        for figure in self._coming:
+            self._drawn[figure.name] = figure.figure
         return iter(self._drawn)
 
     def __len__(self) -> int:
         return len(list(iter(self)))
 
-    def __contains__(self, name: object) -> bool:
-        return name in list(iter(self))
-
     def __repr__(self) -> str:
         return f"<figures: {', '.join(self)}>"
-
-    def _draw_next(self) -> bool:
-        """Draw one more; return False where there is none."""
-        figure = next(self._coming, None)
-        if figure is None:
-            return False
-        self._drawn[figure.name] = figure.figure
-        return True
-
-
-class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):
-    """Metrics by estimator and output; a line that is not there is answered with those that are."""
-
-    def __missing__(self, key: object) -> Mapping[str, float | None]:
-        raise _NotThereError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")

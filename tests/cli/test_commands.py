@@ -1,58 +1,124 @@
-"""What the subcommands do when all is well."""
+"""What the subcommands do when all is well: what they write, where, and what they print."""
 
 import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from toolkit import audit
+from toolkit import audit, registry
 from toolkit.audit import Audit, Finding
+from toolkit.cli import progress_display
 from toolkit.experiment import recording
-from toolkit.report.records import read_metrics
+from toolkit.report.records import read_metrics, read_seeds
 from toolkit.report.run_directory import unique_names
 
 Vislam = Callable[..., int]
+Captured = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
 # Nobody looks at the figures here: drawing them takes as long as all else.
-DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
+QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
 
 
-def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:
-    assert vislam("compare", "drive", "drive-imu", "drive", *DEAD_RECKONING, "--out", "all") == 0
+def payload_of(page: Path) -> list[dict[str, Any]]:
+    text = page.read_text(encoding="utf-8")
+    (found,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', text, flags=re.S)
+    cases: list[dict[str, Any]] = json.loads(found)["cases"]
+    return cases
+
+
+def test_several_sequences_get_a_directory_each_and_take_the_place_of_an_earlier_run(vislam: Vislam) -> None:
+    for _ in range(2):
+        assert vislam("compare", "drive", "drive-imu", "drive", *QUICK, "--out", "all") == 0
     assert sorted(path.name for path in Path("all").iterdir()) == ["drive", "drive-2", "drive-imu"]
     for path in Path("all").iterdir():
         assert read_metrics(path / "metrics.json").runs
-
-
-def test_several_sequences_take_the_place_of_an_earlier_run_of_theirs(vislam: Vislam) -> None:
-    for _ in range(2):
-        assert vislam("compare", "drive", "drive-imu", *DEAD_RECKONING, "--out", "all") == 0
     Path("file").touch()
-    assert vislam("compare", "drive", "drive-imu", *DEAD_RECKONING, "--out", "file") == 4
+    assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "file") == 4
 
 
 def test_results_go_to_a_new_directory_each_time(vislam: Vislam) -> None:
     for _ in range(2):
-        assert vislam("compare", "drive", *DEAD_RECKONING) == 0
+        assert vislam("compare", "drive", *QUICK) == 0
     assert len(list(Path("runs").iterdir())) == 2
 
 
-def test_the_command_is_in_the_manifest(vislam: Vislam) -> None:
-    vislam("compare", "drive", *DEAD_RECKONING, "--out", "with space", "--seed", "2")
+def test_the_command_and_a_start_from_the_truth_are_labelled(vislam: Vislam, capsys: Captured) -> None:
+    assert vislam("compare", "drive", *QUICK, "--start", "truth", "--out", "with space", "--seed", "2") == 0
     manifest = json.loads(Path("with space/manifest.json").read_text())
     assert manifest["command"].endswith("--out 'with space' --seed 2")
     assert manifest["seeds"] == {"sequence": 2}
-
-
-def test_a_start_from_the_truth_is_labelled(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
-    assert vislam("compare", "drive", *DEAD_RECKONING, "--start", "truth", "--out", "run") == 0
     assert "started from the truth" in capsys.readouterr().out
 
 
-def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_prints_the_document_and_quiet_nothing(vislam: Vislam, capsys: Captured) -> None:
+    assert vislam("compare", "drive", *QUICK, "--json", "--out", "run") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert json.loads(line) == json.loads(Path("run/metrics.json").read_text())
+    assert vislam("compare", "drive", *QUICK, "--quiet", "--out", "run") == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_a_run_directory_over_seeds(vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_display, "LOG_EVERY_S", float("inf"))  # work that is soon done leaves no line
+    words = ("--estimators", "dead-reckoning", "--max-frames", "10", "--seeds", "3", "--seed", "1", "--workers", "1")
+    assert vislam("compare", "drive", *words, "--out", "run") == 0
+    messages = capsys.readouterr()
+    assert messages.err == ""
+    assert "results: run;" in messages.out
+    document = read_seeds(Path("run/seeds.json"))
+    assert document.seeds == (1, 2, 3)
+    assert len(set(document.hashes)) == 3
+    manifest = json.loads(Path("run/manifest.json").read_text())
+    assert manifest["seeds"] == {"sequence": 1, "count": 3}
+    assert manifest["sequence"]["hash"] == document.hashes[0]
+    figures = sorted(path.name for path in Path("run/figures").iterdir())
+    assert figures == ["errors_over_seeds.png", "nees_over_seeds.png"]
+    assert all(name in Path("run/report.md").read_text() for name in figures)
+
+
+def test_the_table_has_the_change_of_each_rung_once(
+    vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lowest = registry.ladder()[:2]
+    monkeypatch.setattr(registry, "ladder", lambda: lowest)
+    words = ("--estimators", "ladder", "--max-frames", "10", "--workers", "1", "--figures", "none", "--out", "run")
+    assert vislam("compare", "drive", *words) == 0
+    table, report = capsys.readouterr().out.partition("notes:")[0], Path("run/report.md").read_text()
+    for entry in lowest:
+        assert table.count(entry.change()) == 1
+        assert re.search(rf"^- {entry.name} +{re.escape(entry.change())}$", report, flags=re.MULTILINE)
+
+
+def test_the_page_goes_into_the_run_directory(vislam: Vislam, short_run: Path, capsys: Captured) -> None:
+    capsys.readouterr()
+    assert vislam("report", "run") == 0
+    assert capsys.readouterr().out == "report: run/report.html\n"
+    assert [case["title"] for case in payload_of(short_run / "report.html")] == ["drive"]
+    assert vislam("compare", "drive", *QUICK, "--out", "run") == 0  # the run directory is still one of ours
+    (short_run / "report.json").unlink()  # as of an earlier version
+    assert vislam("report", "run") == 3
+    assert "repeat it: vislam compare drive" in capsys.readouterr().err
+
+
+def test_several_runs_and_runs_over_seeds_make_one_page_beside_them(vislam: Vislam) -> None:
+    assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "all") == 0
+    assert vislam("report", "all/drive", "all/drive-imu", "all/drive") == 0
+    titles = [case["title"] for case in payload_of(Path("report.html"))]
+    assert titles == ["drive (all/drive)", "drive-imu", "drive (all/drive)"]
+    assert vislam("report", "all") == 0
+    assert [case["title"] for case in payload_of(Path("all/report.html"))] == ["drive", "drive-imu"]
+    assert vislam("compare", "drive", *QUICK, "--seeds", "2", "--out", "seeds") == 0
+    assert vislam("report", "seeds", "all/drive", "--out", "pages/both.html") == 0
+    assert [case["kind"] for case in payload_of(Path("pages/both.html"))] == ["seeds", "run"]
+    Path("all/drive/manifest.json").unlink()  # nothing is left out in silence
+    assert vislam("report", "all") == 3
+
+
+def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: Captured) -> None:
     assert vislam("list") == 0
     counts = re.findall(r"^ *(\d+) (\w+)", capsys.readouterr().out, flags=re.MULTILINE)
     listed = {kind: (vislam("list", kind), capsys.readouterr().out)[1] for _, kind in counts}
@@ -64,26 +130,15 @@ def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: pyt
         assert {*some} <= {line.split()[0] for line in listed[kind].splitlines()}
 
 
-def test_list_answers_an_unknown_kind_with_those_there_are(vislam: Vislam, one_line: Callable[[], str]) -> None:
-    assert vislam("list", "cameras") == 2
-    assert "estimators, metrics, faults" in one_line()
-
-
 def test_a_simulated_recording_can_be_compared(vislam: Vislam) -> None:
     assert vislam("simulate", "flight", "--out", "recordings/flight", "--seed", "3", "--duration", "2") == 0
     assert vislam("check-data", "recordings/flight") == 0
-    assert vislam("compare", "recordings/flight", *DEAD_RECKONING, "--out", "run") == 0
+    assert vislam("compare", "recordings/flight", *QUICK, "--out", "run") == 0
 
 
 @pytest.mark.parametrize(("repaired", "blocking", "status"), [(True, False, 0), (False, True, 1), (False, False, 0)])
 def test_check_data_fails_on_a_fault_that_stays(
-    vislam: Vislam,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    repaired: bool,
-    blocking: bool,
-    status: int,
+    vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch, *, repaired: bool, blocking: bool, status: int
 ) -> None:
     finding = Finding("time-gap", 2, repaired, "two frames are 3 s apart", blocking)
     monkeypatch.setattr(recording, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
@@ -94,15 +149,12 @@ def test_check_data_fails_on_a_fault_that_stays(
     assert ("not repaired" in messages) == blocking
 
 
-def test_check_data_says_what_was_done_to_read_the_recording(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_data_says_what_was_done_to_read_the_recording(vislam: Vislam, capsys: Captured) -> None:
     """Images that cannot be used are left out, and tracks simulated where there are none: no fault, and to be known."""
     assert vislam("simulate", "flight", "--images", "--duration", "0.4", "--out", "film") == 0
     sorted(Path("film/mav0/cam0/data").iterdir())[3].write_bytes(b"")
     vislam("check-data", "film")
-    assert "facts: " in (messages := capsys.readouterr().out)
-    assert "1 of 9 image pairs could not be used and are left out" in " ".join(messages.split())
+    assert "1 of 9 image pairs could not be used and are left out" in " ".join(capsys.readouterr().out.split())
 
 
 def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,38 +166,11 @@ def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch)
         return Audit(sequence, ())
 
     monkeypatch.setattr(recording, "audit", listening)
-    vislam("check-data", "drive")
-    vislam("check-data", "drive", "--no-repair")
-    vislam("check-data", "drive", "--keep", f"{first},{second}")
+    for words in ((), ("--no-repair",), ("--keep", f"{first},{second}")):
+        vislam("check-data", "drive", *words)
     assert kept == [frozenset(), frozenset(audit.faults()), frozenset({first, second})]
 
 
 def test_directory_names_are_plain_and_differ() -> None:
-    assert unique_names(["drive", "a/b c", "drive", "..", "drive"]) == [
-        "drive",
-        "a_b_c",
-        "drive-2",
-        "sequence",
-        "drive-3",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("requested", "expected"),
-    [
-        (["--lens", "radtan"], "--lens is of images; add --images"),
-        (["--images", "--blur", "50"], "expected milliseconds from 0 to 40"),
-        (["--images", "--lens", "fov"], "fov"),
-    ],
-)
-def test_what_images_cannot_be_is_a_line(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], requested: list[str], expected: str
-) -> None:
-    assert vislam("simulate", "flight", "--out", "filmed", *requested) == 2
-    assert expected in capsys.readouterr().err
-    assert not Path("filmed").exists()
-
-
-def test_a_scenario_of_points_gives_no_images(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
-    assert vislam("simulate", "drive", "--images", "--out", "filmed") == 2
-    assert "flight has" in capsys.readouterr().err
+    given = ["drive", "a/b c", "drive", "..", "drive"]
+    assert unique_names(given) == ["drive", "a_b_c", "drive-2", "sequence", "drive-3"]

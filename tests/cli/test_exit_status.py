@@ -27,61 +27,10 @@ PATIENCE_S = 300.0
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        (),
-        ("compair",),
-        ("compare", "--max-frames", "1"),
-        ("compare", "--max-frames", "many"),
-        ("compare", "--seed", "-1"),
-        ("compare", "drive", "--workers", "100000"),
-        ("compare", "--estimators", ","),
-        ("compare", "drive", "flight", "--truth", "gt.tum"),
-        ("compare", "drive", "--keep", "no-such-fault"),
-        ("compare", "drive", "--no-repair", "--keep", "time-gap"),
-        ("check-data",),
-        ("simulate", "drive"),
-        ("simulate", "drive", "--out", "d", "--duration", "0"),
-    ],
-)
-def test_a_wrong_command_line_is_2(vislam: Vislam, one_line: OneLine, words: tuple[str, ...]) -> None:
-    assert vislam(*words) == 2
-    one_line()
-
-
 @pytest.mark.usefixtures("unrendered")
 def test_a_run_that_is_marked_overconfident_ends_with_0(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     assert vislam("compare", "drive", "--estimators", "ekf", "--max-frames", "60", "--workers", "1") == 0
     assert "overconfident: ekf" in capsys.readouterr().out
-
-
-def test_a_recording_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
-    assert vislam("compare", "no/such/recording.npz", "--estimators", "dead-reckoning") == 3
-    assert "no/such/recording.npz" in one_line()
-
-
-def test_a_truth_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
-    assert vislam(*QUICK, "--truth", "missing.tum") == 3
-    assert "missing.tum" in one_line()
-
-
-@pytest.mark.parametrize("out", ["taken", "taken/run"])
-def test_an_output_that_cannot_be_written_is_4_before_anything_runs(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, out: str
-) -> None:
-    Path("taken").write_text("a file")
-    monkeypatch.setattr(runner, "run", _never)
-    assert vislam(*QUICK, "--out", out) == 4
-    assert out in one_line()
-
-
-def test_an_unknown_estimator_is_5_before_anything_runs(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(runner, "run", _never)
-    assert vislam("compare", "drive", "--estimators", "dead-reckoning,oracle") == 5
-    assert "oracle" in one_line()
 
 
 @pytest.mark.usefixtures("unrendered")
@@ -132,7 +81,7 @@ def test_nothing_but_results_is_written_when_all_is_well(vislam: Vislam, capsys:
     assert [path.name for path in Path().iterdir()] == ["run"]
 
 
-@pytest.mark.parametrize("words", [("list",), ("--help",), ("--version",), ("compare", "--help")])
+@pytest.mark.parametrize("words", [("list",), ("--help",)])
 def test_an_output_on_a_full_disk_is_4_in_one_line(words: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
         messages = _vislam(*words, stdout=full)
@@ -141,15 +90,9 @@ def test_an_output_on_a_full_disk_is_4_in_one_line(words: tuple[str, ...]) -> No
     assert messages.returncode == 4
 
 
-def test_closed_streams_are_no_trouble() -> None:
-    program = f"exec {sys.executable} -m toolkit.cli list >&- 2>&-"
-    assert subprocess.run(["sh", "-c", program], check=False, timeout=PATIENCE_S).returncode == 0
-
-
-@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
-def test_closed_streams_are_no_trouble_to_processes_either(closed: str, tmp_path: Path) -> None:
+def test_closed_streams_are_no_trouble_to_processes_either(tmp_path: Path) -> None:
     words = "compare drive --estimators dead-reckoning,mapping --max-frames 4 --workers 2 --figures none --out run"
-    program = f"exec {sys.executable} -m toolkit.cli {words} {closed}"
+    program = f"exec {sys.executable} -m toolkit.cli {words} <&- >&- 2>&-"
     assert subprocess.run(["sh", "-c", program], cwd=tmp_path, check=False, timeout=PATIENCE_S).returncode == 0
 
 
@@ -172,12 +115,13 @@ def test_a_full_shared_memory_is_not_taken_for_a_full_output(
     assert "--workers 1" in messages
 
 
-@pytest.mark.parametrize("kilobytes", [150_000, 200_000, 260_000])
+@pytest.mark.parametrize("kilobytes", [150_000, 260_000])
 def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once(kilobytes: int) -> None:
     program = f"ulimit -v {kilobytes}; exec {sys.executable} -m toolkit.cli list"
     environment = {name: value for name, value in os.environ.items() if name not in THREAD_VARIABLES}
-    how = {"capture_output": True, "text": True, "env": environment, "timeout": PATIENCE_S}
-    messages = subprocess.run(["sh", "-c", program], check=False, **how)
+    messages = subprocess.run(
+        ["sh", "-c", program], check=False, capture_output=True, text=True, env=environment, timeout=PATIENCE_S
+    )
     assert messages.returncode == 71
     assert "MB (ulimit -v), and NumPy, SciPy and GTSAM alone need 307 MB" in messages.stderr
     assert messages.stderr.count("\n") == 1
@@ -244,7 +188,7 @@ def test_the_place_of_a_defect_is_shown_when_requested(
     assert "in _raise" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM",), ("SIGHUP",), ("SIGTERM", "SIGINT", "SIGHUP")])
+@pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT", "SIGHUP")])
 def test_signals_leave_no_file_and_no_process(
     tmp_path: Path, starts_group: StartsGroup, signals: tuple[str, ...]
 ) -> None:
@@ -254,20 +198,6 @@ def test_signals_leave_no_file_and_no_process(
     for name in signals:
         os.kill(running.pid, getattr(signal, name))
         time.sleep(0.05)
-    _, messages = running.communicate(timeout=PATIENCE_S)
-    assert messages == "vislam: error: interrupted; what was not finished is not written\n"
-    assert running.returncode == 130
-    assert list(tmp_path.iterdir()) == []
-    _wait_until(lambda: not _group(running.pid))
-
-
-def test_a_terminal_that_is_closed_is_one_line_though_all_its_processes_are_signalled(
-    tmp_path: Path, starts_group: StartsGroup
-) -> None:
-    words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "run")
-    running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
-    _wait_until(lambda: len(_group(running.pid)) > 4)  # two workers, and what watches over what they share
-    os.killpg(running.pid, signal.SIGHUP)
     _, messages = running.communicate(timeout=PATIENCE_S)
     assert messages == "vislam: error: interrupted; what was not finished is not written\n"
     assert running.returncode == 130
@@ -389,7 +319,3 @@ def _vislam(
         check=False,
         timeout=PATIENCE_S,
     )
-
-
-def _never(*_: object) -> None:
-    raise AssertionError("an estimator ran")

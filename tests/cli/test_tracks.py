@@ -76,9 +76,6 @@ def test_bad_images_are_named(folder: Path, vislam: Vislam, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("words", "status", "complaint"),
     [
-        (("tracks", "drive", "--out", "x"), 3, "drive: holds no images"),
-        (("tracks", "nowhere", "--out", "x"), 3, "no such file"),
-        (("tracks", "06", "--out", "x", "--set", "frontend.window=9"), 2, "did you mean frontend.window_px?"),
         (("compare", "06", "--tracks", "simulated"), 3, "EuRoC folders only"),
         (("compare", "06", "--seeds", "2"), 3, "the same under every seed"),
     ],
@@ -100,13 +97,3 @@ def test_images_alone_are_compared_and_labelled(
     assert "no motion measured (smooth motion assumed)" in table
     assert "no motion input" in Path("run/report.md").read_text()
     assert vislam("compare", "--config", "run/manifest.json", "--out", "again") == 0
-
-
-@pytest.mark.usefixtures("one_process", "unrendered")
-def test_a_folder_without_its_calibration_leaves_nothing_behind(
-    folder: Path, vislam: Vislam, one_line: Callable[[], str]
-) -> None:
-    (folder / "calib.txt").unlink()
-    assert vislam("compare", str(folder), "--out", "run") == 3
-    assert "calib.txt" in one_line()
-    assert not Path("run").exists()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from evo.tools import file_interface as evo
 
-from toolkit.cli import main, runs
+from toolkit.cli import main
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.report.records import read_metrics, read_report
 
@@ -95,30 +95,6 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "why"),
-    [
-        (("--trajectory", "poses.tum"), 2, "expected NAME=FILE"),
-        (("--trajectory", "=poses.tum"), 2, "expected NAME=FILE"),
-        (("--trajectory", "ekf=poses.tum"), 2, "the name ekf is taken by ekf"),
-        (("--trajectory", "truth=poses.tum"), 2, "the name truth is taken by truth"),
-        (("--trajectory", "a b=poses.tum", "--trajectory", "a_b=poses.tum"), 2, "a_b is taken by another trajectory"),
-        (("--trajectory", "(!)=poses.tum"), 2, "has no letter or digit"),
-        (("flight", "--trajectory", "theirs=poses.tum"), 2, "exactly one SEQUENCE"),
-        (("--trajectory", "theirs=poses.tum", "--seeds", "2"), 2, "--trajectory and --seeds exclude each other"),
-        (("--trajectory", "theirs=poses.tum"), 3, "poses.tum: cannot be read"),
-        (("--trajectory", "theirs=empty"), 3, "empty: the file holds no poses"),
-    ],
-)
-def test_a_trajectory_that_cannot_be_used_is_reported_before_anything_runs(
-    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], status: int, why: str
-) -> None:
-    Path("empty").touch()
-    assert vislam(*QUICK[:2], *words, *QUICK[2:], "--out", "again") == status
-    assert why in one_line()
-    assert not Path("again").exists()
-
-
-@pytest.mark.parametrize(
     ("words", "why"),
     [
         ((), "holds several trajectories; choose one with --estimator: dead-reckoning, ekf, truth"),
@@ -153,12 +129,6 @@ def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) 
         assert len(read_poses(Path("out.csv"))) == 20
 
 
-def test_a_file_that_cannot_be_written_is_reported(vislam: Vislam, one_line: OneLine, run: Path) -> None:
-    Path("taken").mkdir()
-    assert vislam("export", str(run), "--estimator", "ekf", "--format", "tum", "--out", "taken") == 4
-    assert "taken is a directory" in one_line()
-
-
 def test_a_comparison_over_seeds_has_nothing_to_export(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], one_line: OneLine
 ) -> None:
@@ -167,7 +137,3 @@ def test_a_comparison_over_seeds_has_nothing_to_export(
     capsys.readouterr()
     assert vislam("export", "seeds", "--format", "tum", "--out", "out") == 3
     assert "over seeds and holds no trajectories" in one_line()
-
-
-def test_the_formats_offered_are_those_there_are() -> None:
-    assert tuple(FORMATS) == runs.FORMATS

@@ -1,9 +1,8 @@
 """The command ``vislam``: subcommands by what they are about; whatever is slow to import is imported to run.
 
-Reading order: arguments (what commands share, and how one is declared), settings_arguments (the options that change
-settings), then the commands about one thing in a file each: compare, evaluate, runs, recordings, gate, parts. Beside
-them progress_display, and completion for shells. Here: how a command is run, and what becomes of errors, signals and
-its output.
+Reading order: arguments (how a command is declared, and the arguments that several share), then the commands about one
+thing in a file each: compare, evaluate, runs, recordings, gate, parts. Beside them progress_display, and completion for
+shells. Here: how a command is run, and what becomes of errors, signals and its output.
 """
 
 import errno
@@ -21,7 +20,7 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
 from toolkit.cli import compare, completion, evaluate, gate, parts, recordings, runs
-from toolkit.cli.arguments import Parser, ShowVersion, epilog
+from toolkit.cli.arguments import Parser, ShowVersion
 from toolkit.errors import OutputError, SystemLimitError, VislamError, one_line
 
 # A defect and a lack of the system's means, as sysexits.h numbers them.
@@ -54,7 +53,7 @@ def parser() -> Parser:
     root = Parser(
         prog="vislam",
         description="Compare visual-inertial estimators on the same stereo and motion measurements.",
-        epilog=epilog("vislam compare drive --max-frames 40 --out runs/first"),
+        examples=("vislam compare drive --max-frames 40 --out runs/first",),
     )
     root.add_argument("--version", action=ShowVersion, help="print the version and exit")
     subcommands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -1,10 +1,10 @@
-"""What the subcommands share: the parser and the kinds of arguments."""
+"""How a subcommand and its arguments are declared, the kinds of arguments, and those that several commands share."""
 
 import argparse
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -16,10 +16,8 @@ from toolkit.threads import MOST_WORKERS
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-    # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
-    Subcommands = argparse._SubParsersAction["Parser"]
-
     from toolkit.experiment.recording import Recording
+    from toolkit.settings import Settings
 
 # "s" last, which the others end with.
 _TIMES = {"min": 60.0, "ms": 1e-3, "s": 1.0}
@@ -34,9 +32,10 @@ class UsageError(VislamError):
 class Parser(argparse.ArgumentParser):
     """A parser that keeps the layout of its epilog, takes no abbreviations and reports an error in one line."""
 
-    def __init__(self, *, description: str, **options: Any) -> None:
+    def __init__(self, *, description: str, examples: Iterable[str], **options: Any) -> None:
         super().__init__(
             description=textwrap.fill(description, 80),
+            epilog="\n".join(["example:", *(f"  $ {example}" for example in examples)]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
             **options,
@@ -92,35 +91,86 @@ class ShowVersion(argparse.Action):
         parser.exit()
 
 
-def epilog(*examples: str) -> str:
-    """Return the end of a help text: examples that a test executes."""
-    return "\n".join(["example:", *(f"  $ {example}" for example in examples)])
+class Argument(NamedTuple):
+    """An argument of a subcommand: its name, and what else argparse's ``add_argument`` takes."""
+
+    name: str
+    how: dict[str, Any]
+
+    def add_to(self, parser: argparse._ActionsContainer) -> None:
+        """Add it to a parser or to a group of one."""
+        parser.add_argument(self.name, **self.how)
+
+
+class OneOf(NamedTuple):
+    """Arguments of which at most one can be given."""
+
+    arguments: tuple[Argument, ...]
+
+    def add_to(self, parser: argparse._ActionsContainer) -> None:
+        """Add them as a group that excludes each other."""
+        group = parser.add_mutually_exclusive_group()
+        for one in self.arguments:
+            one.add_to(group)
+
+
+class Group(NamedTuple):
+    """Arguments under a title of their own in the help."""
+
+    title: str
+    arguments: tuple[Argument, ...]
+
+    def add_to(self, parser: argparse._ActionsContainer) -> None:
+        """Add them under the title."""
+        group = parser.add_argument_group(self.title)
+        for one in self.arguments:
+            one.add_to(group)
+
+
+def arg(name: str, metavar: str | None, kind: Callable[[str], Any] | None, help: str, **how: Any) -> Argument:
+    """Return an argument with a value of a ``kind``; a default other than an empty one ends its help."""
+    default = how.get("default")
+    shown = f"{default:g}" if isinstance(default, float) else default
+    end = "" if default in (None, (), []) else f" (default: {shown})"
+    return Argument(name, {"metavar": metavar, "type": kind, "help": help + end, **how})
+
+
+def choice(name: str, choices: Sequence[str], help: str, **how: Any) -> Argument:
+    """Return an argument that is one of some words, which the help names."""
+    return arg(name, how.pop("metavar", None), None, help, choices=choices, **how)
+
+
+def flag(name: str, help: str, **how: Any) -> Argument:
+    """Return an option without a value."""
+    return Argument(name, {"action": "store_true", "help": help, **how})
 
 
 class Command(NamedTuple):
-    """A subcommand: its words in the help, what adds its arguments, and what runs it and returns the exit status."""
+    """A subcommand: its words in the help, its arguments, and what runs it and returns the exit status."""
 
     name: str
     summary: str
+    arguments: tuple[Argument | OneOf | Group, ...]
     examples: tuple[str, ...]
-    add_arguments: Callable[[Parser], None]
     run: Callable[[argparse.Namespace], int]
 
-    def add_to(self, subcommands: "Subcommands") -> None:
+    def add_to(self, subcommands: "argparse._SubParsersAction[Parser]") -> None:
         """Add the parser of the subcommand; it puts what runs into ``command``."""
         description = " ".join((self.run.__doc__ or "").split())
-        parser = subcommands.add_parser(
-            self.name, help=self.summary, description=description, epilog=epilog(*self.examples)
-        )
-        self.add_arguments(parser)
+        parser = subcommands.add_parser(self.name, help=self.summary, description=description, examples=self.examples)
+        for argument in self.arguments:
+            argument.add_to(parser)
         parser.set_defaults(command=self.run)
 
 
 def command(
-    name: str, summary: str, *examples: str, arguments: Callable[[Parser], None] = lambda _: None
+    name: str, summary: str, *arguments: Argument | OneOf | Group, examples: tuple[str, ...]
 ) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
-    """Make a subcommand of the function that runs it; the function's docstring is the description in its help."""
-    return partial(Command, name, summary, examples, arguments)
+    """Make a subcommand of the function that runs it; its docstring is the description in the help.
+
+    A test executes the examples, one after the other.
+    """
+    return partial(Command, name, summary, arguments, examples)
 
 
 def names(text: str) -> tuple[str, ...]:
@@ -131,35 +181,49 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
-def named_file(text: str) -> tuple[str, Path]:
+def named_file(text: str) -> tuple[str, str]:
     """Parse NAME=FILE."""
     name, equals, file = text.partition("=")
     if not (equals and name.strip() and file):
         raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
-    return name.strip(), Path(file)
+    return name.strip(), file
 
 
 def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
-    """Return a parser of whole numbers that are no smaller than ``least`` and no larger than ``most``."""
+    """Return a parser of whole numbers from ``least`` to ``most``."""
 
     def whole_number(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
-        if value < least:
-            raise argparse.ArgumentTypeError(f"expected at least {least}, not {value}")
-        if value > most:
-            raise argparse.ArgumentTypeError(f"expected at most {most}, not {value}")
+        if not least <= value <= most:
+            bound = f"at least {least}" if value < least else f"at most {most}"
+            raise argparse.ArgumentTypeError(f"expected {bound}, not {value}")
         return value
 
     return whole_number
 
 
+def number_within(what: str, least: float, most: float) -> Callable[[str], float]:
+    """Return a parser of numbers from ``least`` to ``most``, told as ``what``."""
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"expected {what} from {least:g} to {most:g}, not {text!r}")
+        return value
+
+    return number
+
+
 def positive_seconds(text: str) -> float:
     """Parse a finite duration greater than zero, as in 10s, 500ms, 2min or 10."""
     value = _seconds(text)
-    if not 0.0 < value < float("inf"):
+    if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"expected seconds greater than zero, not {text}")
     return value
 
@@ -167,7 +231,7 @@ def positive_seconds(text: str) -> float:
 def seconds_from_start(text: str) -> float:
     """Parse a time since a recording's start, written like a duration."""
     value = _seconds(text)
-    if not 0.0 <= value < float("inf"):
+    if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a time since the start, not {text}")
     return value
 
@@ -179,51 +243,6 @@ def _seconds(text: str) -> float:
         return factor * float(number.removesuffix(unit))
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
-
-
-def add_option(
-    parser: argparse.ArgumentParser | argparse._ArgumentGroup, option: str, default: object, what: str, **kind: Any
-) -> None:
-    """Add an option that has a value where none is given, which ends its help; ``kind`` is as argparse has it."""
-    shown = f"{default:g}" if isinstance(default, float) else default
-    parser.add_argument(option, default=default, help=f"{what} (default: {shown})", **kind)
-
-
-def add_part_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what says which frames of a recording are used."""
-    after = "after the first frame, as in 10s"
-    parser.add_argument(
-        "--from", dest="from_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames before it, {after}"
-    )
-    parser.add_argument(
-        "--to", dest="to_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames after it, {after}"
-    )
-    parser.add_argument("--every", metavar="N", type=at_least(1), help="use one frame in N")
-    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N of these frames only")
-
-
-def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the names of estimators, with what they are named for."""
-    parser.add_argument(
-        "--estimators",
-        metavar="NAME,...",
-        type=names,
-        help=f"{what}; my_filter.py is a file of your own (default: those that 'vislam list estimators' marks)",
-    )
-
-
-def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "see the exit status") -> None:
-    """Add --json, with what it prints, and --quiet, with where the answer is then; at most one can be given."""
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--json", action="store_true", help=f"print {as_json}")
-    group.add_argument("--quiet", action="store_true", help=f"print nothing; {quiet}")
-
-
-def add_workers_argument(parser: argparse.ArgumentParser) -> None:
-    """Add the number of processes; None stands for one a CPU."""
-    parser.add_argument(
-        "--workers", metavar="N", type=at_least(1, MOST_WORKERS), help="processes side by side (default: one a CPU)"
-    )
 
 
 # Repeated from toolkit.datasets.io.bag_topics (a test compares them), which would cost the help a third of a second.
@@ -245,66 +264,151 @@ def topics(text: str) -> str:
     return text
 
 
-def add_topics_argument(parser: argparse.ArgumentParser) -> None:
-    """Add which topics of a bag are what; read it with :func:`with_tracks`."""
-    parser.add_argument(
+def estimators(what: str) -> Argument:
+    """Return the argument that names estimators; ``what`` says what they are named for."""
+    default = "my_filter.py is a file of your own (default: those that 'vislam list estimators' marks)"
+    return arg("--estimators", "NAME,...", names, f"{what}; {default}")
+
+
+def output(as_json: str, quiet: str = "see the exit status") -> OneOf:
+    """Return --json, with what it prints, and --quiet, with where the answer is then."""
+    return OneOf((flag("--json", f"print {as_json}"), flag("--quiet", f"print nothing; {quiet}")))
+
+
+_AFTER = "after the first frame, as in 10s"
+PART = (
+    arg("--from", "TIME", seconds_from_start, f"leave out frames before it, {_AFTER}", dest="from_s"),
+    arg("--to", "TIME", seconds_from_start, f"leave out frames after it, {_AFTER}", dest="to_s"),
+    arg("--every", "N", at_least(1), "use one frame in N"),
+    arg("--max-frames", "N", at_least(2), "use the first N of these frames only"),
+)
+WORKERS = arg("--workers", "N", at_least(1, MOST_WORKERS), "processes side by side (default: one a CPU)")
+REPAIR = OneOf(
+    (
+        flag("--no-repair", "report the faults of a recording, repair none"),
+        arg("--keep", "FAULT,...", names, "do not repair these, see 'vislam list faults'"),
+    )
+)
+
+# Options that are short for a setting, by its key; a parsed command line has their values as settings.KEY.
+_SHORT_FOR: dict[str, str] = {}
+
+
+def setting(key: str, made: Argument) -> Argument:
+    """Return the option as one that is short for the setting ``key``."""
+    _SHORT_FOR[key] = made.name
+    return Argument(made.name, {**made.how, "dest": f"settings.{key}"})
+
+
+TOPICS = setting(
+    "frontend.topics",
+    arg(
         "--topics",
-        metavar="ROLE=TOPIC,...",
-        type=topics,
-        help=f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
-    )
-
-
-def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
-    """Add where tracks come from; read it with :func:`with_tracks`."""
-    parser.add_argument(
+        "ROLE=TOPIC,...",
+        topics,
+        f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
+    ),
+)
+TRACKS = setting(
+    "frontend.tracks",
+    choice(
         "--tracks",
-        choices=("auto", "images", "simulated"),
-        help="of a recording with images and truth: made of the images, or simulated along the truth (default: auto, "
-        "of the images if nearly all of them exist)",
-    )
-    add_topics_argument(parser)
+        ("auto", "images", "simulated"),
+        "of a recording with images and truth: made of the images, or simulated along the truth (default: auto, of "
+        "the images if nearly all of them exist)",
+    ),
+)
+RECORDING = (
+    arg("sequence", "SEQUENCE", str, "a recording's path, or a built-in name"),
+    REPAIR,
+    TRACKS,
+    TOPICS,
+    arg("--seed", "N", at_least(0), "of a simulated sequence", default=0),
+)
 
 
-def with_tracks(values: Mapping[str, Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the nested values of settings with --tracks and --topics put in where they were given."""
-    given = {"tracks": getattr(options, "tracks", None), "topics": options.topics}
-    frontend = {key: value for key, value in given.items() if value is not None}
-    return {**values, "frontend": {**values.get("frontend", {}), **frontend}} if frontend else dict(values)
+class _Once(argparse.Action):
+    """Stores the value of an option that is given once: a second one would pass over the first."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, options: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        if getattr(options, self.dest) is not None:
+            parser.error(f"{option} is given twice; it takes one file, and --set changes single settings")
+        setattr(options, self.dest, values)
 
 
-def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that keep the audit from repairing; read them with :func:`kept_faults`."""
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--no-repair", action="store_true", help="report the faults of a recording, repair none")
-    group.add_argument(
-        "--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these, see 'vislam list faults'"
-    )
+SETTINGS = (
+    arg("--config", "FILE", Path, "settings in TOML, or the manifest.json of a run to repeat", action=_Once),
+    setting(
+        "outliers.policy",
+        arg("--outliers", "POLICY", str, "how every estimator treats inconsistent measurements (see docs/settings.md)"),
+    ),
+    setting(
+        "window.lag_s",
+        arg("--window", "SECONDS", positive_seconds, "length of the window of windowed filters and smoothers"),
+    ),
+    flag("--no-fast", "use NumPy only, even where the extra 'fast' provides compiled code for filters"),
+    arg(
+        "--set",
+        "KEY=VALUE",
+        str,
+        "one setting, as in window.lag_s=3 (see 'vislam list settings'); may be repeated",
+        action="append",
+        default=[],
+    ),
+)
 
 
-def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the recording, its seed, and what the audit may repair; read it with :func:`recording_asked`."""
-    parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")
-    add_repair_arguments(parser)
-    add_tracks_argument(parser)
-    add_option(parser, "--seed", 0, "of a simulated sequence", metavar="N", type=at_least(0))
+def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any]) -> dict[str, Any]:
+    """Return the settings that options and --set give, by key; ``further`` has words, key and value of others.
+
+    Raises UsageError where one is given two values.
+    """
+    from toolkit.settings import assigned
+
+    short = [
+        (f"{option} {value:g}" if isinstance(value, float) else f"{option} {value}", key, value)
+        for key, option in _SHORT_FOR.items()
+        if (value := getattr(options, f"settings.{key}", None)) is not None
+    ]
+    if getattr(options, "no_fast", False):
+        short.append(("--no-fast", "arithmetic", "numpy"))
+    by_set = [(f"--set {text}", *assigned(text)) for text in getattr(options, "set", ())]
+    changes: dict[str, Any] = {}
+    told: dict[str, str] = {}
+    for words, key, value in (*short, *further, *by_set):
+        if changes.setdefault(key, value) != value:
+            raise UsageError(f"{told[key]} and {words} give {key} two values; leave one out")
+        told.setdefault(key, words)
+    return changes
+
+
+def requested_settings(options: argparse.Namespace) -> "Settings":
+    """Return the settings of --config, --set and the options short for one; SettingsError where there is no such."""
+    from toolkit.experiment.configuration import read_configuration
+    from toolkit.settings import settings_of, with_changes
+
+    file = getattr(options, "config", None)
+    values = {} if file is None else read_configuration(file)[1]
+    return settings_of(with_changes(values, requested_changes(options)), str(file or "the command line"))
 
 
 def requested_recording(options: argparse.Namespace) -> "Recording":
     """Return the recording that SEQUENCE and --seed name, with what --no-repair, --keep, --tracks and --topics say."""
-    from toolkit.audit import faults
     from toolkit.experiment.recording import Recording
-    from toolkit.settings import settings_of
 
-    frontend = settings_of(with_tracks({}, options), "the command line").frontend
-    return Recording(options.sequence, options.seed, keep=kept_faults(options, faults()), frontend=frontend)
+    keep, frontend = frozenset(kept_faults(options) or ()), requested_settings(options).frontend
+    return Recording(options.sequence, options.seed, keep=keep, frontend=frontend)
 
 
-def kept_faults(options: argparse.Namespace, known: Collection[str]) -> frozenset[str]:
-    """Return the faults that are not to be repaired, or raise UsageError for one that does not exist."""
-    if options.no_repair:
-        return frozenset(known)
-    return frozenset(known_names("fault", options.keep, known))
+def kept_faults(options: argparse.Namespace) -> tuple[str, ...] | None:
+    """Return the faults that are not to be repaired, None where nothing is said; UsageError for one there is not."""
+    if not options.no_repair and not options.keep:
+        return None
+    from toolkit.audit import faults
+
+    return tuple(sorted(faults() if options.no_repair else known_names("fault", options.keep, faults())))
 
 
 def known_names(kind: str, given: Iterable[str], known: Collection[str]) -> list[str]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, NamedTuple
 
-from toolkit.cli.arguments import command
+from toolkit.cli.arguments import choice, command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
-
-
-_SHELLS = ("bash", "zsh", "fish")
 
 
 class _Option(NamedTuple):
@@ -31,15 +28,11 @@ class _Command(NamedTuple):
     options: tuple[_Option, ...]
 
 
-def _completion_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=_SHELLS, help="which shell")
-
-
 @command(
     "completion",
     "print the script with which a shell completes vislam's commands and options",
-    "vislam completion bash",
-    arguments=_completion_arguments,
+    choice("shell", ("bash", "zsh", "fish"), "which shell"),
+    examples=("vislam completion bash",),
 )
 def completion(options: argparse.Namespace) -> int:
     """Print a script that completes commands, options, their choices, and the names of estimators, built-in
@@ -72,18 +65,20 @@ def _known_names() -> dict[str, tuple[str, ...]]:
 
 
 def _commands(root: argparse.ArgumentParser, known: Mapping[str, tuple[str, ...]]) -> Iterator[_Command]:
-    for action in root._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            helps = {one.dest: one.help or "" for one in action._choices_actions}
-            for name, parser in action.choices.items():
-                yield _Command(name, helps.get(name, ""), tuple(_options(parser, known)))
-
-
-def _options(parser: argparse.ArgumentParser, known: Mapping[str, tuple[str, ...]]) -> Iterator[_Option]:
-    for action in parser._actions:
-        choices = tuple(map(str, action.choices or known.get(action.dest, ())))
-        # Positional choices are offered where no option is under way.
-        yield _Option(tuple(action.option_strings), action.help or "", choices, action.nargs != 0)
+    (subcommands,) = (one for one in root._actions if isinstance(one, argparse._SubParsersAction))
+    helps = {one.dest: one.help or "" for one in subcommands._choices_actions}
+    for name, parser in subcommands.choices.items():
+        options = (
+            # Positional choices are offered where no option is under way.
+            _Option(
+                tuple(one.option_strings),
+                one.help or "",
+                tuple(map(str, one.choices or known.get(one.dest, ()))),
+                one.nargs != 0,
+            )
+            for one in parser._actions
+        )
+        yield _Command(name, helps[name], tuple(options))
 
 
 def _bash(commands: list[_Command]) -> str:

@@ -9,86 +9,84 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
+    SETTINGS,
+    WORKERS,
+    Group,
     UsageError,
-    add_estimators_argument,
-    add_option,
-    add_workers_argument,
+    arg,
     at_least,
+    choice,
     command,
+    estimators,
+    flag,
     positive_seconds,
+    requested_changes,
+    requested_settings,
 )
-from toolkit.cli.settings_arguments import add_settings_arguments, requested_settings
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from toolkit.gate.baseline import Baseline, Case
-    from toolkit.gate.trajectory_check import GivenRuns, Truths
+    from toolkit.gate.trajectory_check import GivenRuns
     from toolkit.gate.verdict import Check
+    from toolkit.settings import Settings
 
 SEEDS, FEWEST_SEEDS = 24, 5
 _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json": "JSON"}
 
 
-def _add_trajectories_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("baselines of another system's trajectories")
-    group.add_argument(
-        "--trajectories",
-        metavar="DIR|FILE",
-        type=Path,
-        help="run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against --truth; "
-        "or take the scores of an evaluation.json",
-    )
-    group.add_argument(
-        "--align",
-        choices=("se3", "yaw", "sim3"),
-        help="what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
-    )
-    group.add_argument(
-        "--gap",
-        metavar="S",
-        type=positive_seconds,
-        help="the longest time between two keyframes that counts as covered (default: 5)",
-    )
-
-
-def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "sequences",
-        metavar="SEQUENCE",
-        nargs="*",
-        help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
-    )
-    add_estimators_argument(parser, "estimators to measure, see 'vislam list estimators'")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
-    what = "seeds of each simulated sequence, from 0"
-    add_option(parser, "--seeds", SEEDS, what, metavar="N", type=at_least(FEWEST_SEEDS))
-    add_option(parser, "--repeats", 1, "runs of each recorded sequence", metavar="N", type=at_least(1))
-    parser.add_argument(
-        "--duration",
-        metavar="S",
-        type=positive_seconds,
-        help="seconds of every sequence without its own (default: all of it)",
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="SEQUENCE=FILE.tum",
-        action="append",
-        default=[],
-        help="ground truth of a recorded sequence, from the same places; may be given several times; with "
-        "--trajectories also a folder that has SEQUENCE.tum",
-    )
-    _add_trajectories_arguments(parser)
-    add_settings_arguments(parser)
-    add_workers_argument(parser)
-
-
 @command(
     "baseline",
     "measure the baseline that vislam check compares with",
-    "vislam baseline drive --estimators dead-reckoning,ekf --seeds 5 --duration 2 --out baseline.json",
-    arguments=_baseline_arguments,
+    arg(
+        "sequences",
+        "SEQUENCE",
+        str,
+        "a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
+        nargs="*",
+    ),
+    estimators("estimators to measure, see 'vislam list estimators'"),
+    arg("--out", "FILE", Path, "the baseline (default: named by the releases)"),
+    arg("--seeds", "N", at_least(FEWEST_SEEDS), "seeds of each simulated sequence, from 0", default=SEEDS),
+    arg("--repeats", "N", at_least(1), "runs of each recorded sequence", default=1),
+    arg("--duration", "S", positive_seconds, "seconds of every sequence without its own (default: all of it)"),
+    arg(
+        "--truth",
+        "SEQUENCE=FILE.tum",
+        str,
+        "ground truth of a recorded sequence, from the same places; may be given several times; with --trajectories "
+        "also a folder that has SEQUENCE.tum",
+        action="append",
+        default=[],
+    ),
+    Group(
+        "baselines of another system's trajectories",
+        (
+            arg(
+                "--trajectories",
+                "DIR|FILE",
+                Path,
+                "run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against "
+                "--truth; or take the scores of an evaluation.json",
+            ),
+            choice(
+                "--align",
+                ("se3", "yaw", "sim3"),
+                "what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
+            ),
+            arg(
+                "--gap",
+                "S",
+                positive_seconds,
+                "the longest time between two keyframes that counts as covered (default: 5)",
+            ),
+        ),
+    ),
+    *SETTINGS,
+    WORKERS,
+    examples=("vislam baseline drive --estimators dead-reckoning,ekf --seeds 5 --duration 2 --out baseline.json",),
 )
 def baseline(options: argparse.Namespace) -> int:
     """Measure estimators on sequences and write what vislam check compares with: simulated sequences over many
@@ -106,17 +104,24 @@ def baseline(options: argparse.Namespace) -> int:
     from toolkit.gate.checking import new_baseline
     from toolkit.report.manifest import made_here
 
-    _check_seeds_are_options(options.set)
-    cases = _cases(options)
+    cases, settings = _cases(options), _settings(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
     check_writable(out, "{")
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_baseline(cases, workers, made_by, of_this_process(), requested_settings(options))
+    made = new_baseline(cases, workers, made_by, of_this_process(), settings)
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
     return 1 if ends else 0
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    """Return the settings of a baseline; raises UsageError for those of the seeds, which it has in its cases."""
+    for text in options.set:
+        if text.partition("=")[0].strip() in ("first_seed", "seeds", "vary"):
+            raise UsageError(f"--set {text} is for compare; a baseline's --seeds are from 0, and draw the noise")
+    return requested_settings(options)
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
@@ -126,8 +131,8 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     from toolkit.gate.trajectory_files import Scoring
     from toolkit.report.manifest import made_here
 
-    settings = (options.set, options.config, options.outliers, options.window, options.no_fast)
-    if options.sequences or options.estimators or options.duration or any(settings):
+    asked = (options.sequences, options.estimators, options.duration, options.config, requested_changes(options))
+    if any(asked):
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
     out = options.out or Path("trajectory-baseline.json")
     check_writable(out, "{")
@@ -154,15 +159,6 @@ def command_to_keep(words: list[str]) -> str:
     return shlex.join(kept)
 
 
-def _check_seeds_are_options(assignments: list[str]) -> None:
-    """Raise UsageError for a setting of the seeds, which a baseline has in its cases."""
-    from toolkit.settings import assigned
-
-    for text in assignments:
-        if assigned(text)[0] in ("first_seed", "seeds", "vary"):
-            raise UsageError(f"--set {text} is for compare; a baseline's --seeds are from 0, and draw the noise")
-
-
 def _cases(options: argparse.Namespace) -> list[Case]:
     """Return the cases the command line asks for."""
     from toolkit.datasets import is_drawn_from_a_seed
@@ -173,7 +169,12 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     if not options.sequences:
         raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")
     estimators = tuple(entry.word for entry in find_all(options.estimators or defaults()).values())
-    truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
+    truths = {}
+    for text in options.truth:
+        name, _, file = text.partition("=")
+        if not name or not file:
+            raise UsageError(f"--truth takes SEQUENCE=FILE.tum, not {text}")
+        truths[name] = file
     cases = []
     for given in options.sequences:
         source, seconds = _with_duration(given)
@@ -187,13 +188,6 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     if any(case.simulated and case.truth for case in cases):
         raise UsageError("--truth is for recorded sequences; a simulated one has its own")
     return cases
-
-
-def _split(text: str, separator: str, otherwise: str) -> tuple[str, str]:
-    name, found, value = text.partition(separator)
-    if not found or not name or not value:
-        raise UsageError(f"{otherwise}, not {text}")
-    return name, value
 
 
 def _with_duration(given: str) -> tuple[str, float | None]:
@@ -214,61 +208,51 @@ def _bad_ends(baseline: Baseline) -> Iterator[str]:
                 yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {series.why}"
 
 
-def _check_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--baseline",
-        metavar="FILE",
-        type=Path,
-        required=True,
-        help="file that vislam baseline wrote; of a folder, the one for the releases installed here",
-    )
-    add_workers_argument(parser)
-    for name, what in _FILES.items():
-        parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
-    parser.add_argument(
-        "--trajectories",
-        metavar="DIR|FILE",
-        type=Path,
-        help="run nothing; check another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
-        "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="DIR|SEQUENCE=FILE",
-        action="append",
-        default=[],
-        help="with --trajectories: path of the truth, if it is not the baseline's",
-    )
-    parser.add_argument(
-        "--accept-better",
-        action="store_true",
-        help="let results that moved pass unless they are worse, after a change that is meant to move them",
-    )
-    parser.add_argument(
-        "--skip-speed", action="store_true", help=("do not check time, for example on a machine of another make")
-    )
-    parser.add_argument(
-        "--speed-against",
-        metavar="REVISION|WHEEL",
-        help="check time by alternating runs with another version of the code: a git revision of the current checkout, "
-        "or a wheel; detects 15 %%, on any machine",
-    )
-    parser.add_argument(
-        "--allow-other-releases",
-        action="store_true",
-        help="compare although GTSAM or NumPy is another release than the baseline's",
-    )
-    parser.add_argument(
-        "--verbose", action="store_true", help="print every comparison, not only those that fail; files have them all"
-    )
-
-
 @command(
     "check",
     "fail if accuracy, consistency or speed are not a baseline's",
-    "vislam baseline drive --estimators dead-reckoning --seeds 5 --duration 2 --out baseline.json",
-    "vislam check --baseline baseline.json --skip-speed",
-    arguments=_check_arguments,
+    arg(
+        "--baseline",
+        "FILE",
+        Path,
+        "file that vislam baseline wrote; of a folder, the one for the releases installed here",
+        required=True,
+    ),
+    WORKERS,
+    *(arg(f"--{name}", "FILE", Path, f"write the verdicts as {what}") for name, what in _FILES.items()),
+    arg(
+        "--trajectories",
+        "DIR|FILE",
+        Path,
+        "run nothing; check another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
+        "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
+    ),
+    arg(
+        "--truth",
+        "DIR|SEQUENCE=FILE",
+        str,
+        "with --trajectories: path of the truth, if it is not the baseline's",
+        action="append",
+        default=[],
+    ),
+    flag(
+        "--accept-better",
+        "let results that moved pass unless they are worse, after a change that is meant to move them",
+    ),
+    flag("--skip-speed", "do not check time, for example on a machine of another make"),
+    arg(
+        "--speed-against",
+        "REVISION|WHEEL",
+        str,
+        "check time by alternating runs with another version of the code: a git revision of the current checkout, or "
+        "a wheel; detects 15 %%, on any machine",
+    ),
+    flag("--allow-other-releases", "compare although GTSAM or NumPy is another release than the baseline's"),
+    flag("--verbose", "print every comparison, not only those that fail; files have them all"),
+    examples=(
+        "vislam baseline drive --estimators dead-reckoning --seeds 5 --duration 2 --out baseline.json",
+        "vislam check --baseline baseline.json --skip-speed",
+    ),
 )
 def check(options: argparse.Namespace) -> int:
     """Run again what a baseline lists, on the same measurements, and fail where accuracy, consistency, held-out
@@ -323,31 +307,25 @@ def _check_of_trajectories(options: argparse.Namespace) -> Check:
     return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)
 
 
-def _runs_given(place: Path, truths: Iterable[str], known: Iterable[str] = ()) -> GivenRuns:
+def _runs_given(place: Path, truths: Sequence[str], known: Iterable[str] = ()) -> GivenRuns:
     """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
 
     Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none, or
     a truth that is not there, or of a sequence that neither the folder has nor is ``known``.
     """
-    from toolkit.gate.trajectory_check import FolderOfRuns
+    from toolkit.gate.trajectory_check import FolderOfRuns, Truths
 
     if place.is_dir() or place.suffix != ".json":
-        folder = FolderOfRuns(place, _truths_given(truths))
+        named = [text.partition("=") for text in truths if "=" in text and not Path(text).is_dir()]
+        folders = [Path(text) for text in truths if "=" not in text or Path(text).is_dir()]
+        if len(folders) > 1:
+            raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
+        files = {name: Path(file) for name, _, file in named}
+        folder = FolderOfRuns(place, Truths(folders[0] if folders else None, files))
         folder.truths.check({*folder.sequences, *known})
         return folder
     from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
 
-    if list(truths):
+    if truths:
         raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
     return EvaluatedRuns(place, read_evaluation(place))
-
-
-def _truths_given(given: Iterable[str]) -> Truths:
-    """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
-    from toolkit.gate.trajectory_check import Truths
-
-    named = [text.partition("=") for text in given if "=" in text and not Path(text).is_dir()]
-    folders = [Path(text) for text in given if "=" not in text or Path(text).is_dir()]
-    if len(folders) > 1:
-        raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
-    return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_output_arguments, command
+from toolkit.cli.arguments import arg, choice, command, output
 
 if TYPE_CHECKING:
     from toolkit.registry import EstimatorEntry
     from toolkit.settings import Described
-
-_INDENT = "  "
-
 
 KINDS = ("estimators", "metrics", "faults", "settings", "formats", "sequences")
 # How many names of each kind stand for all of it.
 _EXAMPLES = 4
 
 
-def _list_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", metavar="KIND", nargs="?", choices=KINDS, help=f"one of {', '.join(KINDS)}")
-
-
 @command(
     "list",
     "list estimators, metrics, faults, settings, formats and built-in sequences",
-    "vislam list",
-    "vislam list estimators",
-    arguments=_list_arguments,
+    choice("kind", KINDS, f"one of {', '.join(KINDS)}", metavar="KIND", nargs="?"),
+    examples=("vislam list", "vislam list estimators"),
 )
 def list_parts(options: argparse.Namespace) -> int:
     """Print one kind of what can be named on the command line, a name a line: estimators, metrics, faults the audit
@@ -50,30 +42,33 @@ def _entries(kind: str) -> Mapping[str, str]:
     from toolkit.registry import discover
     from toolkit.settings import describe
 
-    entries: Mapping[str, Callable[[], Mapping[str, str]]] = {
-        "estimators": lambda: {name: _estimator(entry) for name, entry in discover().items()},
-        "metrics": lambda: metrics.describe() | _marked(metrics.unavailable()),
-        "faults": faults,
-        "settings": lambda: {one.key: _setting(one) for one in describe()},
-        "formats": lambda: datasets.formats() | _marked(datasets.unavailable()),
-        "sequences": lambda: dict.fromkeys(datasets.built_in_names(), ""),
-    }
-    return entries[kind]()
+    match kind:
+        case "estimators":
+            return {name: _estimator(entry) for name, entry in discover().items()}
+        case "metrics":
+            return metrics.describe() | _marked(metrics.unavailable())
+        case "faults":
+            return faults()
+        case "settings":
+            return {one.key: _setting(one) for one in describe()}
+        case "formats":
+            return datasets.formats() | _marked(datasets.unavailable())
+        case _:
+            return dict.fromkeys(datasets.built_in_names(), "")
 
 
 def _summary(kind: str, names: list[str]) -> str:
     """Return a kind in one line: how many names it has, and a few of them."""
     more = ", ..." if len(names) > _EXAMPLES else ""
-    return f"{len(names):>3} {kind:<{max(map(len, KINDS))}}{_INDENT}{', '.join(names[:_EXAMPLES])}{more}"
+    return f"{len(names):>3} {kind:<{max(map(len, KINDS))}}  {', '.join(names[:_EXAMPLES])}{more}"
 
 
 def _listing(entries: Mapping[str, str]) -> str:
     """Return names with their one-line summaries."""
     from toolkit.report.prose import filled, width_of_output
 
-    longest, width = max((len(name) for name in entries), default=0), width_of_output()
-    further = " " * (longest + len(_INDENT))
-    lines = (filled(text, width, f"{name:<{longest}}{_INDENT}", further) for name, text in entries.items())
+    longest, width = max(map(len, entries), default=0), width_of_output()
+    lines = (filled(text, width, f"{name:<{longest}}  ", " " * (longest + 2)) for name, text in entries.items())
     return "\n".join(line.rstrip() for line in lines)
 
 
@@ -91,13 +86,12 @@ def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:
     return {name: f"unavailable: {why}" for name, why in unavailable.items()}
 
 
-def _cite_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "names", metavar="NAME|RUN_DIR", nargs="*", help="an estimator, a format, an estimator's file, a run directory"
-    )
-
-
-@command("cite", "print BibTeX for estimators and data sets", "vislam cite msckf-fej euroc", arguments=_cite_arguments)
+@command(
+    "cite",
+    "print BibTeX for estimators and data sets",
+    arg("names", "NAME|RUN_DIR", str, "an estimator, a format, an estimator's file, a run directory", nargs="*"),
+    examples=("vislam cite msckf-fej euroc",),
+)
 def cite(options: argparse.Namespace) -> int:
     """Print BibTeX for estimators, data sets or whatever a run directory compared; for all of them without a name."""
     from toolkit.report.citations import bibtex, citations
@@ -106,18 +100,12 @@ def cite(options: argparse.Namespace) -> int:
     return 0
 
 
-def _verify_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "estimator", metavar="FILE.py|NAME", help="a file or a module with build(setup), or an installed estimator"
-    )
-    add_output_arguments(parser, "the result as JSON")
-
-
 @command(
     "verify",
     "check that an estimator of your own keeps what every estimator promises",
-    "vislam verify dead-reckoning",
-    arguments=_verify_arguments,
+    arg("estimator", "FILE.py|NAME", str, "a file or a module with build(setup), or an installed estimator"),
+    output("the result as JSON"),
+    examples=("vislam verify dead-reckoning",),
 )
 def verify(options: argparse.Namespace) -> int:
     """Run an estimator on simulated recordings and check what every estimator promises: it is causal and

@@ -9,16 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
+    RECORDING,
+    SETTINGS,
+    TOPICS,
+    Group,
+    OneOf,
     UsageError,
-    add_option,
-    add_recording_arguments,
-    add_topics_argument,
+    arg,
     at_least,
+    choice,
     command,
+    flag,
+    number_within,
     positive_seconds,
     requested_recording,
+    requested_settings,
 )
-from toolkit.cli.settings_arguments import add_settings_arguments, requested_settings
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -27,7 +33,6 @@ if TYPE_CHECKING:
 
 # Repeated from toolkit.simulation.SCENARIOS (a test compares them), which would cost the help half a second.
 SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
-_LENSES = ("none", "radtan", "equidistant")
 _LONGEST_EXPOSURE_MS = 40
 # Of more pairs is said, before they are made, how much room they take.
 _MANY_PAIRS = 1000
@@ -35,12 +40,13 @@ _MOST_STILLS, _MOST_CRATES = 10_000, 1000
 _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 
 
-def _check_data_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth, to check that the two overlap")
-    add_recording_arguments(parser)
-
-
-@command("check-data", "find the faults of a recording", "vislam check-data drive", arguments=_check_data_arguments)
+@command(
+    "check-data",
+    "find the faults of a recording",
+    arg("--truth", "FILE.tum", Path, "ground truth, to check that the two overlap"),
+    *RECORDING,
+    examples=("vislam check-data drive",),
+)
 def check_data(options: argparse.Namespace) -> int:
     """Find the faults of a recording from its data alone and say which of them are repaired when it is used. Fails
     on a fault that is not repaired.
@@ -57,17 +63,13 @@ def check_data(options: argparse.Namespace) -> int:
     return 1 if any(finding.blocking for finding in audited.findings) else 0
 
 
-def _card_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write the card as JSON, too (see docs/tracks.md)")
-    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
-    add_recording_arguments(parser)
-
-
 @command(
     "card",
     "describe the tracks of a recording: length, errors, depths",
-    "vislam card drive-realistic --max-frames 60",
-    arguments=_card_arguments,
+    arg("--json", "FILE", Path, "write the card as JSON, too (see docs/tracks.md)"),
+    arg("--max-frames", "N", at_least(2), "use the first N frames only"),
+    *RECORDING,
+    examples=("vislam card drive-realistic --max-frames 60",),
 )
 def card(options: argparse.Namespace) -> int:
     """Fit the noise of a recording's tracks and say what they are like: how errors along a track are correlated,
@@ -91,36 +93,31 @@ def card(options: argparse.Namespace) -> int:
     return 0
 
 
-def _tracks_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
-    add_topics_argument(parser)
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
-    what = parser.add_mutually_exclusive_group()
-    add_option(what, "--count", 10, "how many stills", metavar="N", type=at_least(1, _MOST_STILLS))
-    what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
-    add_settings_arguments(parser)
-
-
 @command(
     "tracks",
     "draw stereo tracks over the images they were made of",
-    "vislam tracks kitti/sequences/06 --out stills --count 4",
-    arguments=_tracks_arguments,
+    arg("images", "FOLDER|BAG", str, "a folder with images, as EuRoC's or KITTI's, or a bag"),
+    TOPICS,
+    arg("--out", "DIR", Path, "directory of the stills", required=True),
+    OneOf(
+        (
+            arg("--count", "N", at_least(1, _MOST_STILLS), "how many stills", default=10),
+            flag("--video", "a video of every frame instead of stills"),
+        )
+    ),
+    *SETTINGS,
+    examples=("vislam tracks kitti/sequences/06 --out stills --count 4",),
 )
 def tracks(options: argparse.Namespace) -> int:
     """Make the stereo tracks of a folder of images, as compare does, and write stills of them: left and right image
     side by side, a circle a track, blue where it is new, red where it is old.
     """
-    import msgspec
-
     from toolkit.cli.progress_display import of_this_process
     from toolkit.datasets import load_images
     from toolkit.files.writing import check_parent
     from toolkit.frontend.stills import write_stills, write_video
 
     frontend = requested_settings(options).frontend
-    if options.topics is not None:
-        frontend = msgspec.structs.replace(frontend, topics=options.topics)
     check_parent(options.out.parent)
     recording = load_images(options.images, frontend)
     with of_this_process()(options.images) as progress:
@@ -146,46 +143,40 @@ def _summary(tracks: ImageTracks) -> str:
     return f"{tracks.t_ns.size} pairs, {a_frame.mean():.0f} tracks a frame ({a_frame.min()} at least){alive}"
 
 
-def _exposure_ms(text: str) -> float:
-    """Parse an exposure that ends before the next one begins."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value <= _LONGEST_EXPOSURE_MS:
-        raise argparse.ArgumentTypeError(f"expected milliseconds from 0 to {_LONGEST_EXPOSURE_MS}, not {text!r}")
-    return value
-
-
-def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", choices=SCENARIOS, help="scenario: the vehicle and its path")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
-    add_option(parser, "--seed", 0, "seed of every error", metavar="N", type=at_least(0))
-    parser.add_argument("--duration", metavar="S", type=positive_seconds, help="seconds (default: the scenario's)")
-    images = parser.add_argument_group("images")
-    images.add_argument("--images", action="store_true", help="render the images of a stereo pair (flight)")
-    images.add_argument(
-        "--lens",
-        choices=_LENSES,
-        help=("the distortion of both cameras, which are then not aligned (default: none, rectified)"),
-    )
-    images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
-    images.add_argument("--moving", metavar="N", type=at_least(0, _MOST_CRATES), help="moving crates (default: 0)")
-
-
 @command(
     "simulate",
     "write a simulated recording",
-    "vislam simulate drive --out recordings/drive-seed-1 --seed 1 --duration 5",
-    "vislam simulate flight --images --lens radtan --out recordings/filmed --duration 0.5",
-    arguments=_simulate_arguments,
+    choice("scenario", SCENARIOS, "scenario: the vehicle and its path"),
+    arg("--out", "DIR", Path, "directory of the recording", required=True),
+    arg("--seed", "N", at_least(0), "seed of every error", default=0),
+    arg("--duration", "S", positive_seconds, "seconds (default: the scenario's)"),
+    Group(
+        "images",
+        (
+            flag("--images", "render the images of a stereo pair (flight)"),
+            choice(
+                "--lens",
+                ("none", "radtan", "equidistant"),
+                "the distortion of both cameras, which are then not aligned (default: none, rectified)",
+            ),
+            arg(
+                "--blur",
+                "MS",
+                number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS),
+                "milliseconds of exposure (default: 0)",
+            ),
+            arg("--moving", "N", at_least(0, _MOST_CRATES), "moving crates (default: 0)"),
+        ),
+    ),
+    examples=(
+        "vislam simulate drive --out recordings/drive-seed-1 --seed 1 --duration 5",
+        "vislam simulate flight --images --lens radtan --out recordings/filmed --duration 0.5",
+    ),
 )
 def simulate(options: argparse.Namespace) -> int:
     """Write a simulated recording with exact truth; the same seed gives the same bits. With --images it is a folder
     of stereo images in EuRoC's layout, 0.4 MB a pair.
     """
-    from dataclasses import replace
-
     from toolkit.datasets import vislam_recording
     from toolkit.simulation import SCENARIOS as KNOWN
     from toolkit.simulation import simulate
@@ -193,11 +184,10 @@ def simulate(options: argparse.Namespace) -> int:
     scenario = KNOWN[options.scenario]
     if options.duration is not None:
         scenario = replace(scenario, duration_s=options.duration)
-    requested = [name for name in _ONLY_WITH_IMAGES if getattr(options, name) is not None]
     if options.images:
         return _film(scenario, options)
-    if requested:
-        raise UsageError(f"--{requested[0]} is of images; add --images")
+    if asked := [name for name in _ONLY_WITH_IMAGES if getattr(options, name) is not None]:
+        raise UsageError(f"--{asked[0]} is of images; add --images")
     vislam_recording.check_folder(options.out)
     sequence = simulate(scenario, options.seed)
     vislam_recording.save(sequence, options.out)
@@ -214,7 +204,6 @@ def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     from toolkit.simulation.filming import Filming, check_filmable, film, pair_count, size_gb
 
     check_filmable(scenario, options.out)
-
     if (pairs := pair_count(scenario)) > _MANY_PAIRS:
         print(f"{printable(str(options.out))}: {pairs} stereo pairs, about {size_gb(scenario):.2g} GB", file=sys.stderr)
     filming = Filming(options.lens or "none", (options.blur or 0.0) / 1000.0, options.moving or 0)
@@ -227,29 +216,23 @@ def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     return 0
 
 
-def _import_tables_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--tracks", metavar="FILE.csv", type=Path, required=True, help="t, track_id, uL, uR and v, or vL and vR"
-    )
-    parser.add_argument(
-        "--motion",
-        metavar="FILE.csv",
-        type=Path,
-        required=True,
-        help="t and ax, ay, az, gx, gy, gz of an IMU, or vx, vy, vz, wx, wy, wz of the body",
-    )
-    parser.add_argument(
-        "--rig", metavar="FILE.toml", type=Path, required=True, help="calibration of the rectified pair, and noise"
-    )
-    parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
-
-
 @command(
     "import",
     "make a recording of your own tables",
-    "vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out recordings/own",
-    arguments=_import_tables_arguments,
+    arg("--tracks", "FILE.csv", Path, "t, track_id, uL, uR and v, or vL and vR", required=True),
+    arg(
+        "--motion",
+        "FILE.csv",
+        Path,
+        "t and ax, ay, az, gx, gy, gz of an IMU, or vx, vy, vz, wx, wy, wz of the body",
+        required=True,
+    ),
+    arg("--rig", "FILE.toml", Path, "calibration of the rectified pair, and noise", required=True),
+    arg("--truth", "FILE.tum", Path, "ground truth"),
+    arg("--out", "DIR", Path, "directory of the recording", required=True),
+    examples=(
+        "vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out recordings/own",
+    ),
 )
 def import_tables(options: argparse.Namespace) -> int:
     """Make a recording of stereo tracks, IMU samples or body velocities, and a calibration in tables of your own.

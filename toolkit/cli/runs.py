@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names
+from toolkit.cli.arguments import WORKERS, UsageError, arg, choice, command, flag, names, output
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -20,24 +20,18 @@ _PAGE = "report.html"
 # Repeated from toolkit.datasets.trajectories.FORMATS (a test compares them), which would cost the help half a second.
 FORMATS = ("tum", "kitti", "euroc", "openvins")
 _MOST_PACKAGES = 12
-
-
-def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", metavar="RUN_DIR", nargs="+", type=Path, help="as vislam compare writes it")
-    parser.add_argument(
-        "--out",
-        metavar="FILE",
-        type=Path,
-        help=f"the page (default: {_PAGE} in the run directory; ./{_PAGE} for several)",
-    )
+_RUN = "as vislam compare writes it"
 
 
 @command(
     "report",
     "show run directories as one interactive HTML page",
-    "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
-    "vislam report runs/drive",
-    arguments=_report_arguments,
+    arg("runs", "RUN_DIR", Path, _RUN, nargs="+"),
+    arg("--out", "FILE", Path, f"the page (default: {_PAGE} in the run directory; ./{_PAGE} for several)"),
+    examples=(
+        "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
+        "vislam report runs/drive",
+    ),
 )
 def report(options: argparse.Namespace) -> int:
     """Write one HTML file that opens from disk, with all it needs inside: the table, the trajectories from above
@@ -55,69 +49,56 @@ def report(options: argparse.Namespace) -> int:
     return 0
 
 
-def _export_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN_DIR", type=Path, help="as vislam compare writes it")
-    parser.add_argument("--estimator", metavar="NAME", help="an estimator, or truth (default: the only one there is)")
-    parser.add_argument("--output", choices=("causal", "final"), help="default: final, where there is one")
-    parser.add_argument("--format", choices=FORMATS, help="of the file; KITTI has no stamps")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="the file to write")
-    parser.add_argument(
-        "--bundle",
-        metavar="FILE.zip",
-        type=Path,
-        help="write settings, versions, hashes, trajectories and metrics of the run as one file for vislam reproduce",
-    )
-
-
 @command(
     "export",
     "write a trajectory of a run directory in another program's format, or a bundle",
-    "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
-    "vislam export runs/drive --format kitti --out drive.kitti",
-    "vislam export runs/drive --bundle drive.zip",
-    arguments=_export_arguments,
+    arg("run", "RUN_DIR", Path, _RUN),
+    arg("--estimator", "NAME", str, "an estimator, or truth (default: the only one there is)"),
+    choice("--output", ("causal", "final"), "default: final, where there is one"),
+    choice("--format", FORMATS, "of the file; KITTI has no stamps"),
+    arg("--out", "FILE", Path, "the file to write"),
+    arg(
+        "--bundle",
+        "FILE.zip",
+        Path,
+        "write settings, versions, hashes, trajectories and metrics of the run as one file for vislam reproduce",
+    ),
+    examples=(
+        "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
+        "vislam export runs/drive --format kitti --out drive.kitti",
+        "vislam export runs/drive --bundle drive.zip",
+    ),
 )
 def export(options: argparse.Namespace) -> int:
     """Write a trajectory of a run directory as a TUM, KITTI, EuRoC or OpenVINS file. Poses are those of the IMU in
     the estimator's world; nothing is aligned. Or bundle what others need to repeat the run.
     """
+    from toolkit.report.export import export, write_bundle
+
     if options.bundle is not None:
-        return _bundle(options)
+        if options.format or options.out or options.estimator or options.output:
+            raise UsageError("--bundle goes without --format, --out, --estimator and --output: it has everything")
+        print(printable(f"{options.bundle}: {write_bundle(options.run, options.bundle)}"))
+        return 0
     if options.format is None or options.out is None:
         raise UsageError("give --format and --out for a trajectory, or --bundle (see vislam export --help)")
-    from toolkit.report.export import export
-
     written = export(options.run, options.estimator, options.output, options.format, options.out)
     print(printable(f"{options.out}: {written}"))
     return 0
 
 
-def _bundle(options: argparse.Namespace) -> int:
-    from toolkit.report.export import write_bundle
-
-    if options.format or options.out or options.estimator or options.output:
-        raise UsageError("--bundle goes without --format, --out, --estimator and --output: it has everything")
-    written = write_bundle(options.run, options.bundle)
-    print(printable(f"{options.bundle}: {written}"))
-    return 0
-
-
-def _diff_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("before", metavar="RUN_A", type=Path, help="as vislam compare writes it")
-    parser.add_argument("after", metavar="RUN_B", type=Path, help="the run directory to compare with it")
-    parser.add_argument(
-        "--columns", metavar="KEY,...", type=names, default=(), help="metrics to show, or all (default: the tables')"
-    )
-    parser.add_argument("--json", action="store_true", help="print every metric and difference as JSON")
-
-
 @command(
     "diff",
     "show what differs between two run directories",
-    "vislam compare drive --estimators ekf --max-frames 40 --out runs/before",
-    "vislam compare drive --estimators ekf --max-frames 40 --set noise.motion_scale=1.2 --out runs/after",
-    "vislam diff runs/before runs/after",
-    arguments=_diff_arguments,
+    arg("before", "RUN_A", Path, _RUN),
+    arg("after", "RUN_B", Path, "the run directory to compare with it"),
+    arg("--columns", "KEY,...", names, "metrics to show, or all (default: the tables')", default=()),
+    flag("--json", "print every metric and difference as JSON"),
+    examples=(
+        "vislam compare drive --estimators ekf --max-frames 40 --out runs/before",
+        "vislam compare drive --estimators ekf --max-frames 40 --set noise.motion_scale=1.2 --out runs/after",
+        "vislam diff runs/before runs/after",
+    ),
 )
 def diff(options: argparse.Namespace) -> int:
     """Tell what differs between two run directories: settings, versions, data, how runs ended, and the metrics that
@@ -138,21 +119,19 @@ def diff(options: argparse.Namespace) -> int:
     return 0
 
 
-def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="as vislam export --bundle writes it")
-    parser.add_argument("--data", metavar="SEQUENCE", help="path of the recording here, if it is not the bundle's")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="keep the new run directory (default: it is not kept)")
-    add_output_arguments(parser, "every difference as JSON, and nothing else")
-    add_workers_argument(parser)
-
-
 @command(
     "reproduce",
     "repeat the run of a bundle and show what differs",
-    "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
-    "vislam export runs/drive --bundle drive.zip",
-    "vislam reproduce drive.zip",
-    arguments=_reproduce_arguments,
+    arg("bundle", "BUNDLE", Path, "as vislam export --bundle writes it"),
+    arg("--data", "SEQUENCE", str, "path of the recording here, if it is not the bundle's"),
+    arg("--out", "DIR", Path, "keep the new run directory (default: it is not kept)"),
+    output("every difference as JSON, and nothing else"),
+    WORKERS,
+    examples=(
+        "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
+        "vislam export runs/drive --bundle drive.zip",
+        "vislam reproduce drive.zip",
+    ),
 )
 def reproduce(options: argparse.Namespace) -> int:
     """Run again, with the settings in a bundle that vislam export --bundle made, and tell what differs: versions,
@@ -175,7 +154,7 @@ def reproduce(options: argparse.Namespace) -> int:
     if options.json:
         print(to_text(diff_document(found)), end="")
     elif not options.quiet:
-        _print(found, record, options)
+        _print(found, record, options.bundle)
     return 0 if found.same_results else 1
 
 
@@ -195,7 +174,7 @@ def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
         requested.command(requested)
 
 
-def _print(found: Differences, record: BundleRecord, options: argparse.Namespace) -> None:
+def _print(found: Differences, record: BundleRecord, bundle: Path) -> None:
     from toolkit.report.differences import diff_text
     from toolkit.report.export import installed_packages
     from toolkit.report.prose import width_of_output
@@ -206,5 +185,4 @@ def _print(found: Differences, record: BundleRecord, options: argparse.Namespace
     if others:
         more = f" and {len(others) - _MOST_PACKAGES} more" if len(others) > _MOST_PACKAGES else ""
         print(printable(f"not installed here in the bundle's release: {', '.join(others[:_MOST_PACKAGES])}{more}"))
-    verdict = "reproduced" if found.same_results else "not reproduced: what differs is above"
-    print(printable(f"{options.bundle}: {verdict}"))
+    print(printable(f"{bundle}: {'reproduced' if found.same_results else 'not reproduced: what differs is above'}"))

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"]
 NEES, NIS = "nees_pose_mean", "nis_mean"
+# The name that stands for the truth among those of trajectories.
+TRUTH = "truth"
 
 
 @dataclass(frozen=True)

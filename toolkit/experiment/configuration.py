@@ -1,17 +1,22 @@
 """A comparison as a file: a TOML file somebody wrote, or the manifest of a run that is to be repeated."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
 
 from toolkit.errors import DataError, did_you_mean
-from toolkit.files.documents import readable
+from toolkit.files.documents import Record, readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings import Settings, SettingsError, read_toml, settings_of
+
+if TYPE_CHECKING:
+    from toolkit.estimator import Build
+    from toolkit.experiment.pipeline import Plan
+    from toolkit.sequence import Sequence as Recorded
 
 # The table of a configuration that says what to compare; all others are settings.
 COMPARE = "compare"
@@ -53,15 +58,52 @@ def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]
 
 def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place: str) -> Configuration:
     """Return nested values as records, the defaults where nothing is given; raises SettingsError as settings_of."""
-    known = [field.name for field in msgspec.structs.fields(Request)]
     for key in request:
-        if key not in known:
-            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{did_you_mean(key, known)}")
+        if key not in Request.__struct_fields__:
+            meant = did_you_mean(key, Request.__struct_fields__)
+            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{meant}")
+    return Configuration(record_of(Request, request, f"{place}: {COMPARE}."), settings_of(settings, place))
+
+
+def record_of(record: type[Record], values: Mapping[str, Any], place: str) -> Record:
+    """Return values as a record; raises SettingsError, which begins with ``place``, for one that it cannot have."""
     try:
-        requested = msgspec.convert(dict(request), Request)
+        return msgspec.convert(dict(values), record)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {COMPARE}.{readable(error, dict(request), Request)}") from error
-    return Configuration(requested, settings_of(settings, place))
+        raise SettingsError(f"{place}{readable(error, dict(values), record)}") from error
+
+
+def plan_of(
+    requested: Configuration,
+    default: "Sequence[str | Recorded]",
+    own: "Mapping[str, Build] | None" = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> "Plan":
+    """Return the plan of a configuration; where it names no sequences ``default`` are compared.
+
+    ``own`` are further estimators as functions by name. Raises SettingsError for what does not go together.
+    """
+    from toolkit.experiment.pipeline import Plan
+    from toolkit.experiment.recording import Part
+    from toolkit.registry import defaults
+
+    request = requested.request
+    usual = () if own else defaults()
+    return Plan(
+        sources=tuple(request.sequences or default),
+        estimators=usual if request.estimators is None else request.estimators,
+        own=own or {},
+        settings=requested.settings,
+        truth=None if request.truth is None else Path(request.truth),
+        trajectories={name: Path(file) for name, file in request.trajectories.items()},
+        keep=frozenset(request.keep),
+        max_frames=request.max_frames,
+        workers=workers,
+        keep_trajectories=request.keep_trajectories,
+        scheduler=scheduler,
+        part=Part(request.from_s, request.to_s, request.every),
+    )
 
 
 def _manifest(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
-from toolkit.experiment.references import check_names, external_runs, reference_runs
+from toolkit.experiment.references import check_file_names, check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
@@ -58,6 +58,13 @@ class Plan:
             raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
         if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:
             raise SettingsError(f"workers is {self.workers}; it is a number of processes, 1 to {MOST_WORKERS}")
+        if self.workers is not None and self.scheduler is not None:
+            raise SettingsError("scheduler and workers exclude each other: a cluster has its own workers")
+        for what, given in {"truth": self.truth is not None, "a trajectory": bool(self.trajectories)}.items():
+            if given and len(self.sources) != 1:
+                raise SettingsError(f"{what} goes with exactly one sequence")
+            if given and self.settings.seeds > 1:
+                raise SettingsError(f"{what} and seeds exclude each other: a file is of one recording")
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -125,13 +132,15 @@ def workers_of(plan: Plan) -> Pool:
 def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[PreparedCase, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
-    Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
-    trajectory that cannot, or for a recording without a seed that is to be repeated over seeds.
+    Raises EstimatorError for an estimator that is unknown or cannot be used, SettingsError for a trajectory's name that
+    is taken, DataError for a recording, a truth or a trajectory that cannot be used, or for a recording without a seed
+    that is to be repeated over seeds.
     """
     entries = find_all(plan.estimators)
     check_options(plan.settings, {*plan.own, *_own_digests(entries)})
     for entry in entries.values():
         entry.check_usable(plan.settings)
+    check_file_names(plan.trajectories, {*entries, *plan.own})
     files = {name: read_poses(path) for name, path in plan.trajectories.items()}
     for source in plan.sources:
         _check_seeds(plan, source)

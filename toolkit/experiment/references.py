@@ -1,6 +1,6 @@
 """Estimates of other systems from a recording, as runs that were not made here."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
@@ -18,9 +18,10 @@ from toolkit.datasets.trajectories.exchanged_axes import check_axes
 from toolkit.datasets.trajectories.poses import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
-from toolkit.experiment.comparison import plain_name
+from toolkit.experiment.comparison import TRUTH, plain_name
 from toolkit.metrics.parts.association import associate, median_period_ns, poses_at
-from toolkit.sequence import Sequence, Truth
+from toolkit.sequence import LONGEST_NAME, Sequence, Truth
+from toolkit.settings import SettingsError
 
 _OTHER_TERMS = (
     "its start, its noise and its cost are its own, and it may have used the tracks that are withheld from the others"
@@ -41,6 +42,19 @@ def external_runs(files: Mapping[str, PosesFile], recording: Sequence, sequence:
     is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
     """
     return tuple(_external(name, poses, recording, sequence) for name, poses in files.items())
+
+
+def check_file_names(names: Iterable[str], estimators: Iterable[str]) -> None:
+    """Raise SettingsError for a trajectory whose name is no file's, or is one of an estimator, the truth or another."""
+    taken = {plain_name(name): name for name in (TRUTH, *estimators)}
+    for name in names:
+        plain = plain_name(name)
+        if len(plain) > LONGEST_NAME:
+            raise SettingsError(f"a trajectory's name of {len(plain)} characters is too long for a file; shorten it")
+        if not plain or plain in taken:
+            why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
+            raise SettingsError(f"a trajectory's name {name} {why}; choose another")
+        taken[plain] = f"another trajectory, {name}"
 
 
 def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesFile]) -> None:

@@ -17,6 +17,7 @@ from msgspec import UNSET, Meta, Struct
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
+from toolkit.experiment.comparison import TRUTH
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
 from toolkit.files.reading import open_input
@@ -24,7 +25,6 @@ from toolkit.files.writing import replaced_file, write_text
 from toolkit.report.records import Report
 from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
-TRUTH = "truth"
 BUNDLE, LOCK = "bundle.json", "requirements.txt"
 _NEVER_IN = ("figures/",)
 # The oldest stamp that a zip archive can hold, for every entry, so that the same files give the same bytes.

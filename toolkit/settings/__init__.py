@@ -5,7 +5,7 @@ runs carry the same one. A threshold that no user has to choose is no setting: i
 Read ``records``, then ``reading``, which converts input to a record and describes each setting.
 """
 
-from toolkit.settings.reading import Described, assigned, describe, read_toml, settings_of, with_assignments
+from toolkit.settings.reading import Described, assigned, describe, read_toml, settings_of, with_changes
 from toolkit.settings.records import (
     DEFAULTS,
     POLICIES,
@@ -49,5 +49,5 @@ __all__ = [
     "outlier_summary",
     "read_toml",
     "settings_of",
-    "with_assignments",
+    "with_changes",
 ]

@@ -5,7 +5,7 @@ They are given in TOML, in a manifest or as ``KEY=VALUE``. Descriptions are read
 
 import math
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import date, time
 from numbers import Number
 from pathlib import Path
@@ -95,22 +95,20 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise SettingsError(f"{path}: is not TOML ({error})") from error
 
 
-def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
-    """Return nested values with ``section.key=value`` put in, the value as TOML writes it or a bare word."""
+def with_changes(given: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested values with the values of ``section.key`` put in."""
     result: dict[str, Any] = {key: dict(v) if isinstance(v, Mapping) else v for key, v in given.items()}
-    # A policy first: the single values on top of it hold, in whatever order they are named.
-    for text in sorted(assignments, key=lambda text: assigned(text)[0] != _POLICY):
-        key, value = assigned(text)
+    # A policy first, which replaces all values of the former one: the single values on top of it hold.
+    for key, value in sorted(changes.items(), key=lambda change: change[0] != _POLICY):
         *sections, name = key.split(".")
         at = result
         for section in sections:
             at = at.setdefault(section, {})
             if not isinstance(at, dict):
-                raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
+                raise SettingsError(f"{key} is set, and {section} is a value: it has no keys of its own")
         at[name] = value
         if key == _POLICY:
-            # Naming a policy replaces all values of the former one.
-            result["outliers"] = {"policy": at[name]}
+            result["outliers"] = {"policy": value}
     return result
 
 

@@ -1,0 +1,58 @@
+"""Names of others act neither on a terminal nor in a report, and paths may be any bytes."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toolkit.report.prose import in_markdown
+
+Vislam = Callable[..., int]
+RECORDING = Path(__file__).parents[2] / "data" / "drive_small"
+HOSTILE = "a\x1b[2J\u202eb|c <img src=x> [click](http://x) $\\frac$ \udcff"
+QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+
+
+def test_names_act_neither_on_the_terminal_nor_in_the_report(vislam: Vislam, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = Path(shutil.copytree(RECORDING, "hostile"))
+    text = json.loads((folder / "recording.json").read_text())
+    text["name"], text["provenance"]["facts"] = HOSTILE, [f"# {HOSTILE}\n\n---"]
+    (folder / "recording.json").write_text(json.dumps(text))
+    assert vislam("compare", "hostile", *QUICK, "--out", "run") == 0
+    messages = capfd.readouterr()
+    assert messages.err == ""
+    assert messages.out.replace("\n", "").isprintable()
+    report = Path("run/report.md").read_text(encoding="utf-8")
+    assert report.replace("\n", "").isprintable()
+    assert not re.search(r"(?<!\\)(<img|\[click|\|c )|^---", report, re.MULTILINE)
+    assert vislam("report", "run") == 0
+    assert vislam("check-data", "hostile") == 0
+    assert capfd.readouterr().out.replace("\n", "").isprintable()
+
+
+@pytest.mark.parametrize("text", ["plain words, 3.5 m", "kitti_t_percent at -0.5", "a (b) c: d; 1e-05 = 2"])
+def test_plain_text_is_the_same_in_markdown(text: str) -> None:
+    assert in_markdown(text) == text
+
+
+def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(
+    vislam: Vislam, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(RECORDING, os.fsdecode(b"caf\xe9"))
+    assert vislam("compare", folder, *QUICK, "--out", os.fsdecode(b"r\xe9sultats")) == 0
+    assert "results: r\\udce9sultats" in capfd.readouterr().out
+    assert vislam("report", os.fsdecode(b"r\xe9sultats")) == 0
+
+
+def test_a_recording_without_noise_is_named(vislam: Vislam, one_line: Callable[[], str]) -> None:
+    folder = Path(shutil.copytree(RECORDING, "exact"))
+    text = json.loads((folder / "recording.json").read_text())
+    text["noise"]["gyro_noise_density"] = [0.0, 0.0, 0.0]
+    (folder / "recording.json").write_text(json.dumps(text))
+    assert vislam("compare", "exact", "--estimators", "dead-reckoning", "--out", "run") == 3
+    assert "noise.gyro_noise_density is 0, expected a positive number" in one_line()
+    assert not Path("run").exists()

@@ -1,0 +1,157 @@
+"""Whatever is asked for that is not there: an exit status and one line that names it, before anything runs."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toolkit import runner
+
+Vislam = Callable[..., int]
+OneLine = Callable[[], str]
+RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
+ENDLESS = "n" * 300
+
+# Words, exit status, and what the line has to say. The files named here are those of ``files`` below.
+WRONG: list[tuple[str, int, str]] = [
+    ("", 2, "COMMAND"),
+    ("compair", 2, "did you mean compare?"),
+    ("compare --max-frames 1", 2, "at least 2"),
+    ("compare --max-frames many", 2, "expected a whole number, not 'many'"),
+    ("compare --seed -1", 2, "at least 0"),
+    ("compare drive --workers 100000", 2, "at most 1024"),
+    ("compare --estimators ,", 2, "expected names separated by commas"),
+    ("compare drive flight --truth gt.tum", 2, "exactly one sequence"),
+    ("compare drive --no-repair --keep time-gap", 2, "not allowed with"),
+    ("compare drive --json --quiet", 2, "not allowed with"),
+    ("verify ekf --json --quiet", 2, "not allowed with"),
+    ("compare drive --config a.toml --config b.toml", 2, "--config is given twice; it takes one file"),
+    # Names that are misspelt get the nearest.
+    ("compare drive --max 10", 2, "there is no option --max; did you mean --max-frames? (see vislam compare --help)"),
+    ("compare drive --estimtors=ekf", 2, "there is no option --estimtors; did you mean --estimators?"),
+    ("compare drive --estimators ekf batch iekf", 2, "give names with commas: --estimators ekf,batch,iekf (see"),
+    ("compare drive --max-frames 9 batch", 2, "unexpected argument batch (see"),
+    ("compare drive --estimators EKF", 5, "did you mean ekf?"),
+    ("compare drive --estimators dead-reckoning,oracle", 5, "no estimator is called oracle"),
+    ("compare Drive", 3, "did you mean drive?"),
+    ("compare drive --start Truth", 2, "did you mean truth?"),
+    ("compare drive --keep time_gap", 2, "did you mean time-gap?"),
+    ("compare drive --keep stale", 2, "did you mean stale-frames?"),
+    ("compare drive --keep tim", 2, "did you mean time-order, time-gap or time-offset?"),
+    ("compare drive --columns ate_se3", 2, "no metric is called ate_se3; did you mean ate_se3_m?"),
+    ("simulate drive_imu --out d", 2, "did you mean drive-imu?"),
+    ("list cameras", 2, "estimators, metrics, faults"),
+    ("cite mscf", 5, "no estimator or format is called mscf"),
+    # Settings, and files of them.
+    ("compare drive --set window.lag=3", 2, "there is no setting window.lag; did you mean window.lag_s?"),
+    ("compare drive --set window.lag_s", 2, "--set takes KEY=VALUE"),
+    ("compare drive --set window.most_states=1", 2, "window.most_states: expected integer >= 2"),
+    ("compare drive --window 1e-9", 2, "window.lag_s: expected number >= 0.001"),
+    ("compare drive --set estimators.ekff.gain=1", 5, "did you mean ekf?"),
+    ("compare drive --estimators ekf --set estimators.ekf.gain=2", 5, "estimator ekf has no option gain"),
+    ("compare drive --config sound.toml --set window.lag=3", 2, "sound.toml or the command line: there is no setting"),
+    ("compare drive --config wrong.toml", 2, "wrong.toml: there is no setting outliers.gate; did you mean"),
+    ("compare drive --config asked.toml", 2, "asked.toml: there is no compare.estimator; did you mean estimators?"),
+    ("compare drive --config typed.toml", 2, "typed.toml: compare.max_frames: expected integer >= 2"),
+    ("compare drive --config kept.toml", 2, "no fault is called stale (did you mean stale-frames?)"),
+    ("compare drive --config broken.toml", 2, "broken.toml: is not TOML"),
+    ("compare drive --config absent.toml", 2, "absent.toml: cannot be read"),
+    ("compare drive --config other.json", 2, "other.json: holds no settings"),
+    *(
+        (
+            f"compare drive {option} --set {text}",
+            2,
+            f"{option} and --set {text} give {text.partition('=')[0]} two values",
+        )
+        for option, text in (
+            ("--window 3", "window.lag_s=2"),
+            ("--outliers gate", "outliers.policy=robust"),
+            ("--seed 1", "first_seed=2"),
+            ("--tracks images", "frontend.tracks=auto"),
+            ("--topics imu=/a", "frontend.topics=imu=/b"),
+            ("--columns bound", "metrics.bound=false"),
+            ("--set window.lag_s=1", "window.lag_s=2"),
+        )
+    ),
+    ("baseline drive:1 --set seeds=9", 2, "--set seeds=9 is for compare"),
+    # Recordings, trajectories, and what does not go together.
+    ("compare no/such.npz", 3, "no/such.npz: no such file or directory"),
+    ("compare https://example.org/03.npz", 3, "it is an address: download it and name the file"),
+    ("compare run", 3, "is a run directory and no recording: vislam report shows it, and --config run/manifest.json"),
+    ("compare drive --truth missing.tum", 3, "missing.tum"),
+    ("compare kitti00 --seeds 2", 3, "kitti00 is the same under every seed"),
+    (f"compare {RECORDING} --seeds 2", 3, "drive_small is the same under every seed"),
+    ("compare drive --seeds 2 --truth gt.tum", 2, "exclude each other"),
+    ("compare drive --workers 2 --scheduler tcp://host:8786", 2, "exclude each other"),
+    ("compare drive --topics left=/cam0", 3, "it has no topics, a bag has; leave --topics out"),
+    (f"compare {RECORDING} --tracks images", 3, "has tracks and no images; leave --tracks images out"),
+    ("compare drive --trajectory gt.tum", 2, "expected NAME=FILE"),
+    ("compare drive --trajectory ekf=gt.tum --estimators ekf", 2, "name ekf is taken by ekf"),
+    ("compare drive --trajectory truth=gt.tum", 2, "name truth is taken by truth"),
+    ("compare drive --trajectory a=gt.tum --trajectory a.=gt.tum", 2, "a. is taken by another trajectory"),
+    ("compare drive --trajectory (!)=gt.tum", 2, "has no letter or digit"),
+    (f"compare drive --trajectory {ENDLESS}=gt.tum", 2, "a trajectory's name of 300 characters is too long"),
+    ("compare drive flight --trajectory a=gt.tum", 2, "exactly one sequence"),
+    ("compare drive --trajectory theirs=missing.tum", 3, "missing.tum: cannot be read"),
+    ("compare drive --trajectory theirs=empty", 3, "empty: the file holds no poses"),
+    ("simulate drive --out d --duration 1e9", 2, "its duration is from 0.1 to 3600 s"),
+    ("simulate flight --out d --lens radtan", 2, "--lens is of images; add --images"),
+    ("simulate flight --out d --images --blur 50", 2, "expected milliseconds from 0 to 40"),
+    ("simulate drive --out d --images", 2, "flight has"),
+    ("tracks drive --out x", 3, "drive: holds no images"),
+    ("tracks nowhere --out x", 3, "no such file"),
+    ("tracks nowhere --out x --set frontend.window=9", 2, "did you mean frontend.window_px?"),
+    ("report", 2, "RUN_DIR"),
+    ("report nowhere", 3, "nowhere is not a directory"),
+    ("report t", 3, "t is not a run directory"),
+    ("export run --format tum", 2, "give --format and --out"),
+    # Outputs that cannot be written.
+    ("compare drive --estimators dead-reckoning --out taken", 4, "taken exists and is not a directory"),
+    ("compare drive --estimators dead-reckoning --out taken/run", 4, "taken/run"),
+    (f"compare drive --estimators dead-reckoning --out {ENDLESS}", 4, "File name too long"),
+    # Of a word of thousands of letters both ends are told.
+    (f"diff {ENDLESS * 20} run", 3, "nnn...nnn"),
+    (f"compare drive --workers {ENDLESS * 20}", 2, "nnn...nnn"),
+    (f"cite {ENDLESS}", 5, "or name a run directory"),
+]
+
+
+@pytest.fixture
+def files(vislam: Vislam) -> None:
+    del vislam  # in whose directory they stand
+    Path("wrong.toml").write_text("[outliers]\ngate = 0.9\n")
+    Path("asked.toml").write_text('[compare]\nestimator = ["ekf"]\n')
+    Path("typed.toml").write_text("[compare]\nmax_frames = 1\n")
+    Path("kept.toml").write_text('[compare]\nkeep = ["stale"]\n')
+    Path("broken.toml").write_text("window = [")
+    Path("sound.toml").write_text("seeds = 1")
+    Path("other.json").write_text("{}")
+    Path("gt.tum").write_text("0 0 0 0 0 0 0 1\n")
+    for name in ("taken", "empty"):
+        Path(name).touch()
+    for name in ("t", "run"):
+        Path(name).mkdir()
+    for name in ("manifest.json", "metrics.json"):
+        Path("run", name).write_text("{}")
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize(("words", "status", "why"), WRONG, ids=[one[0][:80] for one in WRONG])
+def test_a_wrong_command_line_is_answered_in_one_line_before_anything_runs(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, words: str, status: int, why: str
+) -> None:
+    monkeypatch.setattr(runner, "run", None)
+    before = sorted(Path().rglob("*"))
+    assert vislam(*words.split()) == status
+    assert why in (told := one_line())
+    assert len(told) < 1000
+    assert sorted(Path().rglob("*")) == before
+
+
+def test_a_cluster_needs_a_package_that_is_named(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert vislam("compare", "drive", "--estimators", "dead-reckoning", "--scheduler", "tcp://host:8786") == 71
+    assert "a cluster needs the package distributed: pip install 'vislam-toolkit[cluster]'" in one_line()
