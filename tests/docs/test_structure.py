@@ -59,7 +59,7 @@ def test_estimators_import_of_the_toolkit_what_the_page_on_extending_names_and_n
     allowed = set(re.findall(r"`(\w+)`", named[1]))
     files = (PROJECT / "filters").rglob("*.py")
     used = {name.split(".")[1] for path in files for name in imports(path) if name.startswith("toolkit.")}
-    assert used == allowed
+    assert used <= allowed
     forbidden = contract("Estimators see the measurements and the models, not the metrics")["forbidden_modules"]
     # What is left is below the modules that estimators may import, and reached through them alone.
     below = {"discovery", "files", "threads", "track_budget"}
