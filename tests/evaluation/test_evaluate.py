@@ -213,7 +213,7 @@ def test_a_bad_file_is_reported_in_one_line_and_beside_a_good_one_counted(
         (("truths/S0.tum", "results"), 3, "needs its name, NAME=results"),
         (("truths", "a=results/good", "a=results/poor"), 3, "a is given twice"),
         (("truth.tum", "truth.tum", "--metric", "ate_se_m"), 2, "did you mean ate_se3_m?"),
-        (("truth.tum", "truth.tum", "--least-coverage", "101"), 2, "expected 0 to 100 percent"),
+        (("truth.tum", "truth.tum", "--least-coverage", "101"), 2, "expected percent from 0 to 100"),
         (("results/good", "results"), 3, "it has 3 truths for S0"),
         (("truth.tum", "truth.tum", "--out", "results"), 4, "results"),
     ],
