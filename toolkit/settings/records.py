@@ -9,12 +9,15 @@ from msgspec import Meta, Struct
 from toolkit.errors import VislamError
 
 _NS_PER_S = 1_000_000_000
-Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
+PolicyName = Literal["robust", "gate", "none", "classic"]
 Arithmetic = Literal["auto", "compiled", "numpy"]
 Auto = Literal["auto"]
 Scalar = bool | int | float | str
+Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+HuberThreshold = Annotated[float, Meta(ge=1e-3, le=1e6, extra={"unit": "sigma"})]
+Pixels = Annotated[float, Meta(gt=0.0, le=20.0)]
 
 
 class SettingsError(VislamError):
@@ -23,15 +26,11 @@ class SettingsError(VislamError):
     exit_status: ClassVar[int] = 2
 
 
-def _setting(description: str, unit: str = "", *, none: str = "", **within: float) -> Meta:
+def _about(description: str, unit: str = "", *, none: str = "", **within: float) -> Meta:
     """Return what is told of a setting: what it is, its unit, what None stands for, and its range as Meta has it."""
     extra = {key: text for key, text in {"unit": unit, "none": none}.items() if text}
     bounds: dict[str, Any] = {**within}
     return Meta(description=description, extra=extra, **bounds)
-
-
-PolicyName = Literal["robust", "gate", "none", "classic"]
-HuberThreshold = Annotated[float, Meta(ge=1e-3, le=1e6, extra={"unit": "sigma"})] | None
 
 
 class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,25 +40,25 @@ class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
     exceeded as often. None is no gate, no loss.
     """
 
-    policy: Annotated[PolicyName, _setting("policy that sets all keys below, except those that are set themselves")] = (
+    policy: Annotated[PolicyName, _about("policy that sets all keys below, except those that are set themselves")] = (
         "robust"
     )
     gate_probability: Annotated[
-        Probability | None, _setting("chi-square probability below which a measurement is accepted")
+        Probability | None, _about("chi-square probability below which a measurement is accepted")
     ] = 0.99
     smoother_gate_factor: Annotated[
-        float, _setting("the incremental smoothers' gate, as a multiple of the filters'", ge=1.0)
+        float, _about("the incremental smoothers' gate, as a multiple of the filters'", ge=1.0)
     ] = 1.0
-    joint_huber: Annotated[HuberThreshold, _setting("Huber threshold of the joint and the windowed filters")] = 1.5
-    filter_huber: Annotated[HuberThreshold, _setting("Huber threshold of the decoupled filters")] = 1.5
-    smoother_huber: Annotated[HuberThreshold, _setting("Huber threshold of the incremental smoothers")] = 1.5
-    batch_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's first solve")] = 1.5
-    batch_cauchy: Annotated[HuberThreshold, _setting("Cauchy scale of batch's second solve")] = 2.0
+    joint_huber: Annotated[HuberThreshold | None, _about("Huber threshold of the joint and the windowed filters")] = 1.5
+    filter_huber: Annotated[HuberThreshold | None, _about("Huber threshold of the decoupled filters")] = 1.5
+    smoother_huber: Annotated[HuberThreshold | None, _about("Huber threshold of the incremental smoothers")] = 1.5
+    batch_huber: Annotated[HuberThreshold | None, _about("Huber threshold of batch's first solve")] = 1.5
+    batch_cauchy: Annotated[HuberThreshold | None, _about("Cauchy scale of batch's second solve")] = 2.0
     batch_cut_probability: Annotated[
-        Probability | None, _setting("probability below which batch's last solve leaves a sighting out")
+        Probability | None, _about("probability below which batch's last solve leaves a sighting out")
     ] = 1e-3
     # Beyond the cut no sightings are left to weigh down, and a loss would weigh down sound ones.
-    batch_last_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's last solve")] = None
+    batch_last_huber: Annotated[HuberThreshold | None, _about("Huber threshold of batch's last solve")] = None
 
 
 POLICIES: Mapping[PolicyName, Outliers] = {
@@ -96,24 +95,19 @@ _LAG_WITH_IMU_S, _LAG_S = 2.0, 0.6
 class Window(Struct, frozen=True, forbid_unknown_fields=True):
     """How much of the past a windowed estimator keeps, filter or smoother."""
 
-    lag_s: (
-        Annotated[
-            float,
-            _setting(
-                "window of the windowed filters and smoothers",
-                "s",
-                none=f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}",
-                ge=1e-3,
-                le=3600.0,
-            ),
-        ]
-        | None
-    ) = None
+    lag_s: Annotated[
+        Annotated[float, Meta(ge=1e-3, le=3600.0)] | None,
+        _about(
+            "window of the windowed filters and smoothers",
+            "s",
+            none=f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}",
+        ),
+    ] = None
     most_states: Annotated[
-        int, _setting("most states in the window; if there are more frames, states are thinned evenly", ge=2, le=10_000)
+        int, _about("most states in the window; if there are more frames, states are thinned evenly", ge=2, le=10_000)
     ] = 50
     landmarks: Annotated[
-        int, _setting("landmarks msckf-slam keeps in its state for as long as they are seen", ge=0, le=500)
+        int, _about("landmarks msckf-slam keeps in its state for as long as they are seen", ge=0, le=500)
     ] = 50
 
     def seconds(self, motion_kind: str) -> float:
@@ -134,82 +128,52 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     """The noise every estimator assumes; by default what the recording states or its samples show."""
 
     # Below 1e-5 px, rounding leaves covariances that are not positive definite.
-    pixel_sigma_px: (
-        Annotated[
-            float,
-            _setting(
-                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", ge=1e-3, le=100.0
-            ),
-        ]
-        | None
-    ) = None
-    track_weight: (
-        Annotated[
-            float,
-            _setting(
-                "share of its stated information that a sighting carries, because errors along tracks are correlated; "
-                "auto: measured on the recording",
-                gt=0.0,
-                le=1.0,
-            ),
-        ]
-        | Auto
-    ) = "auto"
-    motion_scale: (
-        Annotated[
-            float,
-            _setting(
-                "factor on the white-noise densities of the motion samples; auto: measured on the recording, 1 or more",
-                ge=1e-6,
-                le=1e3,
-            ),
-        ]
-        | Auto
-    ) = "auto"
-    measured_s: (
-        Annotated[
-            float,
-            _setting(
-                "length of the beginning on which auto is measured, so that later causal answers use the past only",
-                "s",
-                none="all of it",
-                ge=1e-6,
-                le=86400.0,
-            ),
-        ]
-        | None
-    ) = None
+    pixel_sigma_px: Annotated[
+        Annotated[float, Meta(ge=1e-3, le=100.0)] | None,
+        _about("standard deviation of uL and uR; v in proportion", "px", none="the recording's"),
+    ] = None
+    track_weight: Annotated[
+        Annotated[float, Meta(gt=0.0, le=1.0)] | Auto,
+        _about(
+            "share of its stated information that a sighting carries, because errors along tracks are correlated; "
+            "auto: measured on the recording"
+        ),
+    ] = "auto"
+    motion_scale: Annotated[
+        Annotated[float, Meta(ge=1e-6, le=1e3)] | Auto,
+        _about("factor on the white-noise densities of the motion samples; auto: measured on the recording, 1 or more"),
+    ] = "auto"
+    measured_s: Annotated[
+        Annotated[float, Meta(ge=1e-6, le=86400.0)] | None,
+        _about(
+            "length of the beginning on which auto is measured, so that later causal answers use the past only",
+            "s",
+            none="all of it",
+        ),
+    ] = None
     bridge_gaps: Annotated[
-        bool, _setting("where frames have no track in common, measured twists before and after predict the twist, too")
+        bool, _about("where frames have no track in common, measured twists before and after predict the twist, too")
     ] = True
 
 
 class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
     """Which of a recording's tracks the estimators work on; those withheld stay as they are."""
 
-    budget: (
-        Annotated[
-            int,
-            _setting(
-                "most tracks a frame that estimators get, spread over image and depth, the oldest first",
-                none="all",
-                ge=10,
-                le=10_000,
-            ),
-        ]
-        | None
-    ) = None
+    budget: Annotated[
+        Annotated[int, Meta(ge=10, le=10_000)] | None,
+        _about("most tracks a frame that estimators get, spread over image and depth, the oldest first", none="all"),
+    ] = None
     leave_out_moving: Annotated[
-        bool, _setting("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
+        bool, _about("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
     ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
     """Metrics that take long and are computed on request alone."""
 
-    bound: Annotated[
-        bool, _setting("the Cramér-Rao bound and what each estimator loses against it, on simulations")
-    ] = False
+    bound: Annotated[bool, _about("the Cramér-Rao bound and what each estimator loses against it, on simulations")] = (
+        False
+    )
 
     def requested(self) -> tuple[str, ...]:
         """Return the names of those that are asked for."""
@@ -221,32 +185,26 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
 
     tracks: Annotated[
         Tracks,
-        _setting("source of the tracks of a recording with images; auto: the images, if nearly all of them exist"),
+        _about("source of the tracks of a recording with images; auto: the images, if nearly all of them exist"),
     ] = "auto"
     topics: Annotated[
         str | None,
-        _setting("topics of a bag, as in left=/cam0/image_raw,imu=/imu0; others are guessed from their names"),
+        _about("topics of a bag, as in left=/cam0/image_raw,imu=/imu0; others are guessed from their names"),
     ] = None
-    max_tracks: Annotated[int, _setting("most stereo tracks a frame", ge=20, le=2000)] = 200
-    spacing_px: Annotated[float, _setting("least distance of two tracks in the left image", "px", ge=3.0, le=200.0)] = (
+    max_tracks: Annotated[int, _about("most stereo tracks a frame", ge=20, le=2000)] = 200
+    spacing_px: Annotated[float, _about("least distance of two tracks in the left image", "px", ge=3.0, le=200.0)] = (
         12.0
     )
-    window_px: Annotated[int, _setting("side of the window that KLT compares", "px", ge=7, le=63)] = 15
-    levels: Annotated[int, _setting("halvings of the image in KLT's pyramid", ge=0, le=8)] = 3
-    nearest_m: Annotated[float, _setting("smallest depth that is searched", "m", gt=0.0, le=100.0)] = 0.25
-    forward_backward_px: Annotated[float, _setting("largest forward-backward error of KLT", "px", gt=0.0, le=10.0)] = (
-        0.3
+    window_px: Annotated[int, _about("side of the window that KLT compares", "px", ge=7, le=63)] = 15
+    levels: Annotated[int, _about("halvings of the image in KLT's pyramid", ge=0, le=8)] = 3
+    nearest_m: Annotated[float, _about("smallest depth that is searched", "m", gt=0.0, le=100.0)] = 0.25
+    forward_backward_px: Annotated[float, _about("largest forward-backward error of KLT", "px", gt=0.0, le=10.0)] = 0.3
+    epipolar_px: Annotated[Pixels, _about("largest difference of left and right rows", "px")] = 1.5
+    ransac_px: Annotated[Pixels, _about("largest distance from the common motion of tracks", "px")] = 2.0
+    patch_px: Annotated[Pixels, _about("largest distance of a track from the best match of its first patch", "px")] = (
+        1.5
     )
-    epipolar_px: Annotated[float, _setting("largest difference of left and right rows", "px", gt=0.0, le=20.0)] = 1.5
-    ransac_px: Annotated[
-        float, _setting("largest distance from the common motion of tracks", "px", gt=0.0, le=20.0)
-    ] = 2.0
-    patch_px: Annotated[
-        float, _setting("largest distance of a track from the best match of its first patch", "px", gt=0.0, le=20.0)
-    ] = 1.5
-    patch_correlation: Annotated[float, _setting("least correlation with the track's first patch", gt=0.0, lt=1.0)] = (
-        0.8
-    )
+    patch_correlation: Annotated[Probability, _about("least correlation with the track's first patch")] = 0.8
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -259,16 +217,16 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     metrics: Metrics = Metrics()
     frontend: Frontend = Frontend()
     start: Annotated[
-        Literal["measurements", "truth"], _setting("source of the first state; a start from the truth is labelled")
+        Literal["measurements", "truth"], _about("source of the first state; a start from the truth is labelled")
     ] = "measurements"
-    card: Annotated[bool, _setting("describe the recording's tracks in the report; takes some seconds")] = False
+    card: Annotated[bool, _about("describe the recording's tracks in the report; takes some seconds")] = False
     arithmetic: Annotated[
-        Arithmetic, _setting("of filters that have both kinds: auto is compiled where the extra fast is installed")
+        Arithmetic, _about("of filters that have both kinds: auto is compiled where the extra fast is installed")
     ] = "auto"
-    first_seed: Annotated[int, _setting("seed of simulated sequences, the first of several", ge=0)] = 0
-    seeds: Annotated[int, _setting("how many seeds a simulated sequence is repeated over", ge=1, le=100_000)] = 1
+    first_seed: Annotated[int, _about("seed of simulated sequences, the first of several", ge=0)] = 0
+    seeds: Annotated[int, _about("how many seeds a simulated sequence is repeated over", ge=1, le=100_000)] = 1
     vary: Annotated[
-        Varied, _setting("what a seed draws of a simulation: the noise, or trajectory and landmarks as well")
+        Varied, _about("what a seed draws of a simulation: the noise, or trajectory and landmarks as well")
     ] = "noise"
     estimators: dict[str, dict[str, Scalar]] = {}
 
