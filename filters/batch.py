@@ -43,7 +43,7 @@ from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.measurements import Packet, StereoFrame, StereoRig, is_left_only
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.motion import motion_model
@@ -172,7 +172,7 @@ class Batch:
         cut = self._outliers.batch_cut_probability
         probability = None if cut is None else 1.0 - cut
         return [
-            frame.select(distance < chi2_bound(left_only.degrees_of_freedom(frame.uvs_px), probability))
+            frame.select(distance < chi2_bound(stereo.degrees_of_freedom(frame.uvs_px), probability))
             for frame, distance, _ in _residuals(frames, values, self._rig)
         ]
 
@@ -219,8 +219,8 @@ def _residuals(
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
     seen = points[np.searchsorted(ids, np.concatenate([frame.track_ids for frame in frames]))]
     predicted_px, depth_m = stereo.images(transform(np.repeat(T_imu_world, sizes, axis=0), seen), rig)
-    covs_px2 = np.broadcast_to(left_only.noise_px2(uvs_px, rig), (len(seen), 3, 3))
-    distance = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted_px), covs_px2)
+    covs_px2 = np.broadcast_to(stereo.noise_px2(uvs_px, rig), (len(seen), 3, 3))
+    distance = mahalanobis_squared(stereo.residuals_px(uvs_px, predicted_px), covs_px2)
     ends = np.cumsum(sizes)[:-1]
     yield from zip(frames, np.split(distance, ends), np.split(depth_m, ends), strict=True)
 

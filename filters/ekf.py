@@ -20,7 +20,7 @@ from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.measurements import Packet, StereoRig
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.models.gating import huber_threshold, huber_weights, mahalanobis_squared
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE, Belief
@@ -52,7 +52,7 @@ class DecoupledEkf(Filter):
         if len(seen):
             self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate)
             # The landmarks whose sighting passed, by the corrected pose, which is taken as uncertain and independent.
-            bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
+            bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
             pose_cov = self._belief.cov[POSE, POSE]
             seen = correct_landmarks_below(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
@@ -79,10 +79,10 @@ def correct_pose(
     rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
-    noise_px2 = left_only.noise_px2(uvs_px, rig)
+    noise_px2 = stereo.noise_px2(uvs_px, rig)
     own_cov = H_point @ landmarks.covs @ transposed(H_point) + noise_px2
     nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
-    dof = left_only.degrees_of_freedom(uvs_px)
+    dof = stereo.degrees_of_freedom(uvs_px)
     accepted = gate.accepts(nis, dof, depth_m > 0.0)
     weights = accepted.astype(float)
     if gate.huber is not None:

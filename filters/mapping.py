@@ -11,7 +11,7 @@ from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model, predicted
 
@@ -42,7 +42,7 @@ class Mapping(Filter):
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
-            nis_bound = chi2_bound(left_only.degrees_of_freedom(uvs_px), self._gate_probability)
+            nis_bound = chi2_bound(stereo.degrees_of_freedom(uvs_px), self._gate_probability)
             seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
         self._map.keep(seen, packet.frame, T_world_imu)
         return self._belief.estimate(packet.frame.t_ns)

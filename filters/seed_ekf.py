@@ -17,7 +17,7 @@ from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Packet
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
 
@@ -57,9 +57,9 @@ class SeedEkf(Filter):
 
     def _correct_pose(self, seen: LandmarkMap, uvs_px: Array) -> None:
         predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
-        residual_px = left_only.residuals_px(uvs_px, predicted.uv_px)
-        H_pose = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
-        noise_px2 = left_only.noise_px2(uvs_px, self._rig) / self._rig.track_weight
+        residual_px = stereo.residuals_px(uvs_px, predicted.uv_px)
+        H_pose = stereo.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        noise_px2 = stereo.noise_px2(uvs_px, self._rig) / self._rig.track_weight
         weighted = np.asarray(np.linalg.solve(noise_px2, H_pose))
         self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, weighted)
 

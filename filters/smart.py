@@ -22,9 +22,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.motion import motion_model, state_keys
-from toolkit.models.reduced_vision import RobustCamera
-from toolkit.models.stereo_window import TrackedWindow
-from toolkit.models.window_solver import SolvedWindow, solve_window, without_oldest
+from toolkit.models.stereo_adjustment import RobustCamera, SolvedWindow, TrackedWindow, solve_window, without_oldest
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
 RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept"

@@ -13,7 +13,7 @@ from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, transposed
 from toolkit.measurements import StereoFrame, StereoRig
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 
@@ -28,12 +28,12 @@ def residuals_with_jacobians(
 ) -> stereo.StereoPrediction:
     """Return the residuals (N, 3) px of sightings, with Jacobians; both are zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
-    if not left_only.any_missing(uvs_px):
+    if not stereo.any_missing(uvs_px):
         return predicted._replace(uv_px=uvs_px - predicted.uv_px)
     return stereo.StereoPrediction(
-        left_only.residuals_px(uvs_px, predicted.uv_px),
-        left_only.seen_rows(uvs_px, predicted.d_uv_d_pose),
-        left_only.seen_rows(uvs_px, predicted.d_uv_d_point),
+        stereo.residuals_px(uvs_px, predicted.uv_px),
+        stereo.seen_rows(uvs_px, predicted.d_uv_d_pose),
+        stereo.seen_rows(uvs_px, predicted.d_uv_d_point),
         predicted.depth_m,
     )
 
@@ -77,7 +77,7 @@ def correct_landmarks(
     the map overconfident. The NIS is by the stated noise, the update has the rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, T_world_imu, rig)
-    noise_px2 = left_only.noise_px2(uvs_px, rig)
+    noise_px2 = stereo.noise_px2(uvs_px, rig)
     carried = H_point @ landmarks.covs
     innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + noise_px2
     nis = mahalanobis_squared(residual_px, innovation_cov)
@@ -107,7 +107,7 @@ class KnownPoseMapper:
         """Correct the landmarks that the frame sees again and start its new ones, both from a pose (4, 4)."""
         seen, uvs_px = self._map.seen_again(frame)
         if len(seen):
-            nis_bound = chi2_bound(left_only.degrees_of_freedom(uvs_px), self._probability)
+            nis_bound = chi2_bound(stereo.degrees_of_freedom(uvs_px), self._probability)
             seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
         self._map.keep(seen, frame, T_world_imu)
 

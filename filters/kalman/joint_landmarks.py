@@ -17,7 +17,7 @@ from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measurements import StereoFrame, StereoRig
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.models.gating import mahalanobis_squared
 
 
@@ -92,10 +92,10 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
     predicted_px, depth_m = multiview.images(joint.points, joint.clones[-1:], rig)
     there = multiview.linearised_images(at.points(joint), at.clones(joint)[-1:], rig)
-    whitener = left_only.whitener(uvs_px, rig)
-    residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], rig)
+    whitener = stereo.whitener(uvs_px, rig)
+    residuals = stereo.whitened_residuals(uvs_px, predicted_px[:, 0], rig)
     H_pose, H_point = whitener @ there.d_uv_d_pose[:, 0], whitener @ there.d_uv_d_point[:, 0]
-    return LandmarkSightings(residuals, H_pose, H_point, depth_m[:, 0], left_only.degrees_of_freedom(uvs_px))
+    return LandmarkSightings(residuals, H_pose, H_point, depth_m[:, 0], stereo.degrees_of_freedom(uvs_px))
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:

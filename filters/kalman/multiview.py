@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dgeqrf
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoRig, is_left_only
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 
 
 class TrackSightings(NamedTuple):
@@ -95,13 +95,13 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same poses, or their first estimates.
     Rows of unseen places are zero throughout, and so is the row of uR where the right image is missing.
     """
-    whitener, seen = left_only.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
+    whitener, seen = stereo.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
     there = linearised_images(points, poses_at, rig)
     if poses_at is poses:
         uv_px, depth_m = there.uv_px, there.depth_m
     else:
         uv_px, depth_m = images(points, poses, rig)
-    residuals = np.where(seen, left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
+    residuals = np.where(seen, stereo.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))

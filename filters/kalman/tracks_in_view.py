@@ -35,7 +35,7 @@ from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, transposed
 from toolkit.measurements import StereoRig
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.settings import Outliers
@@ -112,7 +112,7 @@ def information(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, ga
     points, weights = tracks.points.copy(), np.zeros(len(usable))
     normals = _Normals.of(rows.select(usable))
     nis = normals.newest_nis(window.root)
-    dof = left_only.degrees_of_freedom(tracks.sightings.uvs_px[usable, -1])
+    dof = stereo.degrees_of_freedom(tracks.sightings.uvs_px[usable, -1])
     weights[usable] = gate.weights(nis, dof, gate.accepts(nis, dof))
     normals = normals.newest_weighed(weights[usable])
     most_m = 0.2 * rows.depth_m[usable].min(axis=1)

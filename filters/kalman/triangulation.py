@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transposed
 from toolkit.measurements import StereoRig, is_left_only
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 
 ITERATIONS, FIRST_DAMPING = 6, 1e-3
@@ -135,8 +135,8 @@ def _fit(points: Array, views: _Views, rig: StereoRig) -> _Fit:
     # Jacobian and residual side by side: one product yields the normal equations and the cost.
     system = np.empty((len(depth_m), 3, 4))
     system[..., :3] = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
-    system[..., 3] = left_only.residuals_px(views.uvs_px, stereo.project(points_cam, rig))
-    system = left_only.whitener(views.uvs_px, rig) @ system
+    system[..., 3] = stereo.residuals_px(views.uvs_px, stereo.project(points_cam, rig))
+    system = stereo.whitener(views.uvs_px, rig) @ system
     normal = np.add.reduceat(transposed(system) @ system, views.first)
     nearest_m = np.minimum.reduceat(depth_m, views.first)
     cost = np.where(nearest_m > 0.0, 0.5 * normal[:, 3, 3], np.inf)

@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray
 from toolkit.measurements import StereoFrame, StereoRig
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 
 
 class KnownLandmarks:
@@ -44,7 +44,7 @@ class KnownLandmarks:
         self._sightings.update(ids)
         points = [placed[i] if i in placed else self._points[i] for i in ids]
         expected = stereo.predict(np.array(points), T_world_imu, self._rig)
-        H = left_only.whitener(frame.uvs_px, self._rig) @ left_only.seen_rows(frame.uvs_px, expected.d_uv_d_point)
+        H = stereo.whitener(frame.uvs_px, self._rig) @ stereo.seen_rows(frame.uvs_px, expected.d_uv_d_point)
         self._points.update(zip(ids, points, strict=True))
         information = zip(ids, np.swapaxes(H, 1, 2) @ H, strict=True)
         self._information.update({i: self._information.get(i, 0.0) + one for i, one in information})

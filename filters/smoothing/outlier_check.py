@@ -19,7 +19,7 @@ import numpy as np
 from filters.smoothing.known_landmarks import KnownLandmarks
 from toolkit.geometry import Array, BoolArray, se3_exp, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.settings import Outliers
@@ -77,13 +77,13 @@ class OutlierCheck:
         if not len(known.points):
             return known.rows
         predicted, uvs_px = stereo.predict(known.points, expected.T_world_imu, self.rig), known.uvs_px
-        by_pose = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
-        by_point = left_only.seen_rows(uvs_px, predicted.d_uv_d_point)
-        covs_px2 = left_only.noise_px2(uvs_px, self.rig) + _carried(by_pose, expected.cov[POSE, POSE])
+        by_pose = stereo.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        by_point = stereo.seen_rows(uvs_px, predicted.d_uv_d_point)
+        covs_px2 = stereo.noise_px2(uvs_px, self.rig) + _carried(by_pose, expected.cov[POSE, POSE])
         covs_px2 = covs_px2 + _carried(by_point, known.covs)
-        dof = left_only.degrees_of_freedom(uvs_px)
+        dof = stereo.degrees_of_freedom(uvs_px)
         bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
-        far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
+        far = mahalanobis_squared(stereo.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
         if known.confirmed.any():
             is_state_wrong = far[known.confirmed].mean() > MOST_MISMATCHED
         else:
@@ -175,10 +175,10 @@ def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig) -> Belief
         return expected
     uvs_px, landmarks = known.uvs_px, known.points
     cov = expected.cov[POSE, POSE]
-    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), left_only.whitener(uvs_px, rig)
+    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), stereo.whitener(uvs_px, rig)
     for _ in range(_STEPS):
         predicted = stereo.predict(landmarks, T_world_imu, rig)
-        residual = left_only.whitened_residuals(uvs_px, predicted.uv_px, rig)
+        residual = stereo.whitened_residuals(uvs_px, predicted.uv_px, rig)
         weights = np.where(predicted.depth_m > 0.0, 1.0 / (1.0 + np.square(residual / _LOSS_SCALE).sum(axis=1)), 0.0)
         H = (whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
         weighed = H * np.repeat(weights, 3)[:, None]

@@ -13,9 +13,15 @@ from toolkit.geometry import se3_exp, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
-from toolkit.models.stereo_window import Evaluated, MarginalPrior, StereoWindow
-from toolkit.models.window_solver import solve_window
+from toolkit.models.stereo_adjustment import (
+    Evaluated,
+    MarginalPrior,
+    RobustCamera,
+    Sightings,
+    StereoWindow,
+    Vision,
+    solve_window,
+)
 from toolkit.progress import SILENT
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate

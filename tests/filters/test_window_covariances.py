@@ -15,9 +15,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.measurements import NS_PER_S
 from toolkit.models.motion import motion_model, state_cov, state_keys
-from toolkit.models.reduced_vision import Sightings
-from toolkit.models.stereo_window import MarginalPrior, StereoWindow
-from toolkit.models.window_solver import SolvedWindow, without_oldest
+from toolkit.models.stereo_adjustment import MarginalPrior, Sightings, SolvedWindow, StereoWindow, without_oldest
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.measurements import StereoFrame, StereoRig
-from toolkit.models import left_only
+from toolkit.models import stereo
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 # A key is a character above an index of this many bits (gtsam/inference/Symbol.h); making a Symbol takes several times
@@ -67,7 +67,7 @@ class StereoFactors:
     def __init__(self, rig: StereoRig, threshold: float | None = None, loss: Loss = HUBER) -> None:
         robust = None if threshold is None else loss(threshold * float(np.sqrt(rig.track_weight)))
         self._noise = _noise(rig.cov_uv_px2 / rig.track_weight, robust)
-        self._left_noise = _noise(left_only.left_cov_px2(rig) / rig.track_weight, robust)
+        self._left_noise = _noise(stereo.left_cov_px2(rig) / rig.track_weight, robust)
         self._calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
         self._left_calibration = gtsam.Cal3_S2(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px)
         self._T_imu_cam = gtsam.Pose3(rig.T_imu_cam)

@@ -1,6 +1,6 @@
 """Stretches of a recording, each adjusted as a whole: states and landmarks by all measurements in it.
 
-A stretch is a smoother's window that holds all of its frames (:mod:`toolkit.models.stereo_window`), with the
+A stretch is a smoother's window that holds all of its frames (:mod:`toolkit.models.stereo_adjustment`), with the
 estimators' motion factors, the stereo sightings under Huber's loss, and a weak prior on the first state.
 """
 
@@ -17,14 +17,20 @@ from toolkit.audit.edits import keep_frames
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse
 from toolkit.initialization.first_guess import guess_with_imu
 from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior, StereoRig
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model, state_keys
-from toolkit.models.reduced_vision import RobustCamera, Sightings, Vision
 from toolkit.models.state import Belief
-from toolkit.models.stereo_window import Evaluated, StereoWindow, TrackedWindow
-from toolkit.models.window_solver import solve_window
+from toolkit.models.stereo_adjustment import (
+    Evaluated,
+    RobustCamera,
+    Sightings,
+    StereoWindow,
+    TrackedWindow,
+    Vision,
+    solve_window,
+)
 from toolkit.sequence import Sequence
 
 # A stretch has this many frames: most tracks end within it, and a dense matrix holds its states. There are as many
@@ -176,7 +182,7 @@ class Adjusted:
     def by_sound_sightings(self) -> StereoWindow:
         """Return the window with the sightings that are plausible by the stated noise, and the points they see."""
         vision, seen = self.vision, self.window.sightings
-        bound = chi2_bound(left_only.degrees_of_freedom(seen.uv_px), SOUND)
+        bound = chi2_bound(stereo.degrees_of_freedom(seen.uv_px), SOUND)
         sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.seen.in_front
         kept = Sightings(seen.pose[sound], seen.point[sound], seen.uv_px[sound])
         return (

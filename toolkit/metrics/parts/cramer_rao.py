@@ -30,7 +30,7 @@ from toolkit.measurements import Packet, Prior, StereoFrame, StereoRig, is_left_
 from toolkit.metrics.parts.alignment import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
-from toolkit.models import left_only, stereo
+from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model
@@ -187,8 +187,8 @@ def _sighting_chi_square(problem: _Problem) -> tuple[float, float]:
     for packet, state in zip(problem.packets, problem.states, strict=True):
         uvs_px = packet.frame.uvs_px
         seen = stereo.predict(problem.points[problem.rows(packet.frame)], state.T_world_imu, problem.rig)
-        squared += float(np.square(left_only.whitened_residuals(uvs_px, seen.uv_px, problem.rig)).sum())
-        dof += int(np.broadcast_to(left_only.degrees_of_freedom(uvs_px), len(uvs_px)).sum())
+        squared += float(np.square(stereo.whitened_residuals(uvs_px, seen.uv_px, problem.rig)).sum())
+        dof += int(np.broadcast_to(stereo.degrees_of_freedom(uvs_px), len(uvs_px)).sum())
     return (squared / dof, 5.0 * float(np.sqrt(2.0 / dof))) if dof > 0 else (1.0, 0.0)
 
 
@@ -218,8 +218,8 @@ def _placed_by_stereo(packets: tuple[Packet, ...]) -> tuple[Packet, ...]:
 
 def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Array, rig: StereoRig) -> StereoFrame:
     seen = stereo.predict(points[np.searchsorted(track_ids, frame.track_ids)], pose, rig)
-    whitened = left_only.whitened_residuals(frame.uvs_px, seen.uv_px, rig)
-    bound = chi2_bound(left_only.degrees_of_freedom(frame.uvs_px), 1.0 - _MISMATCH_PROBABILITY)
+    whitened = stereo.whitened_residuals(frame.uvs_px, seen.uv_px, rig)
+    bound = chi2_bound(stereo.degrees_of_freedom(frame.uvs_px), 1.0 - _MISMATCH_PROBABILITY)
     likely = np.square(whitened).sum(axis=1) < bound
     return frame.select(likely & (seen.depth_m > 0.0))
 
@@ -234,10 +234,10 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
     uvs_px, seen_from = uvs_px[order], poses[pose[order]]
     track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
     points = stereo.triangulate_world(uvs_px[first], seen_from[first], rig)
-    whitener = left_only.whitener(uvs_px, rig)
+    whitener = stereo.whitener(uvs_px, rig)
     for _ in range(_POINT_ITERATIONS):
         seen = stereo.predict(points[track], seen_from, rig)
-        H, residuals = whitener @ seen.d_uv_d_point, left_only.whitened_residuals(uvs_px, seen.uv_px, rig)
+        H, residuals = whitener @ seen.d_uv_d_point, stereo.whitened_residuals(uvs_px, seen.uv_px, rig)
         H_transposed = np.swapaxes(H, 1, 2)
         information = np.add.reduceat(H_transposed @ H, first)
         score = np.add.reduceat((H_transposed @ residuals[..., None])[..., 0], first)
@@ -297,10 +297,10 @@ class _Information:
         problem, rows = self._problem, self._problem.rows(frame)
         self._join(rows[~np.isin(rows, self._landmarks)])
         seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
-        whitener = left_only.whitener(frame.uvs_px, problem.rig)
+        whitener = stereo.whitener(frame.uvs_px, problem.rig)
         root = float(np.sqrt(problem.rig.track_weight))
         H = root * np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
-        residuals = root * left_only.whitened_residuals(frame.uvs_px, seen.uv_px, problem.rig)
+        residuals = root * stereo.whitened_residuals(frame.uvs_px, seen.uv_px, problem.rig)
         place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]
         own = self._size + 3 * place[:, None] + np.arange(3)
         columns = np.concatenate([np.broadcast_to(np.arange(6), (len(rows), 6)), own], axis=1)

@@ -20,7 +20,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoRig
 from toolkit.metrics.parts.association import finite_poses
 from toolkit.metrics.parts.residuals import reprojection_errors_px
-from toolkit.models import left_only
+from toolkit.models import stereo
 from toolkit.sequence import Observations
 
 # Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
@@ -97,7 +97,7 @@ class Views:
         The weights are Huber's.
         """
         seen = self.project(np.take(points, self.track, axis=1))
-        residual = self._whitened(left_only.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
+        residual = self._whitened(stereo.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
         length = np.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
         visible = seen.in_front & np.isfinite(length)
         slope = self._whitened(self._slope(seen))
@@ -221,7 +221,7 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
     T_view_last = se3_inverse(T_last_view)
     # r times the point in the view's camera: R (a, b, 1) + r t, linear in q = (a, b, r).
     linear, constant = T_view_last[:, :3, [0, 1, 3]], T_view_last[:, :3, 2]
-    whitener = left_only.whitener(uv_px, rig)
+    whitener = stereo.whitener(uv_px, rig)
     return Views(
         track=np.repeat(np.arange(first.size), np.diff(np.append(first, track_ids.size))),
         first=first,

@@ -1,0 +1,527 @@
+"""The one adjustment of states to stereo tracks: landmarks eliminated, the states solved for, the oldest left out.
+
+A :class:`StereoWindow` is the problem: states, motion factors between them, a linear prior, and sightings of points
+that are no variables. A :class:`TrackedWindow` adds the track id of each point. ``solve_window`` finds its minimum by
+Levenberg-Marquardt and the covariance of each state. The fixed-lag smoother `smart` solves one frame by frame, the
+start and the measurement of noise on stretches of a recording. Everything is dense: a window has a few hundred
+unknowns.
+
+Each track is a smart factor (Carlone, Kira, Beall, Indelman & Dellaert 2014, "Eliminating conditionally independent
+sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur complement,
+for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does the same only for noise that is equal and
+independent in uL, uR and v; here the rig's full covariance is used, and each sighting has its weight by Huber's loss.
+States that leave are marginalised by a Schur complement, together with every track they saw, so that each sighting is
+used once (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.sparse import csc_array
+
+from toolkit.errors import EstimatorError
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
+from toolkit.measurements import StereoFrame, StereoRig
+from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX
+
+# Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
+_BEHIND_NORM = 100.0
+# A threshold of Huber's loss, in standard deviations, that no sighting reaches: no loss.
+_NO_LOSS = 1e6
+# Added to a landmark's 3x3 block so that it is never singular; far below the information of any sighting.
+_LEAST_INFORMATION_PER_M2 = 1e-12
+MOST_ITERATIONS = 5
+# Newton's method converges quadratically: after a step shorter than this, in sigmas of all states together, the next is
+# a tenth of a sigma, and is taken with the next frame. If a step gains hardly anything, further ones gain nothing.
+LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
+# Used only after a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than
+# the information on position and heading in the world, and would fix these.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
+# Parts of a landmark's step that are tried if the window's step raises the cost; damping the poses does not shorten it.
+_SHARES = (1.0, 0.5, 0.25, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustCamera:
+    """A rig, and the threshold of Huber's loss of whitened sightings."""
+
+    rig: StereoRig
+    huber: float
+
+    @classmethod
+    def of(cls, rig: StereoRig, huber: float | None) -> "RobustCamera":
+        """Return a camera with a threshold of the loss; None for no loss."""
+        return cls(rig, _NO_LOSS if huber is None else huber)
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N sightings in the order of time: rows of poses (N,) and points (N,), measurements (N, 3) px."""
+
+    pose: IntArray
+    point: IntArray
+    uv_px: Array
+
+    def of_points(self, points: IntArray) -> "Sightings":
+        """Return the sightings of some points (M,); their row numbers stay."""
+        rows = np.isin(self.point, points)
+        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
+
+
+class PointsInView(NamedTuple):
+    """The points of N sightings: attitudes (N, 3, 3) of the IMU, points (N, 3) m in its frame, depths (N,) m."""
+
+    R_world_imu: Array
+    points_imu: Array
+    depth_m: Array
+
+    @property
+    def in_front(self) -> BoolArray:
+        """Say which points (N,) are in front of the camera."""
+        front: BoolArray = self.depth_m > 0.0
+        return front
+
+
+class ReducedVision(NamedTuple):
+    """Information matrix (6K, 6K) and vector (6K,) on the poses, and the matrices for back-substitution of points."""
+
+    information: Array
+    vector: Array
+    coupling: Array
+    root: Array
+    point_vector: Array
+
+    def point_steps(self, pose_steps: Array) -> Array:
+        """Return the steps (M, 3) of the points for steps (6K,) of the poses."""
+        whitened = self.point_vector - (self.coupling.T @ pose_steps).reshape(-1, 3)
+        return (self.root @ whitened[..., None])[..., 0]
+
+
+def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> PointsInView:
+    """Return the points (M, 3) of sightings relative to their poses (K, 4, 4) of the IMU in the world."""
+    T_imu_world = se3_inverse(poses)[sightings.pose]
+    with np.errstate(invalid="ignore"):
+        points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
+        return PointsInView(poses[sightings.pose, :3, :3], points_imu, stereo.in_camera(points_imu, rig)[:, 2])
+
+
+@dataclass(frozen=True, eq=False)
+class Vision:
+    """Sightings evaluated at poses (K, 4, 4) and points (M, 3): their cost, and on demand their normal equations."""
+
+    counts: tuple[int, int]
+    sightings: Sightings
+    seen: PointsInView
+    camera: RobustCamera
+
+    @classmethod
+    def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
+        """Evaluate sightings at poses (K, 4, 4) of the IMU in the world and points (M, 3) m in the world."""
+        seen = seen_from(poses, points, sightings, camera.rig)
+        return cls((len(poses), len(points)), sightings, seen, camera)
+
+    @property
+    def loss(self) -> float:
+        """The sum of Huber's losses of the whitened residuals, half a square each where small, by tracks' weight."""
+        return float(self._losses.sum())
+
+    @property
+    def loss_of_points(self) -> Array:
+        """The part (M,) of the loss due to the sightings of each point."""
+        return np.asarray(np.bincount(self.sightings.point, self._losses, minlength=self.counts[1]), dtype=np.float64)
+
+    @property
+    def _losses(self) -> Array:
+        norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
+        huber = self.camera.huber
+        beyond = huber * (norm - huber / 2)
+        return self.camera.rig.track_weight * np.where(norm <= huber, 0.5 * norm**2, beyond)
+
+    def reduced(self) -> ReducedVision:
+        """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
+        weights = self._root_weights
+        weighted = weights[:, None, None] * stereo.whitener(self.sightings.uv_px, self.camera.rig)
+        J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
+        return _eliminated(weights[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts)
+
+    @property
+    def _root_weights(self) -> Array:
+        """The roots of Huber's weights (N,) times the weight of tracks; 0 behind the camera."""
+        huber, weight = self.camera.huber, self.camera.rig.track_weight
+        return np.where(self.seen.in_front, np.sqrt(weight * huber / np.maximum(self._norm, huber)), 0.0)
+
+    @cached_property
+    def _predicted(self) -> stereo.StereoPrediction:
+        """The predicted images; points behind the camera are replaced by one that has an image."""
+        in_front, somewhere = self.seen.in_front, transform(self.camera.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
+        points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
+        return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
+
+    @property
+    def H_pose(self) -> Array:
+        """The whitened Jacobians (N, 3, 6) to the pose of each sighting."""
+        whitener = stereo.whitener(self.sightings.uv_px, self.camera.rig)
+        return np.asarray(whitener @ stereo.seen_rows(self.sightings.uv_px, self._predicted.d_uv_d_pose))
+
+    @property
+    def residual_px(self) -> Array:
+        """Measured less predicted (N, 3) px, zero where uR is missing."""
+        return stereo.residuals_px(self.sightings.uv_px, self._predicted.uv_px)
+
+    @cached_property
+    def whitened(self) -> Array:
+        """Measured less predicted, whitened by the stated noise (N, 3)."""
+        return stereo.whitened_residuals(self.sightings.uv_px, self._predicted.uv_px, self.camera.rig)
+
+    @cached_property
+    def _norm(self) -> Array:
+        return np.asarray(np.linalg.norm(self.whitened, axis=1))
+
+
+def _eliminated(
+    residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]
+) -> ReducedVision:
+    (pose_count, point_count), point, pose = counts, seen.point, seen.pose
+    # Small matrix products are several times as fast on contiguous arrays.
+    to_point = np.ascontiguousarray(np.swapaxes(J_point, 1, 2))
+    per_point = _summation(point, point_count)
+    information_point = (per_point @ (to_point @ J_point).reshape(-1, 9)).reshape(-1, 3, 3)
+    information_point += _LEAST_INFORMATION_PER_M2 * np.eye(3)
+    vector_point = per_point @ (to_point @ residual[..., None])[..., 0]
+    root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
+    whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
+    coupling, vector = np.zeros((pose_count, 6, point_count, 3)), np.zeros((pose_count, 6))
+    to_pose, per_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2)), _summation(pose, pose_count)
+    coupling[pose, :, point, :] += to_pose @ (J_point @ root[point])
+    vector += per_pose @ (to_pose @ residual[..., None])[..., 0]
+    across = coupling.reshape(6 * pose_count, 3 * point_count)
+    information = -(across @ across.T)
+    own = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(pose_count, 6, 6)
+    information.reshape(pose_count, 6, pose_count, 6)[np.arange(pose_count), :, np.arange(pose_count)] += own
+    return ReducedVision(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
+
+
+def _summation(groups: IntArray, count: int) -> csc_array:
+    """Return the matrix (count, N) that sums the rows (N, d) of each group."""
+    return csc_array((np.ones(groups.size), groups, np.arange(groups.size + 1)), shape=(count, groups.size))
+
+
+@dataclass(frozen=True, eq=False)
+class MarginalPrior:
+    """Information matrix (D, D) and vector (D,) on the first D unknowns of the window, linearised at ``about``."""
+
+    information: Array
+    vector: Array
+    about: gtsam.Values
+
+    @classmethod
+    def nothing(cls) -> "MarginalPrior":
+        """Return a prior without information."""
+        return cls(np.zeros((0, 0)), np.zeros(0), gtsam.Values())
+
+
+@dataclass(frozen=True, eq=False)
+class StereoWindow:
+    """States in the order of time: their keys (each [pose, velocity, bias] or [pose, bias]), factors and sightings.
+
+    ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
+    """
+
+    keys: tuple[tuple[int, ...], ...]
+    values: gtsam.Values
+    motion: tuple[gtsam.NonlinearFactorGraph, ...]
+    prior: MarginalPrior
+    sightings: Sightings
+    points: Array
+
+    @property
+    def poses(self) -> Array:
+        """Return the poses (K, 4, 4) of the IMU in the world."""
+        return np.array([self.values.atPose3(keys[0]).matrix() for keys in self.keys])
+
+    @property
+    def all_keys(self) -> list[int]:
+        """Return the keys of all states, in the order of the unknowns."""
+        return [key for keys in self.keys for key in keys]
+
+    @property
+    def size(self) -> int:
+        """Return the number of unknowns of one state."""
+        return int(self.values.extract(list(self.keys[0])).dim())
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedWindow:
+    """A window and the track ids (M,) of its points."""
+
+    window: StereoWindow
+    track_ids: IntArray
+
+    @classmethod
+    def empty(cls) -> "TrackedWindow":
+        """Return a window without states."""
+        none = np.empty(0, dtype=np.int64)
+        sightings = Sightings(none, none, np.empty((0, 3)))
+        return cls(StereoWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
+
+    def points_by_id(self) -> dict[int, Array]:
+        """Return the point (3,) m of every track."""
+        return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
+
+    def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
+        """Add the sightings of the newest state, at a pose (4, 4): known tracks continue, new ones are triangulated.
+
+        New tracks of too small a disparity are left out.
+        """
+        known = np.isin(frame.track_ids, self.track_ids)
+        new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
+        used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
+        ids = np.concatenate([self.track_ids, new.track_ids])
+        points = np.concatenate([self.window.points, stereo.triangulate_world(new.uvs_px, T_world_imu, rig)])
+        order = np.argsort(ids)
+        rows, seen = order[np.searchsorted(ids, used.track_ids, sorter=order)], self.window.sightings
+        newest = np.full(rows.size, len(self.window.keys) - 1)
+        sightings = Sightings(
+            np.concatenate([seen.pose, newest]),
+            np.concatenate([seen.point, rows]),
+            np.concatenate([seen.uv_px, used.uvs_px]),
+        )
+        return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
+
+    def newest(self, frame: StereoFrame) -> StereoFrame:
+        """Return the newest state's frame without the sightings that are not in the window."""
+        seen = self.window.sightings
+        taken = self.track_ids[seen.point[seen.pose == len(self.window.keys) - 1]]
+        return frame.select(np.isin(frame.track_ids, taken))
+
+    def compacted(self) -> "TrackedWindow":
+        """Drop the points without sightings."""
+        seen = self.window.sightings
+        kept, rows = np.unique(seen.point, return_inverse=True)
+        sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px)
+        return TrackedWindow(
+            replace(self.window, points=self.window.points[kept], sightings=sightings), self.track_ids[kept]
+        )
+
+    def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
+        """Drop the points that are behind a camera that saw them; return the window and the ids (n,) of these."""
+        seen = self.window.sightings
+        in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
+        behind = np.unique(seen.point[~in_front])
+        if not behind.size:
+            return self, self.track_ids[behind]
+        left = seen.of_points(np.setdiff1d(seen.point, behind))
+        return TrackedWindow(replace(self.window, sightings=left), self.track_ids).compacted(), self.track_ids[behind]
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The normal equations (D, D), (D,) of a window and the elimination of its landmarks."""
+
+    information: Array
+    vector: Array
+    vision: ReducedVision
+
+    @cached_property
+    def root(self) -> Array:
+        """The lower Cholesky factor (D, D) of the information; raises LinAlgError where there is none."""
+        return _lower_factor(self.information)
+
+    def damped_root(self, damping: float) -> Array:
+        """Return the lower Cholesky factor (D, D) with a share of the diagonal added; raises as ``root`` does."""
+        if damping == 0.0:
+            return self.root
+        damped = self.information.copy()
+        damped.flat[:: len(damped) + 1] *= 1.0 + damping
+        return _lower_factor(damped)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """A window and its cost at its values: half the squared errors of motion and prior, and Huber's losses."""
+
+    window: StereoWindow
+    motion: gtsam.GaussianFactorGraph
+    off_prior: Array
+    vision: Vision
+
+    @classmethod
+    def of(cls, window: StereoWindow, camera: RobustCamera) -> "Evaluated":
+        """Evaluate a window. Its motion is linearised at once: Python factors cost as much to evaluate."""
+        vision = Vision.at(window.poses, window.points, window.sightings, camera)
+        return cls(window, _joined_graph(window.motion).linearize(window.values), _off_prior(window), vision)
+
+    @cached_property
+    def error(self) -> float:
+        """The cost of the window."""
+        prior, off = self.window.prior, self.off_prior
+        of_prior = float(0.5 * off @ prior.information @ off - prior.vector @ off)
+        return of_prior + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
+
+    def linearised(self) -> System:
+        """Return the normal equations."""
+        window, count, size = self.window, len(self.window.keys), len(self.off_prior)
+        d = window.size
+        information, vector = self._of_motion(count * d)
+        information[:size, :size] += window.prior.information
+        vector[:size] += window.prior.vector - window.prior.information @ self.off_prior
+        vision = self.vision.reduced()
+        information.reshape(count, d, count, d)[:, :6, :, :6] += vision.information.reshape(count, 6, count, 6)
+        vector.reshape(count, d)[:, :6] += vision.vector.reshape(count, 6)
+        return System(information, vector, vision)
+
+    def _of_motion(self, size: int) -> tuple[Array, Array]:
+        """Return the normal equations of the motion factors, which involve the first states of the window, or all."""
+        tied, ordering = set(self.motion.keyVector()), gtsam.Ordering()
+        for key in self.window.all_keys:
+            if key in tied:
+                ordering.push_back(key)
+        information, vector = np.zeros((0, 0)), np.zeros(0)
+        if tied:
+            # The matrix is symmetric and column-major, so its transpose is the same matrix in NumPy's row-major order.
+            augmented = self.motion.augmentedHessian(ordering).T
+            information, vector = augmented[:-1, :-1], augmented[-1, :-1]
+        rest = size - len(vector)
+        return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
+
+
+def _joined_graph(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
+    whole = gtsam.NonlinearFactorGraph()
+    for graph in graphs:
+        whole.push_back(graph)
+    return whole
+
+
+def _off_prior(window: StereoWindow) -> Array:
+    """Return the deviation (D,) of the prior's states from its linearisation point."""
+    about = window.prior.about
+    keys = [key for key in window.all_keys if about.exists(key)]
+    if not keys:
+        return np.zeros(0)
+    delta = about.localCoordinates(window.values.extract(keys))
+    return np.concatenate([delta.at(key) for key in keys])
+
+
+def _lower_factor(matrix: Array) -> Array:
+    # LAPACK is column-major and NumPy row-major: a symmetric matrix is its own transpose and need not be copied.
+    return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedWindow:
+    """A window at its minimum, and the root of its information, linearised one step before the minimum."""
+
+    window: StereoWindow
+    root: Array
+
+    def cov(self, i: int) -> Array:
+        """Return the marginal covariance (d, d) of state i, in GTSAM's tangent spaces.
+
+        The root's rows are in the order of time, and rows before the state do not involve it.
+        """
+        d = self.window.size
+        later = self.root[i * d :, i * d :]
+        half = solve_triangular(later, np.eye(len(later), d), lower=True, check_finite=False)
+        return np.asarray(half.T @ half)
+
+
+def solve_window(window: StereoWindow, camera: RobustCamera, iterations: int = MOST_ITERATIONS) -> SolvedWindow:
+    """Return the window at its minimum, by Levenberg-Marquardt.
+
+    Raises EstimatorError where the error is not a number or the states are not determined.
+    """
+    here, damping = Evaluated.of(window, camera), 0.0
+    if not np.isfinite(here.error):
+        raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
+    for _ in range(iterations):
+        system = here.linearised()
+        step = _descent(here, system, damping, camera)
+        decrease, here = here.error - step.there.error, step.there
+        if step.sigmas <= LAST_STEP_SIGMAS or decrease <= RELATIVE_DECREASE * here.error:
+            break
+        damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
+    try:
+        return SolvedWindow(here.window, system.root)
+    except np.linalg.LinAlgError as refusal:
+        raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
+
+
+def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> StereoWindow:
+    """Marginalise the ``count`` oldest states with every track they saw; the row numbers of other points stay."""
+    seen = window.sightings
+    leaving_points = np.unique(seen.point[seen.pose < count])
+    leaving = replace(_with_points(window, leaving_points), motion=window.motion[: count + 1])
+    system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
+    root = np.linalg.cholesky(system.information[:gone, :gone])
+    across = solve_triangular(root, system.information[:gone, gone:], lower=True)
+    information = system.information[gone:, gone:] - across.T @ across
+    vector = system.vector[gone:] - across.T @ solve_triangular(root, system.vector[:gone], lower=True)
+    values = gtsam.Values(window.values)
+    for keys in window.keys[:count]:
+        for key in keys:
+            values.erase(key)
+    left = ~np.isin(seen.point, leaving_points)
+    kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
+    prior = MarginalPrior(information, vector, values)
+    motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
+    return StereoWindow(window.keys[count:], values, motion, prior, kept, window.points)
+
+
+def _with_points(window: StereoWindow, points: IntArray) -> StereoWindow:
+    """Return the window with some points (M,), by their ascending rows, and their sightings."""
+    seen = window.sightings.of_points(points)
+    rows = np.searchsorted(points, seen.point).astype(np.int64)
+    return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
+
+
+class _DescentStep(NamedTuple):
+    """The window after a step, the step's length in standard deviations of all states together, and its damping."""
+
+    there: Evaluated
+    sigmas: float
+    damping: float
+
+
+def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _DescentStep:
+    """Return the least damped step that does not raise the cost, or a step of length zero."""
+    while damping <= _MOST_DAMPING:
+        try:
+            step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
+            moved = _moved(here.window, system, step)
+            there = Evaluated.of(moved, camera)
+            if not there.error <= here.error:
+                there = Evaluated.of(_with_shortened_landmark_steps(moved, here.window.points, camera), camera)
+            if there.error <= here.error:
+                return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
+        except np.linalg.LinAlgError:
+            pass
+        damping = max(10.0 * damping, _FIRST_DAMPING)
+    return _DescentStep(here, 0.0, damping)
+
+
+def _with_shortened_landmark_steps(moved: StereoWindow, before: Array, camera: RobustCamera) -> StereoWindow:
+    """Return the window with each landmark (M,) moved by the part of its step with the lowest cost of its sightings.
+
+    A landmark that comes nearer by metres may overshoot to behind a camera, and alone would make every step fail.
+    """
+    places = np.array([before + share * (moved.points - before) for share in _SHARES])
+    costs = [Vision.at(moved.poses, points, moved.sightings, camera).loss_of_points for points in places]
+    cheapest = np.nan_to_num(costs, nan=np.inf).argmin(axis=0)
+    return replace(moved, points=places[cheapest, np.arange(len(before))])
+
+
+def _moved(window: StereoWindow, system: System, step: Array) -> StereoWindow:
+    """Return the window after a step (D,) of its states and the corresponding steps of its landmarks."""
+    delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
+    for key in window.all_keys:
+        delta.insert(key, step[start : start + dims[key]])
+        start += dims[key]
+    pose_steps = step.reshape(len(window.keys), -1)[:, :6].ravel()
+    points = window.points + system.vision.point_steps(pose_steps)
+    return replace(window, values=window.values.retract(delta), points=points)
