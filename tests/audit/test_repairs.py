@@ -232,7 +232,7 @@ def test_what_slip_could_feign_is_no_place_of_the_camera(clean_recording: Make) 
     evidence = Evidence(clean)
     assert evidence.intervals is not None
     exact = Position(np.zeros(3), 1e-12 * np.eye(3))
-    ahead, aside = (way_gone(clean, evidence.intervals, exact, way) for way in np.eye(3)[:2])
+    ahead, aside = (way_gone(evidence.intervals, exact, way) for way in np.eye(3)[:2])
     assert ahead.error > 0.64  # the way of travel is not quite the x axis
     turning = np.abs(clean.motion.w_radps[:, 2]) > 0.3
     radii_m = np.linalg.norm(clean.motion.v_mps[turning], axis=1) / np.abs(clean.motion.w_radps[turning, 2])

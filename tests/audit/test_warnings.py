@@ -70,7 +70,7 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
 
     def turn_of(T_imu_cam: Array) -> Turn:
         assert intervals is not None and intervals.v_mps is not None
-        return velocity_fit(intervals, T_imu_cam, np.inf).turn
+        return velocity_fit(intervals._replace(T_imu_cam=T_imu_cam), np.inf).turn
 
     found = turn_of(turned)
     assert found.rad.size == 2

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import stdtrit
 
-from toolkit.audit.alignment import IntegratedGravity
+from toolkit.audit.alignment import ForceBesideCamera
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import (
     FORCES,
@@ -103,9 +103,7 @@ def _median_angle_deg(evidence: Evidence) -> float | None:
     assert intervals is not None
     if intervals.v_mps is None:
         return None
-    T_imu_cam = evidence.sequence.rig.T_imu_cam
-    w_radps, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
-    measured = intervals.v_mps + np.cross(w_radps, T_imu_cam[:3, 3])
+    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
     lengths = np.linalg.norm(measured, axis=1) * np.linalg.norm(seen, axis=1)
     moving = lengths > np.median(lengths)
     if moving.sum() < LEAST_INTERVALS // 2:
@@ -212,16 +210,14 @@ def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ..
 
     The gyro's constant bias is subtracted first.
     """
-    sequence, T_imu_cam = evidence.sequence, evidence.sequence.rig.T_imu_cam
+    sequence = evidence.sequence
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     t_s = 0.5 * (frame_s[intervals.interval] + frame_s[intervals.interval + 1])
-    w_radps = intervals.w_radps - intervals.w_cam_radps @ T_imu_cam[:3, :3].T
-    bias_radps = np.median(w_radps, axis=0)
-    rotation = _of_medians("rate of rotation", "rad/s", t_s, w_radps - bias_radps)
+    w_radps = intervals.w_radps - intervals.bias_radps
+    rotation = _of_medians("rate of rotation", "rad/s", t_s, w_radps - intervals.w_seen_radps)
     if intervals.v_mps is None:
-        return rotation, _specific_force(sequence, evidence.camera_motion, evidence.integrated_gravity)
-    lever_mps = np.cross(intervals.w_radps - bias_radps, T_imu_cam[:3, 3])
-    v_mps = intervals.v_mps + lever_mps - intervals.v_cam_mps @ T_imu_cam[:3, :3].T
+        return rotation, _specific_force(sequence, evidence.camera_motion, evidence.force_beside_camera)
+    v_mps = intervals.v_mps + np.cross(w_radps, intervals.T_imu_cam[:3, 3]) - intervals.v_seen_mps
     return rotation, _of_medians("velocity", "m/s", t_s, v_mps)
 
 
@@ -302,7 +298,7 @@ def _scatter(value: Array) -> Array:
     return np.asarray(MAD_TO_SIGMA * np.median(change, axis=0) / np.sqrt(2.0))
 
 
-def _specific_force(sequence: Sequence, camera: CameraMotion, found: IntegratedGravity) -> Deviation:
+def _specific_force(sequence: Sequence, camera: CameraMotion, found: ForceBesideCamera) -> Deviation:
     """Return the change of the camera's velocity less the specific force, less the gravity estimated around that time.
 
     In the axes of the first frame, by the gyro, the velocity changes by the specific force plus gravity, which is
@@ -313,8 +309,8 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: IntegratedG
     middle_ns = found.middle_ns
     h_s = np.diff(middle_ns)[:, None] / NS_PER_S
     fallen = (
-        found.velocity_mps
-        - np.median(np.diff(found.velocity_mps, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
+        found.gravity_mps
+        - np.median(np.diff(found.gravity_mps, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
     )
     smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
     sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
@@ -368,11 +364,11 @@ def scale_change(evidence: Evidence) -> Symptom | Undecided | None:
     """
     if evidence.intervals is None:
         return evidence.blind
-    intervals, T_imu_cam = evidence.intervals, evidence.sequence.rig.T_imu_cam
+    intervals = evidence.intervals
     if intervals.v_mps is None:
         return None  # an IMU has no speed to compare
-    w_imu, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
-    measured, speed_mps = intervals.v_mps + np.cross(w_imu, T_imu_cam[:3, 3]), np.linalg.norm(seen, axis=1)
+    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
+    speed_mps = np.linalg.norm(seen, axis=1)
     fast = (speed_mps > STANDING_MPS) & (speed_mps >= 0.5 * np.median(speed_mps))
     if fast.sum() < LEAST_INTERVALS:
         return Undecided(f"too little motion: {int(fast.sum())} intervals show a scale, {LEAST_INTERVALS} are needed")
@@ -447,7 +443,7 @@ def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if evidence.intervals is None:
         return evidence.blind
-    middle_ns, v_mps = evidence.integrated_gravity
+    middle_ns, v_mps = evidence.force_beside_camera.middle_ns, evidence.force_beside_camera.gravity_mps
     t_s, known = (middle_ns - sequence.frames_t_ns[0]) / NS_PER_S, evidence.camera_motion.known
     steps = {share: _gravity_step(t_s, v_mps, known, share * sequence.duration_s) for share in CUTS}
     found = {share: step for share, step in steps.items() if step is not None}
@@ -541,9 +537,7 @@ def image_jump(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     sequence, intervals = evidence.sequence, evidence.intervals
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
-    R_imu_cam = sequence.rig.T_imu_cam[:3, :3]
-    excess_radps = intervals.w_cam_radps @ R_imu_cam.T - intervals.w_radps
-    excess_radps = excess_radps - np.median(excess_radps, axis=0)
+    excess_radps = intervals.w_seen_radps - intervals.w_radps + intervals.bias_radps
     turn_rad = excess_radps * np.diff(frame_s)[intervals.interval][:, None]
     sigma_rad = np.maximum(MAD_TO_SIGMA * np.median(np.abs(turn_rad), axis=0), 1e-9)
     size, angle_rad = np.linalg.norm(turn_rad / sigma_rad, axis=1), np.linalg.norm(turn_rad, axis=1)
@@ -551,7 +545,7 @@ def image_jump(evidence: Evidence) -> Symptom | Undecided | None:
     jumps = np.flatnonzero((size > JUMP_SIGMAS) & (angle_rad > LEAST_JUMP_RAD) & (beside < ALONE * size))
     if not jumps.size:
         return None
-    stay = [k for k in jumps.tolist() if _stays(intervals, sequence.rig.T_imu_cam, k, turn_rad[k])]
+    stay = [k for k in jumps.tolist() if _stays(intervals, k, turn_rad[k])]
     places = [f"{frame_s[intervals.interval[k]]:.1f} s (by {angle_rad[k]:.3f} rad)" for k in stay or jumps.tolist()]
     if not stay:
         return Undecided(
@@ -564,19 +558,18 @@ def image_jump(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
-def _stays(intervals: Intervals, T_imu_cam: Array, k: int, turn_rad: Array) -> bool:
+def _stays(intervals: Intervals, k: int, turn_rad: Array) -> bool:
     """Say whether the camera's velocity is rotated by that angle after interval ``k``; True with an IMU."""
     if intervals.v_mps is None:
         return True
-    share = _share_that_stays(intervals, intervals.v_mps, T_imu_cam, k, turn_rad)
+    share = _share_that_stays(intervals, k, turn_rad)
     return share is not None and max(SHARE[0], STAYS_SIGMAS * share.error) < share.value < SHARE[1]
 
 
-def _share_that_stays(intervals: Intervals, v_mps: Array, T_imu_cam: Array, k: int, turn_rad: Array) -> Scalar | None:
+def _share_that_stays(intervals: Intervals, k: int, turn_rad: Array) -> Scalar | None:
     """Return the share of a rotation by which the camera's velocity is rotated after interval k and not before."""
-    w_imu, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
-    deviation = v_mps + np.cross(w_imu, T_imu_cam[:3, 3]) - seen
-    expected = np.cross(turn_rad, seen)  # if the camera is rotated by it against its extrinsic
+    deviation = intervals.v_measured_mps - intervals.v_seen_mps
+    expected = np.cross(turn_rad, intervals.v_seen_mps)  # if the camera is rotated by it against its extrinsic
     size = np.sum(expected**2, axis=1)
     before, after = slice(max(k - AROUND, 0), k), slice(k + 1, k + 1 + AROUND)
     shares = np.sum(deviation * expected, axis=1) / np.maximum(size, 1e-12)

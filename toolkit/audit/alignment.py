@@ -3,8 +3,8 @@
 One robust regression of the camera's velocities on the measured ones (``velocity_fit``) estimates all three. Slip lasts
 for seconds, so its standard errors are those of a jackknife over stretches that are no shorter. ``turn_by_rotations``
 estimates the rotation from rates of rotation instead. ``way_gone`` says which of two positions the camera has, with the
-systematic error of sound recordings added to the covariance. ``integrated_gravity`` compares an accelerometer with the
-camera's velocity.
+systematic error of sound recordings added to the covariance. ``force_beside_camera`` integrates an accelerometer beside
+the camera's velocity.
 """
 
 from typing import NamedTuple
@@ -93,18 +93,16 @@ class VelocityFit(NamedTuple):
     turn: Turn
 
 
-def velocity_fit(intervals: Intervals, T_imu_cam: Array, step_s: float) -> VelocityFit:
+def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
     """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
 
     The intervals, ``step_s`` long, have measured velocities. Noise of the regressor biases the scale. Of the regression
     of one velocity on the other and the inverse regression, the result nearer to zero is taken, or zero where their
     signs differ (Frisch, "Statistical confluence analysis", 1934).
     """
-    assert intervals.v_mps is not None
-    R_imu_cam, p_imu_cam = T_imu_cam[:3, :3], T_imu_cam[:3, 3]
-    w_radps, seen = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
-    measured = intervals.v_mps + np.cross(w_radps, p_imu_cam)
-    response, jacobian = measured - seen, np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
+    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
+    columns = [-seen[:, :, None], -skew(intervals.w_seen_radps), skew(seen)]
+    response, jacobian = measured - seen, np.concatenate(columns, axis=2)
     found, formal = _robust_with_formal_cov(response, jacobian)
     stretches = slip_stretches(len(seen) * step_s)
     lasting = jackknife_cov(_robust_solution, response, jacobian, stretches=stretches)
@@ -120,9 +118,9 @@ def velocity_fit(intervals: Intervals, T_imu_cam: Array, step_s: float) -> Veloc
     return VelocityFit(Scalar(scale, error), by_chance, Position(found[_LEVER], cov[_LEVER, _LEVER]), turn)
 
 
-def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
+def turn_by_rotations(intervals: Intervals) -> Turn:
     """Return the rotation that aligns the camera's rates of rotation with those of the gyro."""
-    seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    seen = intervals.w_seen_radps
     bias = np.tile(np.eye(3), (len(seen), 1, 1))
     response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
     found, formal = _robust_with_formal_cov(response, jacobian)
@@ -165,9 +163,9 @@ def _robust_solution(response: Array, jacobian: Array) -> Array:
     return _robust_with_formal_cov(response, jacobian)[0]
 
 
-def way_gone(sequence: Sequence, intervals: Intervals, position: Position, way_m: Array) -> Scalar:
+def way_gone(intervals: Intervals, position: Position, way_m: Array) -> Scalar:
     """Return where the camera is along a vector (3,) m from the given position: 0 is its start, 1 its end."""
-    return share_of_way(position.lacking_m, position.cov_m2 + _systematic_cov_m2(sequence, intervals), way_m)
+    return share_of_way(position.lacking_m, position.cov_m2 + _systematic_cov_m2(intervals), way_m)
 
 
 def share_of_way(lacking_m: Array, cov_m2: Array, way_m: Array) -> Scalar:
@@ -197,12 +195,11 @@ def metres(position: Array) -> str:
     return "(" + ", ".join(f"{x:z.2f}" for x in position) + ")"
 
 
-def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:
+def _systematic_cov_m2(intervals: Intervals) -> Array:
     """Return the covariance (3, 3) of the systematic error of the position in sound recordings."""
     if intervals.v_mps is None:
         return BESIDE_IMU_M**2 * np.eye(3)
-    R_imu_cam = sequence.rig.T_imu_cam[:3, :3]
-    w_radps, v_mps = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
+    w_radps, v_mps = intervals.w_seen_radps, intervals.v_seen_mps
     speed_mps, travel = np.linalg.norm(v_mps, axis=1), np.median(v_mps, axis=0)
     travel /= max(float(np.linalg.norm(travel)), 1e-9)
     lever = skew(w_radps)
@@ -213,32 +210,36 @@ def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:
     return np.asarray(in_turns + ALONG_TRAVEL_M**2 * np.outer(travel, travel))
 
 
-class IntegratedGravity(NamedTuple):
-    """The middle (K - 1,) of each interval, and the camera's velocity less the integrated specific force (K - 1, 3).
+class ForceBesideCamera(NamedTuple):
+    """At the middle (n,) of each interval, the camera's velocity (n, 3) and the integral (n, 3, 3, 3) of the force.
 
-    Velocities are in the axes of the first frame, by the rates of the gyro less its bias. Without errors the difference
-    is a straight line in time, whose slope is gravity.
+    Velocities are in the axes of the first frame, by the rates of the gyro less its bias. The integral is that of each
+    of the accelerometer's channels if it measured along each axis: [interval, axis of the IMU, channel, axis of the
+    first frame].
     """
 
     middle_ns: IntArray
-    velocity_mps: Array
+    v_mps: Array
+    along_mps: Array
+
+    @property
+    def gravity_mps(self) -> Array:
+        """The velocity less the integrated specific force (n, 3): without errors, a line whose slope is gravity."""
+        return np.asarray(self.v_mps - np.einsum("kaai->ki", self.along_mps))
 
 
-def integrated_gravity(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> IntegratedGravity:
-    """Subtract the specific force, integrated from the first interval on, from the camera's velocity."""
-    bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
+def force_beside_camera(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> ForceBesideCamera:
+    """Integrate the specific force beside the camera's velocity, from the first interval on."""
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
     middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
-    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
+    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - intervals.bias_radps
     v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
     t_ns, middle_at = subdivided(middle_ns)
     step_s = np.diff(t_ns)[:, None] / NS_PER_S
     mean = interval_means(motion.t_ns, motion.values, t_ns)
-    half = so3_exp(0.5 * step_s * (mean[:, 3:] - bias_radps))
+    half = so3_exp(0.5 * step_s * (mean[:, 3:] - intervals.bias_radps))
     R_first_imu = chained(half @ half)
-    v_first = (R_first_imu[middle_at] @ v_mps[:, :, None]).squeeze(-1)
-    gained = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1) * step_s
-    return IntegratedGravity(
-        middle_ns, v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at]
-    )
+    gained = np.einsum("kia,kc->kaci", R_first_imu[:-1] @ half, mean[:, :3] * step_s)
+    along_mps = np.concatenate([np.zeros((1, 3, 3, 3)), np.cumsum(gained, axis=0)])[middle_at]
+    return ForceBesideCamera(middle_ns, (R_first_imu[middle_at] @ v_mps[:, :, None])[..., 0], along_mps)

@@ -406,9 +406,8 @@ def _against_camera(evidence: Evidence) -> _Reading | None:
     intervals = evidence.intervals
     if intervals is None:
         return None
-    w_imu = intervals.w_cam_radps @ evidence.sequence.rig.T_imu_cam[:3, :3].T
-    source = f"against the camera's rotation over {len(w_imu)} intervals"
-    return _median(intervals.w_radps - w_imu, SYSTEMATIC_CAMERA, source)
+    source = f"against the camera's rotation over {len(intervals.interval)} intervals"
+    return _median(intervals.w_radps - intervals.w_seen_radps, SYSTEMATIC_CAMERA, source)
 
 
 # A scale is reported beyond so many standard errors, by a jackknife, and this share. Beyond five standard errors,
@@ -440,7 +439,7 @@ def gyro_scale(evidence: Evidence) -> Symptom | Undecided | None:
     if intervals is None:
         return evidence.blind
     off, doubtful = list[str](), list[str]()
-    for axis, (measured, seen) in zip("xyz", _rates(evidence, intervals), strict=True):
+    for axis, (measured, seen) in zip("xyz", _rates(intervals), strict=True):
         found = _sensitivity(measured, seen)
         if found is None:
             continue
@@ -460,10 +459,9 @@ def gyro_scale(evidence: Evidence) -> Symptom | Undecided | None:
     return None
 
 
-def _rates(evidence: Evidence, intervals: Intervals) -> list[tuple[Array, Array]]:
+def _rates(intervals: Intervals) -> list[tuple[Array, Array]]:
     """Return the gyro's and the camera's rates of rotation (M,) about each axis of the IMU, less their medians."""
-    seen = intervals.w_cam_radps @ evidence.sequence.rig.T_imu_cam[:3, :3].T
-    both = [rates - np.median(rates, axis=0) for rates in (intervals.w_radps, seen)]
+    both = [rates - np.median(rates, axis=0) for rates in (intervals.w_radps, intervals.w_seen_radps)]
     return [(both[0][:, k], both[1][:, k]) for k in range(3)]
 
 
@@ -627,7 +625,7 @@ def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
     """Judge the rotation of the camera by the motion from frame to frame, which does not determine the intrinsics."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
     by_velocities = evidence.velocity_fit
-    turn = turn_by_rotations(intervals, rig.T_imu_cam) if by_velocities is None else by_velocities.turn
+    turn = turn_by_rotations(intervals) if by_velocities is None else by_velocities.turn
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
         return _Calibration([], _undecided(float(least_rad.min()), kind == "twist"))

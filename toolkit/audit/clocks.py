@@ -58,10 +58,10 @@ CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 
 
-def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
+def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
     """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
-    gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
+    gyro, w_imu = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:]), intervals.w_seen_radps
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
     some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
     costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
@@ -71,7 +71,7 @@ def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Sca
     best = int(np.nanargmin(costs))
     offset_s = float(candidates[best]) if costs[best] < MOST_UNEXPLAINED * at_zero else 0.0
     found = Scalar(offset_s, np.inf)
-    seen, known = _change_seen(sequence, intervals, w_imu)
+    seen, known = _change_seen(sequence, intervals)
     for _ in range(REFINEMENTS):
         mean, inside = _gyro_at(gyro, sequence, intervals, found.value)
         after, after_inside = _gyro_at(gyro, sequence, intervals, found.value + 0.1 * step_s)
@@ -96,14 +96,14 @@ def _slope(instrument: Array, change: Array, residual: Array) -> float:
     return slope(instrument, change, residual).value
 
 
-def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
+def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolArray]:
     """Return the camera's angular acceleration at each interval (M, 3) rad/s^2, and where it is known (M,).
 
     It is computed from the neighbouring intervals, so it is independent of the noise of the gyro and of the interval's
     own.
     """
     seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
-    seen[intervals.interval + 1], known[intervals.interval + 1] = w_imu, True
+    seen[intervals.interval + 1], known[intervals.interval + 1] = intervals.w_seen_radps, True
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     before, after = intervals.interval, intervals.interval + 2
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
@@ -152,9 +152,8 @@ def _share_apart(w_imu: Array, mean: Array) -> float:
 
 def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
     """Return the change (s) of the camera's offset from the first half to the second; None if one is undetermined."""
-    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
-    early = np.arange(len(w_imu)) < len(w_imu) // 2
-    first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
+    early = np.arange(intervals.interval.size) < intervals.interval.size // 2
+    first, second = (camera_offset(sequence, intervals.select(rows)) for rows in (early, ~early))
     if first is None or second is None:
         return None
     return Scalar(second.value - first.value, float(np.hypot(first.error, second.error)))
@@ -195,52 +194,33 @@ class TruthClock(NamedTuple):
         return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
 
 
-class BesideTruth(NamedTuple):
-    """Rates of rotation (M, 3) rad/s of the camera, in the IMU's axes over M intervals, and of the truth.
-
-    ``sequence`` is the recording with the truth's rates of rotation in place of its motion samples.
-    """
-
-    sequence: Sequence
-    seen: Intervals
-    w_imu_radps: Array
-
-    @classmethod
-    def of(cls, sequence: Sequence, camera: CameraMotion, truth: Truth) -> Self | None:
-        """Return both; None unless the truth has finite poses in the order of time and there are motion samples."""
-        step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
-        in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
-        if sequence.motion_kind == "none" or not in_order:
-            return None
-        R_world_imu = truth.T_world_imu[:, :3, :3]
-        w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
-        middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
-        turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
-        rows = np.flatnonzero(camera.known)
-        seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
-        as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
-        return cls(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
-
-
 def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> TruthClock | None:
-    """Compare the clocks; None where the truth does not move, or no motion was measured."""
-    beside = BesideTruth.of(sequence, camera, truth)
-    if beside is None:
+    """Compare the clocks; None where the truth is out of order or not finite, or no motion was measured."""
+    step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
+    in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
+    if sequence.motion_kind == "none" or not in_order:
         return None
-    offset = camera_offset(beside.sequence, beside.seen, beside.w_imu_radps)
-    rate = rate_of_clock(beside, 0.0 if offset is None else offset.value)
+    R_world_imu = truth.T_world_imu[:, :3, :3]
+    w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+    middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
+    turning = sequence.motion.of(middle_ns, np.concatenate([np.zeros_like(w_radps), w_radps], axis=1))
+    as_gyro, rows = replace(sequence, motion=turning), np.flatnonzero(camera.known)
+    w_cam_radps = camera.w_radps[rows]
+    seen = Intervals(rows, w_cam_radps, None, w_cam_radps, camera.v_mps[rows], sequence.rig.T_imu_cam)
+    offset = camera_offset(as_gyro, seen)
+    rate = rate_of_clock(as_gyro, seen, 0.0 if offset is None else offset.value)
     return TruthClock(offset, rate, 0.5 * sequence.duration_s)
 
 
-def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
+def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar | None:
     """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
 
-    ``offset_s`` is an approximation of the delay (s) of the middle frame by the truth's clock. The standard error is
-    that of a jackknife over stretches of the recording.
+    ``as_gyro`` is the recording with the truth's rates of rotation in place of its motion samples, ``offset_s`` an
+    approximation of the delay (s) of the middle frame by the truth's clock. The standard error is that of a jackknife
+    over stretches of the recording.
     """
-    clocks = _Clocks.of(beside)
     try:
-        fitted = clocks.fitted(offset_s)
+        fitted = _Clocks.of(as_gyro, seen).fitted(offset_s)
         if fitted is None:
             return None
         found, at = fitted
@@ -269,11 +249,11 @@ class _Clocks(NamedTuple):
     w_imu_radps: Array
 
     @classmethod
-    def of(cls, beside: BesideTruth) -> Self:
-        motion, t_ns = beside.sequence.motion, beside.sequence.frames_t_ns
+    def of(cls, as_gyro: Sequence, seen: Intervals) -> Self:
+        motion, t_ns = as_gyro.motion, as_gyro.frames_t_ns
         since_s = (t_ns - t_ns[0]) / NS_PER_S
         truth = Integral.of(motion.t_ns, motion.values[:, 3:])
-        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], beside.seen.interval, beside.w_imu_radps)
+        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], seen.interval, seen.w_seen_radps)
 
     @property
     def step_s(self) -> float:

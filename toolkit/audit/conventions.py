@@ -9,10 +9,10 @@ import numpy as np
 
 from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.intervals import Intervals, chained, interval_means
+from toolkit.audit.intervals import Intervals
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
-from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp, so3_log
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
 
@@ -125,16 +125,11 @@ def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scal
     """
     if intervals.v_mps is None:
         return None
-    one, other = (_velocities(intervals, T) for T in (T_imu_first, T_imu_other))
+    readings = [intervals._replace(T_imu_cam=T) for T in (T_imu_first, T_imu_other)]
+    one, other = (read.v_seen_mps - np.cross(read.w_seen_radps, read.T_imu_cam[:3, 3]) for read in readings)
     in_turns = -np.cross(intervals.w_radps, T_imu_other[:3, 3] - T_imu_first[:3, 3])
     share = slope(*(_centred(values) for values in (in_turns, other - one, intervals.v_mps - one)))
     return share if share.error < LARGEST_ERROR else None
-
-
-def _velocities(intervals: Intervals, T_imu_cam: Array) -> Array:
-    """Return the velocity (M, 3) of the IMU by the camera's own motion and an extrinsic."""
-    w_imu = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
-    return np.asarray(intervals.v_cam_mps @ T_imu_cam[:3, :3].T - np.cross(w_imu, T_imu_cam[:3, 3]))
 
 
 def _centred(values: Array) -> Array:
@@ -305,7 +300,7 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConventi
     found = evidence.after(turned).position
     if found is None or np.linalg.norm(other - here) < NEAR_M:
         return here, ""
-    share = way_gone(turned, intervals, found, other - here)
+    share = way_gone(intervals._replace(T_imu_cam=reading.T_imu_cam), found, other - here)
     if is_there(share):
         return other, f"; by rotations the camera is at {metres(other)} and not at {metres(here)}"
     if is_excluded(share):
@@ -317,7 +312,7 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConventi
 
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
     """Name the axes of an extrinsic that the gyro's channels measure: x, y, z unless others are better beyond doubt."""
-    signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    signed, w_imu = signed_axes(), intervals._replace(T_imu_cam=T_imu_cam).w_seen_radps
     costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
     best = int(np.argmin(costs.mean(axis=1)))
     return axes_named(signed[best]) if mean_in_sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
@@ -362,7 +357,7 @@ def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
     apart_m = float(np.linalg.norm(candidate - given))
     if apart_m == 0.0:
         return None
-    share = way_gone(evidence.sequence, evidence.intervals, evidence.velocity_fit.position, candidate - given)
+    share = way_gone(evidence.intervals, evidence.velocity_fit.position, candidate - given)
     if is_excluded(share):
         return None
     where = (
@@ -419,13 +414,12 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
 
     Report the order and the signs of the channels that fit the camera's motion, if they are not the given ones.
     """
-    intervals, sequence = evidence.intervals, evidence.sequence
-    if intervals is None or sequence.motion_kind != "imu":
+    if evidence.intervals is None or evidence.sequence.motion_kind != "imu":
         return None
     found = evidence.agreement
     if found.residual_px > found.limit_px:
         return None  # gyro and camera differ, which `disagreement` reports
-    changes = _changes(evidence, intervals)
+    changes = _changes(evidence)
     if len(changes.velocity) < LEAST_STRIDES:
         return None
     orders = signed_axes()
@@ -448,33 +442,19 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _changes(evidence: Evidence, intervals: Intervals) -> _Changes:
-    """Return changes of the camera's velocity between the middles of intervals, in axes of the first frame."""
-    sequence, camera = evidence.sequence, evidence.camera_motion
-    R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
-    bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ R_imu_cam.T, axis=0)
-    frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
-    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
-    v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
-    middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
-    h_s = np.diff(middle_ns) / NS_PER_S
-    mean = interval_means(motion.t_ns, motion.values, middle_ns)
-    half = so3_exp(0.5 * h_s[:, None] * (mean[:, 3:] - bias_radps))
-    R_first_imu = chained(half @ half)
-    v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
-    made = np.einsum("kia,kc,k->kaci", R_first_imu[:-1] @ half, mean[:, :3], h_s)
-    up_to = np.concatenate([np.zeros((1, 3, 3, 3)), np.cumsum(made, axis=0)])
-    stride = max(OVERLAP, round(STRIDE_S / float(np.median(h_s))))
-    a = np.arange(0, len(v_first) - stride, stride // OVERLAP)
-    unknown = np.concatenate([[0], np.cumsum(~camera.known)])
+def _changes(evidence: Evidence) -> _Changes:
+    """Return the changes over strides in which the camera's motion is known."""
+    found, known = evidence.force_beside_camera, evidence.camera_motion.known
+    t_s = (found.middle_ns - found.middle_ns[0]) / NS_PER_S
+    stride = max(OVERLAP, round(STRIDE_S / float(np.median(np.diff(t_s)))))
+    a = np.arange(0, t_s.size - stride, stride // OVERLAP)
+    unknown = np.concatenate([[0], np.cumsum(~known)])
     a = a[unknown[a + stride + 1] == unknown[a]]
-    b = a + stride
-    t_s = (middle_ns - middle_ns[0]) / NS_PER_S
-    over_s = t_s[b] - t_s[a]
-    window = (t_s[a] // WINDOW_S).astype(np.int64)
-    return _Changes(
-        (v_first[b] - v_first[a]) / over_s[:, None], (up_to[b] - up_to[a]) / over_s[:, None, None, None], window
+    velocity, along = (
+        (one[a + stride] - one[a]) / (t_s[a + stride] - t_s[a]).reshape(-1, *[1] * (one.ndim - 1))
+        for one in (found.v_mps, found.along_mps)
     )
+    return _Changes(velocity, along, (t_s[a] // WINDOW_S).astype(np.int64))
 
 
 def _left(changes: _Changes, order: Array) -> Array:

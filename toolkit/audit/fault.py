@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from toolkit.audit.alignment import IntegratedGravity, Position, VelocityFit, integrated_gravity, velocity_fit
+from toolkit.audit.alignment import ForceBesideCamera, Position, VelocityFit, force_beside_camera, velocity_fit
 from toolkit.audit.clocks import TruthClock, truth_clock
 from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.one_step import Agreement, OneStep, agreement, one_step, step_correlation
@@ -141,7 +141,7 @@ class Evidence:
         if self.intervals is None or self.intervals.v_mps is None:
             return None
         step_s = float(np.median(np.diff(self.sequence.frames_t_ns))) / NS_PER_S
-        return velocity_fit(self.intervals, self.sequence.rig.T_imu_cam, step_s)
+        return velocity_fit(self.intervals, step_s)
 
     @cached_property
     def self_calibration(self) -> SelfCalibration | None:
@@ -157,10 +157,10 @@ class Evidence:
         return None if found is None else found.position
 
     @cached_property
-    def integrated_gravity(self) -> IntegratedGravity:
-        """The camera's velocity less the integrated specific force; needs ``intervals``."""
+    def force_beside_camera(self) -> ForceBesideCamera:
+        """The integrated specific force beside the camera's velocity; needs ``intervals``."""
         assert self.intervals is not None
-        return integrated_gravity(self.sequence, self.camera_motion, self.intervals)
+        return force_beside_camera(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
     def truth_clock(self) -> TruthClock | None:
@@ -179,7 +179,7 @@ class Evidence:
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
             known = ["camera_motion", "one_step", "step_correlation"]
             if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
-                known += ["intervals", "agreement", "velocity_fit", "self_calibration", "integrated_gravity"]
+                known += ["intervals", "agreement", "velocity_fit", "self_calibration", "force_beside_camera"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

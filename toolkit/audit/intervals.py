@@ -27,7 +27,7 @@ class Intervals(NamedTuple):
 
     ``interval`` (M,) is the index of the earlier frame. ``w_radps`` (M, 3) and, for twists, ``v_mps`` (M, 3)
     are the means of the motion samples over the interval, in the IMU frame; ``w_cam_radps`` and ``v_cam_mps``
-    (M, 3) are the camera's own motion in the camera's axes.
+    (M, 3) are the camera's own motion in the camera's axes. ``T_imu_cam`` (4, 4) relates the two.
     """
 
     interval: IntArray
@@ -35,11 +35,34 @@ class Intervals(NamedTuple):
     v_mps: Array | None
     w_cam_radps: Array
     v_cam_mps: Array
+    T_imu_cam: Array
+
+    @property
+    def w_seen_radps(self) -> Array:
+        """The camera's rates of rotation (M, 3) in the IMU's axes."""
+        return np.asarray(self.w_cam_radps @ self.T_imu_cam[:3, :3].T)
+
+    @property
+    def v_seen_mps(self) -> Array:
+        """The camera's velocity (M, 3) by its own motion, in the IMU's axes."""
+        return np.asarray(self.v_cam_mps @ self.T_imu_cam[:3, :3].T)
+
+    @property
+    def v_measured_mps(self) -> Array:
+        """The camera's velocity (M, 3) by the samples, in the IMU's axes; only where these are twists."""
+        assert self.v_mps is not None
+        return np.asarray(self.v_mps + np.cross(self.w_seen_radps, self.T_imu_cam[:3, 3]))
+
+    @property
+    def bias_radps(self) -> Array:
+        """The constant difference (3,) of the gyro's rates and the camera's, their median."""
+        return np.asarray(np.median(self.w_radps - self.w_seen_radps, axis=0))
 
     def select(self, rows: BoolArray) -> "Intervals":
         """Return those of a mask (M,)."""
         v_mps = None if self.v_mps is None else self.v_mps[rows]
-        return Intervals(self.interval[rows], self.w_radps[rows], v_mps, self.w_cam_radps[rows], self.v_cam_mps[rows])
+        seen = self.w_cam_radps[rows], self.v_cam_mps[rows], self.T_imu_cam
+        return Intervals(self.interval[rows], self.w_radps[rows], v_mps, *seen)
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
@@ -49,7 +72,8 @@ def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
         return None
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)[rows]
     v_mps = mean[:, :3] if isinstance(sequence.motion, TwistSamples) else None
-    return Intervals(rows, mean[:, 3:], v_mps, camera.w_radps[rows], camera.v_mps[rows])
+    seen = camera.w_radps[rows], camera.v_mps[rows], sequence.rig.T_imu_cam
+    return Intervals(rows, mean[:, 3:], v_mps, *seen)
 
 
 def is_comparable(sequence: Sequence) -> bool:

@@ -120,7 +120,7 @@ def self_calibration(
 
     None where no window has enough tracks, or the adjustment finds no calibration near the given one.
     """
-    w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
+    w_bias = intervals.bias_radps
     windows = _windows(sequence, camera, w_bias, fewest_windows)
     if not windows:
         return None

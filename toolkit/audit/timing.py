@@ -670,7 +670,7 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
 def _lag(sequence: Sequence, intervals: Intervals) -> Scalar | None:
     """Estimate the lag where both frames have a sample and the camera's motion is known on either side."""
     w_camera = np.zeros((sequence.frame_count - 1, 3))
-    w_camera[intervals.interval] = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    w_camera[intervals.interval] = intervals.w_seen_radps
     known = np.zeros(sequence.frame_count - 1, dtype=bool)
     known[intervals.interval] = True
     sample, follows = _samples_at_frames(sequence)
@@ -735,8 +735,7 @@ def time_offset(evidence: Evidence) -> Symptom | Undecided | None:
     sequence, intervals = evidence.sequence, evidence.intervals
     if intervals is None:
         return evidence.blind
-    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
-    found = _refined(camera_offset(sequence, intervals, w_imu), evidence)
+    found = _refined(camera_offset(sequence, intervals), evidence)
     if found is None:
         return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
     expected_s, least_s = _expected(sequence)
@@ -775,8 +774,7 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
     _, here, there = np.intersect1d(
         evidence.sequence.frames_t_ns[before.interval], stamps_ns[after.interval], return_indices=True
     )
-    R_imu_cam, p_imu_cam = evidence.sequence.rig.T_imu_cam[:3, :3], evidence.sequence.rig.T_imu_cam[:3, 3]
-    seen = before.v_cam_mps @ R_imu_cam.T - np.cross(before.w_cam_radps @ R_imu_cam.T, p_imu_cam)
+    seen = before.v_seen_mps - np.cross(before.w_seen_radps, before.T_imu_cam[:3, 3])
     costs = cauchy(np.stack([before.v_mps[here] - seen[here], after.v_mps[there] - seen[here]]), LEAST_SPREAD_V)
     return mean_in_sigmas(costs[1] - costs[0])
 
