@@ -85,18 +85,38 @@ def test_a_dataset_of_another_package_is_read(announce: Announce, tmp_path: Path
     assert datasets.load_sequence(str(tmp_path / "recording")).name == "loaded recording"
 
 
-def test_a_missing_dependency_makes_one_metric_file_unavailable(announce: Announce) -> None:
-    announce(metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "needy_one.py": "import a_package_nobody_has.part\n"})
-    assert metrics.unavailable() == {"needy-one": "it needs the package a_package_nobody_has"}
-    assert "answer" in metrics.describe()
-
-
-def test_a_missing_dependency_makes_one_dataset_unavailable(announce: Announce, tmp_path: Path) -> None:
+def test_a_missing_dependency_makes_one_file_unavailable(announce: Announce, tmp_path: Path) -> None:
+    announce(
+        metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "needy.py": f"import a_package_nobody_has.part\n{METRIC}"}
+    )
     announce(datasets.ENTRY_POINT_GROUP, {"needy.py": "import a_package_nobody_has\n"})
-    assert datasets.unavailable() == {"needy": "it needs the package a_package_nobody_has"}
+    lacking = {"needy": "it needs the package a_package_nobody_has"}
+    assert metrics.unavailable() == datasets.unavailable() == lacking
+    assert "answer" in metrics.describe()
     (tmp_path / "recording").write_text("of nobody")
     with pytest.raises(DataError, match=r"no known format.*; needy is unavailable: it needs the package a_package_nob"):
         datasets.load_sequence(str(tmp_path / "recording"))
+
+
+def test_a_metric_that_is_unavailable_is_named_where_it_is_requested(announce: Announce) -> None:
+    announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
+    with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
+        metrics.metrics_called(["answer"])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "why"),
+    [
+        ("empty.py", "", "empty.py: defines neither recognises(path) and load(path) nor BUILT_IN"),
+        ("their_world.py", "BUILT_IN = {'drive': lambda seed: None}\n", "both offer the sequence drive; rename one"),
+        ("course_npz.py", DATASET, "two dataset modules are called course-npz"),
+    ],
+)
+def test_a_module_that_is_no_dataset_is_named(announce: Announce, file: str, text: str, why: str) -> None:
+    announce(datasets.ENTRY_POINT_GROUP, {file: text})
+    with pytest.raises(ExtensionError, match=re.escape(why)):
+        datasets.formats()
+        datasets.built_ins()
 
 
 @pytest.mark.parametrize(
@@ -116,38 +136,10 @@ def test_a_typo_still_fails(announce: Announce, group: str, line: str, error: ty
         found()
 
 
-def test_an_entry_point_to_nowhere_is_refused(monkeypatch: pytest.MonkeyPatch, announce: Announce) -> None:
-    point = EntryPoint("gone", "gone_package.parts", "any")
-    monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
-    for found in (metrics.describe, datasets.formats):
-        with pytest.raises(ExtensionError, match=r"names gone_package.parts, which is not a package"):
-            found()
-
-
-def test_a_module_that_is_no_dataset_says_what_it_lacks(announce: Announce) -> None:
-    announce(datasets.ENTRY_POINT_GROUP, {"empty.py": ""})
-    with pytest.raises(
-        ExtensionError, match=r"empty.py: defines neither recognises\(path\) and load\(path\) nor BUILT_IN"
-    ):
-        datasets.formats()
-
-
-def test_two_packages_cannot_offer_a_sequence_of_the_same_name(announce: Announce) -> None:
-    announce("toolkit.datasets", {"their_world.py": "BUILT_IN = {'drive': lambda seed: None}\n"})
-    with pytest.raises(ExtensionError, match=r"their_world\.py: both offer the sequence drive; rename one"):
-        datasets.built_ins()
-
-
 def test_an_estimators_file_that_is_no_python_is_named_with_its_line(announce: Announce) -> None:
     announce("toolkit.estimators", {"broken.py": "import math\ndef (\n"})
     with pytest.raises(ExtensionError, match=r"broken\.py: line 2 is no Python \(invalid syntax\)"):
         find("broken").summary()
-
-
-def test_two_datasets_cannot_share_a_name(announce: Announce) -> None:
-    announce(datasets.ENTRY_POINT_GROUP, {"course_npz.py": DATASET})
-    with pytest.raises(ExtensionError, match="two dataset modules are called course-npz"):
-        datasets.formats()
 
 
 @pytest.mark.parametrize(
@@ -187,12 +179,6 @@ def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer
     run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
     with pytest.raises(ExtensionError, match=r"answer\.py: score must return Scores of \['answer'\], and returned"):
         metrics.score_run(run, "causal", sequence)
-
-
-def test_a_metric_that_is_unavailable_is_named_where_it_is_requested(announce: Announce) -> None:
-    announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
-    with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
-        metrics.metrics_called(["answer"])
 
 
 def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp_path: Path) -> None:

@@ -34,9 +34,15 @@ def write(package: Path, file: str, body: str) -> None:
 
 def test_the_projects_own_estimators_are_found():
     assert {"batch", "dead-reckoning", "ekf", "mapping", "seed-ekf"} <= discover().keys()
+    rungs = ladder()
+    assert len({entry.rung() for entry in rungs}) == len(rungs) > 2
+    assert all(entry.change() for entry in rungs)
 
 
 def test_a_new_file_is_a_new_estimator(package):
+    (package / "parts").mkdir()  # folders and private files are parts, not estimators
+    (package / "parts" / "__init__.py").write_text("")
+    write(package, "_helper.py", "")
     assert discover() == {}
     write(package, "my_new_filter.py", "def build(setup):\n    return setup")
     assert list(discover()) == ["my-new-filter"]
@@ -49,13 +55,6 @@ def test_discovery_and_summaries_import_nothing(package):
     write(package, "explosive.py", "raise RuntimeError('imported')")
     assert find("explosive").summary() == "Stands still and says so."
     assert f"{PACKAGE}.explosive" not in sys.modules
-
-
-def test_folders_and_private_files_are_parts_not_estimators(package):
-    (package / "parts").mkdir()
-    (package / "parts" / "__init__.py").write_text("")
-    write(package, "_helper.py", "")
-    assert discover() == {}
 
 
 def test_several_packages_are_found_together(package, tmp_path, monkeypatch):
@@ -72,6 +71,9 @@ def test_several_packages_are_found_together(package, tmp_path, monkeypatch):
 def test_a_missing_optional_dependency_makes_one_estimator_unavailable(package):
     write(package, "needy.py", "import a_package_nobody_has.part\n\ndef build(setup): ...")
     write(package, "modest.py", "def build(setup): ...")
+    write(package, "empty.py", "")
+    with pytest.raises(EstimatorError, match=r"empty.py defines no function build\(setup\)"):
+        find("empty").load()
     with pytest.raises(EstimatorError, match="needy is unavailable: it needs the package a_package_nobody_has"):
         find("needy").load()
     assert callable(find("modest").load())
@@ -93,12 +95,6 @@ def test_a_typo_still_fails(package, body, error):
     write(package, "typo.py", body) if error is not SyntaxError else (package / "typo.py").write_text(body)
     with pytest.raises(error):
         find("typo").load()
-
-
-def test_a_file_without_build_says_what_it_lacks(package):
-    write(package, "empty.py", "")
-    with pytest.raises(EstimatorError, match=r"empty.py defines no function build\(setup\)"):
-        find("empty").load()
 
 
 def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
@@ -138,19 +134,6 @@ def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(package, rul
     write(package, "odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
     with pytest.raises(EstimatorError, match=r"odd: RULES in odd.py has to map some of outliers, .* to True"):
         find("odd").check_usable(DEFAULTS)
-
-
-def test_every_rung_of_the_project_says_what_it_changes():
-    rungs = ladder()
-    assert len({entry.rung() for entry in rungs}) == len(rungs) > 2
-    assert all(entry.change() for entry in rungs)
-
-
-def test_an_unknown_name_lists_the_known_ones(package):
-    write(package, "ant.py", "")
-    write(package, "bee.py", "")
-    with pytest.raises(EstimatorError, match="no estimator is called wasp; there are ant, bee"):
-        find("wasp")
 
 
 def test_an_entry_point_to_nowhere_is_reported(monkeypatch):

@@ -51,10 +51,6 @@ def execution() -> ModuleType:
     return module
 
 
-def test_there_are_five_notebooks() -> None:
-    assert [source.stem[:2] for source in SOURCES] == ["01", "02", "03", "04", "05"]
-
-
 @each
 def test_the_pair_has_the_same_cells(source: Path, execution: ModuleType) -> None:
     written, kept = execution.read_source(source), nbformat.read(source.with_suffix(".ipynb"), 4)
