@@ -236,6 +236,17 @@ def rotation_from_quaternion(quaternion: Array) -> Array:
     return _IDENTITY + 2.0 * (q[..., 3, None, None] * vector_x + vector_x @ vector_x)
 
 
+def nearest_rotation(matrix: Array) -> tuple[Array, Array]:
+    """Return the rotation R (3, 3) with the largest tr(R^T M) of a matrix M (3, 3), and the terms (3,) of that trace.
+
+    R is nearest to M, and turns vectors x best onto y where M is the sum of y x^T (Kabsch 1976; Umeyama 1991, eqs.
+    40-43). The terms are the singular values of M, the last one negative where M mirrors.
+    """
+    u, d, v_transposed = np.linalg.svd(matrix)
+    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v_transposed))])
+    return (u * s) @ v_transposed, d * s
+
+
 def yaw_of(rotation: Array) -> Array:
     """Return the heading (...,) in radians about the world z axis of a rotation (..., 3, 3) world <- body."""
     return np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])

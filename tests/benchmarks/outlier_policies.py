@@ -25,7 +25,7 @@ import numpy as np
 
 from toolkit import compare, runner
 from toolkit.geometry import Array
-from toolkit.metrics.parts.alignment import fit_yaw
+from toolkit.metrics.parts.against_truth import fit_yaw
 from toolkit.registry import find
 from toolkit.sequence import Sequence as Recording
 from toolkit.settings import POLICIES, Outliers, Settings

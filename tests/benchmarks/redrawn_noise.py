@@ -26,7 +26,7 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log, transform
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import NS_PER_S, ImuNoise
-from toolkit.metrics.parts.alignment import fit_yaw
+from toolkit.metrics.parts.against_truth import fit_yaw
 from toolkit.models import stereo
 from toolkit.registry import find
 from toolkit.runner import run

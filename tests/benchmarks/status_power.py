@@ -43,8 +43,8 @@ from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Evaluation, ate, score_run
-from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
-from toolkit.metrics.held_out_over_motion import RATIO
+from toolkit.metrics.innovations import ACCEPTED, refuses_much
+from toolkit.metrics.reprojection import RATIO
 from toolkit.progress import SILENT
 from toolkit.runner import with_divergence
 from toolkit.sequence import Observations

@@ -17,8 +17,7 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import Unit, run_estimator
 from toolkit.metrics import Evaluation
 from toolkit.metrics.ate import position_rmse
-from toolkit.metrics.parts.alignment import fit_yaw
-from toolkit.metrics.parts.association import Matched
+from toolkit.metrics.parts.against_truth import Matched, fit_yaw
 from toolkit.progress import SILENT
 
 

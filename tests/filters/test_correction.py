@@ -13,9 +13,7 @@ from filters.kalman.landmark_map import LandmarkMap
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
-from toolkit.models.imu import IMU_LAYOUT
-from toolkit.models.state import Belief, Layout
-from toolkit.models.twist import TWIST_LAYOUT
+from toolkit.models.state import IMU_LAYOUT, TWIST_LAYOUT, Belief, Layout
 from toolkit.simulation import DRIVE
 
 RIG = DRIVE.rig

@@ -21,8 +21,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, skew
 from toolkit.measurements import Prior
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief
-from toolkit.models.twist import TWIST_LAYOUT
+from toolkit.models.state import TWIST_LAYOUT, Belief
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT
 

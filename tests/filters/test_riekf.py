@@ -23,9 +23,8 @@ from filters.kalman.online_output import LandmarkMemory
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
 from toolkit.measurements import Prior
-from toolkit.models.imu import IMU_LAYOUT
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief
+from toolkit.models.state import IMU_LAYOUT, Belief
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 

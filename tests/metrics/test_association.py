@@ -8,7 +8,7 @@ import pytest
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
-from toolkit.metrics.parts.association import associate
+from toolkit.metrics.parts.against_truth import associate
 from toolkit.sequence import Truth
 
 PERIOD_NS = 100_000_000

@@ -56,7 +56,7 @@ def test_the_efficient_estimates_errors_are_as_large_as_the_bound(name):
 
 
 def scores(run, sequence, output="causal", requested=("bound",)):
-    found = score_run(run, output, sequence, requested, only=KEYS)
+    found = score_run(run, output, sequence, requested)
     return {key: found.values[key] for key in KEYS}, found.notes
 
 
@@ -202,7 +202,7 @@ def test_measurements_that_do_not_determine_a_state_have_no_bound(sequence, make
     monkeypatch.setattr(cramer_rao, "state_covs", indeterminate)
     efficient.cache_clear()
     run = with_error(sequence, make_run, np.zeros(6))
-    found = score_run(run, "final", sequence, ("bound",), only=KEYS)
+    found = score_run(run, "final", sequence, ("bound",))
     assert {found.values[key] for key in KEYS} == {None}
     assert "do not determine every state" in found.notes["bound_position_m"]
 

@@ -8,7 +8,8 @@ import pytest
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse, so3_exp
 from toolkit.measurements import Prior
-from toolkit.metrics import Evaluation, score_run
+from toolkit.metrics import Evaluation
+from toolkit.metrics.nees import score
 from toolkit.metrics.parts.consistency import chi2_quantile, nees_band, nees_over_time
 from toolkit.sequence import Truth
 
@@ -46,7 +47,7 @@ def stating(make_run, sequence, poses, cov):
 
 
 def nees(run, sequence, output="causal"):
-    scores = score_run(run, output, sequence, only=KEYS)
+    scores = score(Evaluation(run, output, sequence))
     return [scores.values[key] for key in KEYS]
 
 
@@ -93,7 +94,7 @@ def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequenc
     poses = elsewhere @ drive(200)
     sequence = replace(sequence, prior=None if prior is None else prior_at(poses[0]))
     run = stating(make_run, sequence, poses, np.broadcast_to(COV, (200, 6, 6)))
-    scores = score_run(run, "causal", sequence, only=KEYS)
+    scores = score(Evaluation(run, "causal", sequence))
     # A perfect estimate: what is left is rounding, far below the covariance.
     assert scores.values["nees_pose_mean"] < 1e-12
     assert "its own world frame" in scores.notes["nees_pose_mean"]
@@ -133,7 +134,7 @@ def test_a_truth_with_other_stamps_is_interpolated(make_sequence, make_run, driv
 
 
 def refused(sequence, run):
-    scores = score_run(run, "causal", sequence, only=KEYS)
+    scores = score(Evaluation(run, "causal", sequence))
     assert [scores.values[key] for key in KEYS] == [None] * 4
     return scores.notes["nees_pose_mean"]
 

@@ -8,7 +8,8 @@ import pytest
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, se3, se3_exp, se3_inverse
 from toolkit.measurements import Prior
-from toolkit.metrics import score_run
+from toolkit.metrics import Evaluation
+from toolkit.metrics.nees import score
 from toolkit.sequence import Truth
 
 FRAMES = 4000
@@ -50,7 +51,7 @@ def drawn(sequence, make_run, scale=1.0, T_new_old=None):
 
 
 def values(run, sequence):
-    scores = score_run(run, "final", sequence, only=KEYS)
+    scores = score(Evaluation(run, "final", sequence))
     return [scores.values[key] for key in KEYS], [scores.notes.get(key, "") for key in KEYS]
 
 

@@ -105,25 +105,6 @@ def test_an_output_that_does_not_exist_is_refused(make_sequence, make_run, drive
         score_run(run, "causal", sequence)
 
 
-def test_of_some_metrics_their_files_alone_are_computed_and_say_the_same(make_sequence, make_run, drive, monkeypatch):
-    from toolkit.metrics import held_out
-
-    sequence = make_sequence(drive(20), track_count=3)
-    run = make_run(sequence.frames_t_ns, drive(20))
-    whole = score_run(run, "final", sequence)
-    monkeypatch.setattr(held_out, "score", lambda evaluation: 1 / 0)
-    some = score_run(run, "final", sequence, only=["coverage_percent", "ATE SE(3)"])
-    assert {"pairs", "coverage_percent", "ate_se3_m", "ate_none_m"} <= some.values.keys() < whole.values.keys()
-    assert some.values == {key: whole.values[key] for key in some.values}
-    assert some.notes == {key: note for key, note in whole.notes.items() if key in some.values}
-
-
-def test_an_unknown_metric_that_alone_is_wanted_is_answered_with_the_nearest(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(20), track_count=3)
-    with pytest.raises(VislamError, match="did you mean ate_se3_m"):
-        score_run(make_run(sequence.frames_t_ns, drive(20)), "final", sequence, only=["ate_se3"])
-
-
 def test_a_value_that_is_not_finite_becomes_none():
     scores = Scores({"a": math.nan, "b": 1.0}, {"b": "remark"})
     assert scores.values == {"a": None, "b": 1.0}

@@ -12,7 +12,7 @@ from matplotlib.inset import InsetIndicator
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, interpolate_poses, se3
-from toolkit.metrics import Evaluation, Scores, in_sample
+from toolkit.metrics import Evaluation, Scores, reprojection
 from toolkit.report import figures
 from toolkit.report.curves import Components
 from toolkit.report.figures import FigureChoice, consistency, drawn, error_map, errors_over_time, panels, top_view
@@ -137,12 +137,12 @@ def test_without_truth_there_is_no_nees_and_without_innovations_no_nis(without_t
 
 def test_landmarks_have_the_error_of_their_sightings(comparison: Comparison) -> None:
     evaluation = Evaluation(comparison.runs[0], "final", comparison.sequence)
-    ids, error_px = in_sample.errors_of_landmarks(evaluation)
+    ids, error_px = reprojection.errors_of_landmarks(evaluation)
     one = ids[ids.size // 2]
     kept = evaluation.run.landmarks.track_ids == one
     landmarks = evaluation.run.landmarks
     alone = replace(landmarks, track_ids=landmarks.track_ids[kept], points_world=landmarks.points_world[kept], cov=None)
-    of_one = in_sample.errors(replace(evaluation, run=replace(evaluation.run, landmarks=alone)))
+    of_one = reprojection.in_sample_errors(replace(evaluation, run=replace(evaluation.run, landmarks=alone)))
     assert error_px[ids == one] == pytest.approx(np.sqrt(np.mean(of_one**2)))
 
 

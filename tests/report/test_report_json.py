@@ -13,8 +13,8 @@ from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.metrics import Evaluation
+from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.consistency import body_errors
-from toolkit.metrics.parts.residuals import rmse
 from toolkit.report.curves import components, error_curves
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document

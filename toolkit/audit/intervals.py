@@ -6,7 +6,7 @@ import numpy as np
 
 from toolkit.audit.robust import Scalar, median_error
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
+from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3_exp, se3_inverse
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.noise import white_sigma
@@ -179,12 +179,11 @@ def rotation_ratio(intervals: Intervals) -> Scalar:
     of the samples does not bias.
     """
     measured, seen = (w - np.median(w, axis=0) for w in (intervals.w_radps, intervals.w_cam_radps))
-    left, singular, right = np.linalg.svd(measured.T @ seen)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    turn, overlaps = nearest_rotation(measured.T @ seen)
     total = float(np.sum(seen**2))
     if not total > 0.0:
         return Scalar(1.0, np.inf)
-    turned, scale = seen @ (left * signs @ right).T, float(singular @ signs) / total
+    turned, scale = seen @ turn.T, float(overlaps.sum()) / total
     moment = np.sum(turned * (measured - scale * turned), axis=1)
     return Scalar(scale, float(np.sqrt(np.sum(moment**2))) / total)
 

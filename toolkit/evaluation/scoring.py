@@ -35,8 +35,16 @@ from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, t
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
-from toolkit.metrics.parts.alignment import place_first
-from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
+from toolkit.metrics.parts.against_truth import (
+    STAMP_TOLERANCE_NS,
+    AgainstTruth,
+    Matched,
+    PairsAgainstTruth,
+    distance_along,
+    median_period_ns,
+    place_first,
+    poses_at,
+)
 from toolkit.metrics.parts.consistency import (
     NOT_MET,
     NOT_PLACED,
@@ -44,7 +52,6 @@ from toolkit.metrics.parts.consistency import (
     PLACED,
     chi2_quantile,
 )
-from toolkit.metrics.parts.evaluation import AgainstTruth, PairsAgainstTruth
 from toolkit.models.gating import mahalanobis_squared
 
 COVERAGE = Metric(

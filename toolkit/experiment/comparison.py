@@ -32,7 +32,7 @@ from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
 from toolkit.metrics.correction_trend import LIMIT, TREND
-from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
+from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 from toolkit.settings import DEFAULTS, Settings
 

@@ -18,7 +18,7 @@ from scipy.special import fdtri, stdtrit
 from toolkit.arrays import rows_of
 from toolkit.geometry import Array, se3_inverse
 from toolkit.jackknife import STRETCHES, jackknife_error
-from toolkit.metrics.parts.association import Matched
+from toolkit.metrics.parts.against_truth import Matched
 
 # Stretches a path is divided into, at most; with fewer than the second number nothing is tested.
 MOST_STRETCHES, FEWEST_STRETCHES = 40, 10

@@ -19,7 +19,7 @@ from toolkit.datasets.trajectories.poses import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.experiment.comparison import TRUTH, plain_name
-from toolkit.metrics.parts.association import associate, median_period_ns, poses_at
+from toolkit.metrics.parts.against_truth import associate, median_period_ns, poses_at
 from toolkit.sequence import LONGEST_NAME, Sequence, Truth
 from toolkit.settings import SettingsError
 

@@ -22,8 +22,16 @@ from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
 from toolkit.metrics.ate import position_rmse, rotation_rmse_deg
-from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_sim3, fit_yaw
-from toolkit.metrics.parts.association import Matched, distance_along, median_period_ns, poses_at
+from toolkit.metrics.parts.against_truth import (
+    Alignment,
+    Matched,
+    distance_along,
+    fit_se3,
+    fit_sim3,
+    fit_yaw,
+    median_period_ns,
+    poses_at,
+)
 from toolkit.metrics.rpe import hundred_metres_percent
 from toolkit.sequence import content_digest
 

@@ -155,19 +155,11 @@ def requests_of(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted({switch for switch in switches if switch}))
 
 
-def score_run(
-    run: Run,
-    output: Output,
-    sequence: Sequence,
-    requested: Collection[str] = (),
-    only: Collection[str] | None = None,
-) -> Scores:
+def score_run(run: Run, output: Output, sequence: Sequence, requested: Collection[str] = ()) -> Scores:
     """Score one output of a run against its sequence, with every key of :func:`describe`.
 
-    ``requested`` names the switches of metrics that are computed on request only. With ``only``, the keys, names or
-    groups of some metrics, only the files of these are computed, and the scores have the keys of these files alone. A
-    metric that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where
-    the run has no output of that kind, UnknownNameError where ``only`` names a metric that does not exist,
+    ``requested`` names the switches of metrics that are computed on request only. A metric that cannot be computed, or
+    is not finite, is None and has its reason in the notes. Raises ValueError where the run has no output of that kind,
     ExtensionError where a file scores other keys than it declares; an error inside a metric is a defect and passes
     through.
     """
@@ -175,7 +167,7 @@ def score_run(
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
     with np.errstate(all="ignore"):  # a diverged run may overflow; the value is then None with its reason, below
-        for file in _files_of(only):
+        for file in _found().files:
             scores = _score_file(file, evaluation, requested)
             if not isinstance(scores, Scores) or list(scores.values) != _keys(file):
                 given = list(scores.values) if isinstance(scores, Scores) else type(scores).__name__
@@ -184,14 +176,6 @@ def score_run(
             values |= scores.values
             notes |= scores.notes
     return Scores(values, notes)
-
-
-def _files_of(names: Collection[str] | None) -> tuple[MetricFile, ...]:
-    """Return the files that declare the metrics of the given keys, names or groups; every file where they are None."""
-    if names is None:
-        return _found().files
-    wanted = {metric.key for metric in metrics_called(names)}
-    return tuple(file for file in _found().files if any(metric.key in wanted for metric in file.METRICS))
 
 
 def repeated(causal: Scores) -> Scores:

@@ -3,10 +3,16 @@
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.alignment import Alignment, fit_sim3, fit_yaw
-from toolkit.metrics.parts.association import Matched
-from toolkit.metrics.parts.evaluation import AgainstTruth
-from toolkit.metrics.parts.residuals import angles_deg, lengths, rmse
+from toolkit.metrics.parts.against_truth import (
+    AgainstTruth,
+    Alignment,
+    Matched,
+    angles_deg,
+    fit_sim3,
+    fit_yaw,
+    lengths,
+    rmse,
+)
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 10

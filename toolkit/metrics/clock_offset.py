@@ -14,9 +14,7 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, skew
 from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics.parts.alignment import fit_se3
-from toolkit.metrics.parts.evaluation import AgainstTruth
-from toolkit.metrics.parts.residuals import lengths, rmse
+from toolkit.metrics.parts.against_truth import AgainstTruth, fit_se3, lengths, rmse
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 45

@@ -8,8 +8,7 @@ and their errors are divided by the nominal length; the mean is over all segment
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.evaluation import AgainstTruth
-from toolkit.metrics.parts.residuals import angles_deg, lengths, relative_errors
+from toolkit.metrics.parts.against_truth import AgainstTruth, angles_deg, lengths, relative_errors
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 30

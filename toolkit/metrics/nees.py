@@ -1,16 +1,31 @@
-"""Normalised estimation error squared: compares the errors with the stated covariance.
+"""Normalised estimation error squared: compares the errors of pose, velocity and biases with the stated covariance.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4. A filter
+may be consistent in its pose and not in its biases; the error shows in the pose much later.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
-from toolkit.metrics.parts.consistency import PLACED, POSE_DOF, nees_band, nees_over_time
+from toolkit.geometry import Array
+from toolkit.metrics.parts.consistency import (
+    NO_SUCH_BLOCK,
+    PLACED,
+    POSE_DOF,
+    bias_errors,
+    layout_of,
+    nees_band,
+    nees_over_time,
+    stated_errors,
+    velocity_errors,
+)
 from toolkit.metrics.parts.evaluation import Evaluation
-from toolkit.metrics.parts.scores import Metric, Scores
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.models.gating import mahalanobis_squared
 
 ORDER = 75
-METRICS = (
+_OF_POSE = (
     Metric(
         "nees_pose_mean",
         "mean normalised error squared of the pose over its 6 degrees of freedom; 1 is consistent",
@@ -49,9 +64,31 @@ METRICS = (
         in_contract=True,
     ),
 )
+_OF_STATE = tuple(
+    Metric(
+        f"nees_{key}_mean",
+        f"mean normalised error squared of the {block} over its 3 degrees of freedom; 1 is consistent",
+        "1",
+        ("NEES", heading),
+        best="one",
+    )
+    for key, block, heading in (
+        ("vel", "velocity", "vel"),
+        ("gyro_bias", "gyro bias", "gyro b"),
+        ("accel_bias", "accelerometer bias", "acc b"),
+    )
+)
+METRICS = (*_OF_POSE, *_OF_STATE)
 
 
 def score(evaluation: Evaluation) -> Scores:
+    """Score the stated covariances against the truth."""
+    return Scores.attempt(_OF_POSE, lambda: _of_pose(evaluation)) | Scores.attempt(
+        _OF_STATE, lambda: _of_state(evaluation)
+    )
+
+
+def _of_pose(evaluation: Evaluation) -> Scores:
     """Score the stated covariances of poses against the truth."""
     nees = nees_over_time(evaluation)
     low, high = nees_band(POSE_DOF)
@@ -64,3 +101,22 @@ def score(evaluation: Evaluation) -> Scores:
         }
     )
     return scores.remarked(scores.values, PLACED if nees.placed else "")
+
+
+def _of_state(evaluation: Evaluation) -> Scores:
+    """Score the stated covariances of velocity and biases against the truth."""
+    stated = stated_errors(evaluation)
+    layout = layout_of(stated)
+
+    def mean(block: slice | None, errors: Callable[[], Array]) -> float:
+        if block is None:
+            raise Unavailable(NO_SUCH_BLOCK)
+        return float(mahalanobis_squared(errors(), stated.cov[:, block, block]).mean()) / 3.0
+
+    return evaluate(
+        {
+            "nees_vel_mean": lambda: mean(layout.velocity, lambda: velocity_errors(evaluation, stated)),
+            "nees_gyro_bias_mean": lambda: mean(layout.gyro_bias, lambda: bias_errors(evaluation, stated)[:, 3:]),
+            "nees_accel_bias_mean": lambda: mean(layout.accel_bias, lambda: bias_errors(evaluation, stated)[:, :3]),
+        }
+    )

@@ -10,9 +10,16 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
-from toolkit.metrics.parts.evaluation import AgainstTruth
-from toolkit.metrics.parts.residuals import angles_deg, lengths, relative_errors, rmse
+from toolkit.metrics.parts.against_truth import (
+    STAMP_TOLERANCE_NS,
+    AgainstTruth,
+    Matched,
+    angles_deg,
+    lengths,
+    median_period_ns,
+    relative_errors,
+    rmse,
+)
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 20

@@ -15,9 +15,8 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, skew, so3_exp
 from toolkit.measurements import ImuMotion, ImuNoise, Motion, Prior
 from toolkit.models.factors import B, V, X, joint_prior, latest_values
-from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction, with_velocity_turned
+from toolkit.models.state import IMU_LAYOUT, POSE, POSITION, ROTATION, Belief, Prediction, with_velocity_turned
 
-IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)
 
 # GTSAM requires a noise of position integration (m/s/sqrt(Hz)); this one is far below any accelerometer's effect.

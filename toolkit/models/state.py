@@ -30,6 +30,11 @@ class Layout:
         return slice((self.accel_bias or self.gyro_bias).start, self.size)
 
 
+# Of the whole state where an IMU measures the motion, and where twists do.
+IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
+TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
+
+
 def with_velocity_turned(cov: Array, layout: Layout, rotation: Array) -> Array:
     """Return a covariance (d, d) with the velocity's error rotated by (3, 3) to other axes."""
     assert layout.velocity is not None

@@ -15,9 +15,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp_and_right_jacobian, se3_inverse
 from toolkit.measurements import Motion, Prior, TwistMotion, TwistNoise
 from toolkit.models.factors import B, X, joint_prior, latest_values
-from toolkit.models.state import POSE, Belief, Layout, Prediction
-
-TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
+from toolkit.models.state import POSE, TWIST_LAYOUT, Belief, Prediction
 
 
 class TwistStep(NamedTuple):

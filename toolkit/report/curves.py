@@ -15,8 +15,15 @@ from toolkit.estimate import Output, Run, Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
 from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_yaw, place_first
-from toolkit.metrics.parts.association import associate, finite_poses, median_period_ns
+from toolkit.metrics.parts.against_truth import (
+    Alignment,
+    associate,
+    finite_poses,
+    fit_se3,
+    fit_yaw,
+    median_period_ns,
+    place_first,
+)
 from toolkit.metrics.parts.consistency import POSE_DOF, body_errors, starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION

@@ -13,8 +13,8 @@ from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, is_on_request, metrics_called, unavailable
-from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
-from toolkit.metrics.held_out_over_motion import RATIO
+from toolkit.metrics.innovations import ACCEPTED, refuses_much
+from toolkit.metrics.reprojection import RATIO
 from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
 from toolkit.report.table import cell, number
 from toolkit.report.verdict import listed

@@ -16,7 +16,7 @@ from zlib import crc32
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, IntArray, se3, so3_exp
+from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3, so3_exp
 from toolkit.measurements import GRAVITY_WORLD, NS_PER_S, ImuNoise, Prior, StereoRig, TwistNoise
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
@@ -234,8 +234,7 @@ def _flight_rig() -> StereoRig:
     y_axis = np.array([-0.99988092970, 0.01496721332, 0.00375618836])
     R_imu_cam = np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)], axis=-1)
     # The published digits are orthonormal to 1e-10 only.
-    nearest = np.linalg.svd(R_imu_cam)
-    T_imu_cam = se3(nearest.U @ nearest.Vh, np.array([-0.021640145, -0.064676987, 0.009810731]))
+    T_imu_cam = se3(nearest_rotation(R_imu_cam)[0], np.array([-0.021640145, -0.064676987, 0.009810731]))
     return StereoRig(458.0, 457.0, 367.0, 248.0, 0.11, T_imu_cam, stereo_cov_px2(1.0))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from toolkit.datasets.trajectories.poses import OtherOrder
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, so3_log
+from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
@@ -167,8 +167,7 @@ def turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Ar
     measured, rates = (x - x.mean(axis=0) for x in (
         steps.mean_rates(reference.rates_t_ns, reference.rates_radps), steps.rates(R_world_body[within])
     ))  # fmt: skip
-    u, _, v_transposed = np.linalg.svd(measured.T @ rates)
-    turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v_transposed))]) @ v_transposed
+    turn, _ = nearest_rotation(measured.T @ rates)
     as_given, turned = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
     is_other = turned > _TURNED_CORRELATION and 1.0 - turned < _UNEXPLAINED_SHARE * (1.0 - as_given)
     return turn if is_other and np.linalg.norm(so3_log(turn)) > _OTHER_AXES_RAD else None

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, se3, se3_inverse, so3_log
+from toolkit.geometry import Array, nearest_rotation, se3, se3_inverse, so3_log
 
 Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 # Largest errors of a fit: positions in shares of their extent, orientations by an angle. Estimates with more drift are
@@ -155,12 +155,13 @@ class _Fit:
         self._truth, self._estimate = truth, estimate
         self._variance = float((y**2).sum() + (x**2).sum()) / len(y)
         self._extent = float(np.sqrt((y**2).sum() / len(y)))
-        self._u, self._s, self._vt = np.linalg.svd(y.T @ x / len(y))
+        self._covariance = y.T @ x / len(y)
 
     @property
     def is_determined(self) -> bool:
         """Say whether the positions leave a line."""
-        return bool(self._extent > 0.0 and self._s[1] > _LEAST_SIDEWAYS**2 * self._s[0])
+        _, overlaps = nearest_rotation(self._covariance)
+        return bool(self._extent > 0.0 and overlaps[1] > _LEAST_SIDEWAYS**2 * overlaps[0])
 
     @property
     def is_near(self) -> bool:
@@ -189,8 +190,8 @@ class _Fit:
 
     def off_share(self, matrix: Array) -> float:
         """Return how far positions whose axes are exchanged are off the truth's, of the truth's extent."""
-        handed = np.sign(np.linalg.det(self._u @ self._vt) * np.linalg.det(matrix))
-        squared = self._variance - 2.0 * float(self._s @ [1.0, 1.0, handed])
+        _, overlaps = nearest_rotation(self._covariance @ matrix.T)
+        squared = self._variance - 2.0 * float(overlaps.sum())
         return float(np.sqrt(max(squared, 0.0))) / self._extent
 
     def turned_rad(self, exchange: Exchange) -> float:
@@ -200,13 +201,10 @@ class _Fit:
         return float(np.median(np.linalg.norm(so3_log(off), axis=1)))
 
     def _rotation(self, matrix: Array) -> Array:
-        vt = self._vt @ matrix.T
-        rotation: Array = (self._u * [1.0, 1.0, np.sign(np.linalg.det(self._u @ vt))]) @ vt
-        return rotation
+        return nearest_rotation(self._covariance @ matrix.T)[0]
 
 
 def _spread_rad(rotations: Array) -> float:
     """Return the median angle of rotations (n, 3, 3) from their mean (the nearest rotation to the mean matrix)."""
-    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
-    mean = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    mean, _ = nearest_rotation(rotations.mean(axis=0))
     return float(np.median(np.linalg.norm(so3_log(mean.T @ rotations), axis=1)))

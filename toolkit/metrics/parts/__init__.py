@@ -1,7 +1,6 @@
 """Parts of the metric files; no file here is a metric.
 
-Read ``scores`` (what a metric file declares and returns), ``evaluation`` (one output of a run and its sequence), then
-``association``, ``alignment`` and ``residuals``; ``consistency`` computes NEES and NIS of the pose, ``state_errors``
-the errors of the whole state, ``leave_one_out`` the held-out prediction, ``cramer_rao`` the bound from
-``sound_sightings`` and ``information_filter``.
+Read ``scores`` (what a metric file declares and returns), ``evaluation`` (one output of a run and its sequence) and
+``against_truth`` (association, alignment, errors of pairs). ``consistency`` computes NEES, NIS and the errors of the
+state, ``leave_one_out`` predicts withheld sightings, ``cramer_rao`` is the bound.
 """

@@ -1,4 +1,4 @@
-"""An estimate and the truth, with each alignment computed once: any pairs of poses, or one output of one run."""
+"""One output of one run and the sequence it was made from: what a metric is computed from."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,68 +8,17 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.metrics.parts.alignment import Alignment, fit_se3, place_first
-from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
+from toolkit.metrics.parts.against_truth import (
+    STAMP_TOLERANCE_NS,
+    AgainstTruth,
+    Matched,
+    associate,
+    finite_poses,
+    median_period_ns,
+)
 from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.sequence import Sequence
-
-
-class AgainstTruth:
-    """Pairs of true and estimated poses with their alignments, from which trajectory metrics are computed.
-
-    The properties raise Unavailable where there is no truth, or too few pairs.
-    """
-
-    @property
-    def matched(self) -> Matched:
-        """The pairs of true and estimated poses that are scored; there may be none."""
-        raise NotImplementedError
-
-    @property
-    def level(self) -> bool:
-        """Whether the vertical is measured, as an IMU does, so that only heading and position are free."""
-        raise NotImplementedError
-
-    @cached_property
-    def compared(self) -> Matched:
-        """The matched pairs, of which there are at least two."""
-        if len(self.matched) < 2:
-            raise Unavailable(f"{len(self.matched)} pose(s) match the ground truth in time, a comparison needs 2")
-        return self.matched
-
-    @cached_property
-    def placed(self) -> Array:
-        """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
-
-        Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
-        and position of the first pose are aligned; without one, the whole first pose is.
-        """
-        pairs = self.compared
-        return place_first(pairs.truth[0], pairs.estimate[0], self.level).apply(pairs.estimate)
-
-    @cached_property
-    def se3_alignment(self) -> Alignment:
-        """The rigid motion that fits the estimated positions to the true ones."""
-        return fit_se3(*self.compared.positions)
-
-
-@dataclass(frozen=True, eq=False)
-class PairsAgainstTruth(AgainstTruth):
-    """Pairs that were matched already, of a trajectory without its recording."""
-
-    pairs: Matched
-    is_level: bool = False
-
-    @property
-    def matched(self) -> Matched:
-        """The pairs."""
-        return self.pairs
-
-    @property
-    def level(self) -> bool:
-        """Whether the vertical is measured."""
-        return self.is_level
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,12 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.measurements import StereoRig
-from toolkit.metrics.parts.association import finite_poses
-from toolkit.metrics.parts.residuals import reprojection_errors_px
+from toolkit.measurements import StereoRig, is_left_only
+from toolkit.metrics.parts.against_truth import finite_poses
 from toolkit.models import stereo
 from toolkit.sequence import Observations
 
+# Cap of the error of an observation. A point behind the camera, or one that is not finite, has this error, so that no
+# run gains by losing its points.
+CAP_PX = 100.0
 # Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
 FEWEST_VIEWS = 3
 # 95 % quantile of the length of three whitened residuals: sqrt(chi2(3, 0.95)).
@@ -196,6 +198,18 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     for rows in _in_parts(again, views.count[views.track[again]] - 1):
         points[:, rows] = _solve(views.others(rows), points[:, rows], _ITERATIONS_AGAIN)
     return views.predict(points)
+
+
+def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_front: BoolArray) -> Array:
+    """Return the root mean square of the uL, uR and v residuals (N,), no more than CAP_PX.
+
+    Predictions and measurements are (N, 3); an observation that is not ``in_front`` (N,) counts as CAP_PX. One that
+    lacks the right image has the root mean square of uL and v.
+    """
+    squares_px2 = (uv_measured_px - uv_predicted_px) ** 2
+    means_px2 = np.where(is_left_only(uv_measured_px), squares_px2[:, [0, 2]].mean(axis=1), squares_px2.mean(axis=1))
+    errors_px = np.sqrt(means_px2)
+    return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
 
 
 def _in_parts(rows: IntArray, others: IntArray) -> Iterator[IntArray]:

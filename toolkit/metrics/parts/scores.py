@@ -76,6 +76,18 @@ class Scores:
         """Return no value for any of the keys, for one reason."""
         return cls({}).without(keys, reason)
 
+    @classmethod
+    def attempt(cls, metrics: Iterable[Metric], compute: "Callable[[], Scores]") -> "Scores":
+        """Return computed scores of some metrics or, where these are Unavailable, no value and the reason for each."""
+        try:
+            return compute()
+        except Unavailable as why:
+            return cls.none((metric.key for metric in metrics), str(why))
+
+    def __or__(self, others: "Scores") -> "Scores":
+        """Return these scores and those of other metrics."""
+        return Scores(self.values | others.values, self.notes | others.notes)
+
     def without(self, keys: Iterable[str], reason: str) -> "Scores":
         """Return the scores without a value for the keys, for one reason."""
         gone = tuple(keys)

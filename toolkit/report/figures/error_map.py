@@ -19,8 +19,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
-from toolkit.metrics import Evaluation, Unavailable, in_sample
-from toolkit.metrics.parts.residuals import rmse
+from toolkit.metrics import Evaluation, Unavailable, reprojection
+from toolkit.metrics.parts.against_truth import rmse
 from toolkit.report.curves import alignment_text, errors_to, onto_truth, shown_output, truth_during
 from toolkit.report.figures.style import (
     LABEL_PT,
@@ -124,7 +124,7 @@ def _by_pixel(comparison: Comparison, run: Run) -> _Coloured | None:
         return None
     try:
         with np.errstate(all="ignore"):  # a diverged run may overflow; the metric caps what comes of it
-            ids, error_px = in_sample.errors_of_landmarks(Evaluation(run, shown_output(run), comparison.sequence))
+            ids, error_px = reprojection.errors_of_landmarks(Evaluation(run, shown_output(run), comparison.sequence))
     except Unavailable:
         return None
     points = run.landmarks.points_world[np.searchsorted(run.landmarks.track_ids, ids)]

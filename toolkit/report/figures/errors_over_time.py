@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array
-from toolkit.metrics.parts.residuals import rmse
+from toolkit.metrics.parts.against_truth import rmse
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import Components, ErrorCurves, Errors, components, error_curves, reference_estimate
 from toolkit.report.figures.panels import scale_by_decades

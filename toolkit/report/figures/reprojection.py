@@ -12,8 +12,8 @@ from matplotlib.ticker import NullLocator
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
-from toolkit.metrics import Evaluation, held_out, in_sample
-from toolkit.metrics.parts.residuals import CAP_PX
+from toolkit.metrics import Evaluation, reprojection
+from toolkit.metrics.parts.leave_one_out import CAP_PX
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.curves import shown_output
 from toolkit.report.figures.panels import annotate, finish, panels_of
@@ -68,7 +68,10 @@ def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
     if run.trajectory(shown_output(run)) is None:
         return {}
     evaluation = Evaluation(run, shown_output(run), comparison.sequence)
-    kinds: dict[str, Callable[[Evaluation], Array]] = {"in-sample": in_sample.errors, "held-out": held_out.errors}
+    kinds: dict[str, Callable[[Evaluation], Array]] = {
+        "in-sample": reprojection.in_sample_errors,
+        "held-out": reprojection.held_out_errors,
+    }
     found = {}
     for kind, errors_of in kinds.items():
         try:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from toolkit.estimate import Run
-from toolkit.metrics import Scores, score_run
-from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
+from toolkit.metrics import Evaluation, Scores
+from toolkit.metrics.innovations import ACCEPTED, refuses_much, score
 from toolkit.simulation import SCENARIOS, simulate
 
 Scored = Callable[..., Scores]
@@ -18,8 +18,8 @@ RunEstimator = Callable[..., Run]
 @pytest.fixture
 def scored(make_sequence, make_run, drive) -> Scored:
     sequence = make_sequence(drive(150), track_count=60)
-    return lambda output, info: score_run(
-        make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, info=info), output, sequence, only=[ACCEPTED]
+    return lambda output, info: score(
+        Evaluation(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, info=info), output, sequence)
     )
 
 
@@ -50,6 +50,6 @@ def test_a_sound_recording_passes_and_a_focal_length_a_tenth_too_long_does_not(
     sound = simulate(replace(SCENARIOS["flight"], duration_s=4.0), seed=5)
     wrong = replace(sound, rig=replace(sound.rig, fx_px=1.1 * sound.rig.fx_px))
     runs = [(run_estimator(name, one), one) for one in (sound, wrong)]
-    shares = [score_run(run, "causal", one, only=[ACCEPTED]).values[ACCEPTED] for run, one in runs]
+    shares = [score(Evaluation(run, "causal", one)).values[ACCEPTED] for run, one in runs]
     assert not refuses_much(shares[0])
     assert refuses_much(shares[1])
