@@ -22,8 +22,7 @@ from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.messages import note_lines, paired_lines
-from toolkit.report.records import Seeds
-from toolkit.report.scores_json import seeds_document
+from toolkit.report.scores import Seeds, seeds_document
 
 Document = dict[str, Any]
 

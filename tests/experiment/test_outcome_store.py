@@ -19,7 +19,7 @@ from toolkit.experiment.units import Outcome, Scored, Unit, run_unit
 from toolkit.experiment.workers import Workers
 from toolkit.metrics import Scores, describe
 from toolkit.progress import Progress
-from toolkit.report.scores_json import seeds_document
+from toolkit.report.scores import seeds_document
 from toolkit.settings import Settings, settings_of
 
 TWO = ("dead-reckoning", "ekf")

@@ -18,7 +18,8 @@ from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import outcome_of
 from toolkit.initialization import start_from_truth
 from toolkit.report.html.payload import payload_of
-from toolkit.report.records import CameraFrame, read_report
+from toolkit.report.records import read_report
+from toolkit.report.report_json import CameraFrame
 from toolkit.report.run_directory import MadeBy, RunFiles, check_run_directory, read_run, write_run
 
 

@@ -18,9 +18,9 @@ from toolkit.metrics import Scores
 from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.payload import evenly, payload_of, running_median, with_peaks
-from toolkit.report.records import ContestRecord, Rival
+from toolkit.report.records import schema_files
+from toolkit.report.report_json import ContestRecord, Rival
 from toolkit.report.run_directory import MadeBy, read_run, write_run
-from toolkit.report.schemas import schema_files
 
 Json = dict[str, Any]
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

@@ -13,10 +13,9 @@ from toolkit.errors import DataError
 from toolkit.files.documents import parse, read, schema, to_line, to_text
 from toolkit.gate import baseline_file, trajectory_baseline
 from toolkit.metrics import describe
-from toolkit.report import schemas
-from toolkit.report.records import read_card, read_check
-from toolkit.report.schemas import RECORDS, schema_files
-from toolkit.report.score_records import PROMISED_KEYS
+from toolkit.report import records
+from toolkit.report.records import RECORDS, read_card, read_check, schema_files
+from toolkit.report.scores import PROMISED_KEYS
 
 Document = dict[str, Any]
 
@@ -135,16 +134,16 @@ def test_a_document_cut_anywhere_is_reported(name: str, tmp_path: Path) -> None:
 
 
 def test_the_published_schemas_are_those_of_the_records() -> None:
-    reported = "docs/schemas differs from the records: python -m toolkit.report.schemas docs/schemas renews it"
+    reported = "docs/schemas differs from the records: python -m toolkit.report.records docs/schemas renews it"
     assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), reported
 
 
 def test_the_schemas_are_written_into_a_new_directory_or_refused_in_one_line(tmp_path: Path, capsys: Any) -> None:
-    assert schemas.main([str(tmp_path / "new" / "schemas")]) == 0
+    assert records.main([str(tmp_path / "new" / "schemas")]) == 0
     assert {path.name: path.read_text() for path in (tmp_path / "new" / "schemas").iterdir()} == schema_files()
     (tmp_path / "file").write_text("")
     for arguments, status in (([], 2), ([str(tmp_path / "file")], 4)):
-        assert schemas.main(arguments) == status
+        assert records.main(arguments) == status
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 

@@ -15,7 +15,7 @@ from toolkit.report import figures, run_directory
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import MadeBy, check_run_directory, write_run
-from toolkit.report.scores_json import metrics_document
+from toolkit.report.scores import metrics_document
 
 # Where it does not matter which figures there are, and what is in their files.
 one_figure = pytest.mark.usefixtures("one_figure")

@@ -12,8 +12,7 @@ from toolkit.experiment.comparison import Comparison, Row, consistency_of
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
-from toolkit.report.score_records import PROMISED_KEYS, MetricsDocument
-from toolkit.report.scores_json import metrics_document
+from toolkit.report.scores import PROMISED_KEYS, MetricsDocument, metrics_document
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 

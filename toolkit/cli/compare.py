@@ -140,7 +140,7 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.report.comparison_text import comparison_text
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
-    from toolkit.report.scores_json import scores_document
+    from toolkit.report.scores import scores_document
 
     columns = requested_columns(options.columns)
     requested = _configuration(options)

@@ -21,7 +21,7 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.report.curves import seconds
-from toolkit.report.records import CameraFrame, TrackErrors
+from toolkit.report.report_json import CameraFrame, TrackErrors
 from toolkit.sequence import Sequence
 
 FOLDER = "frames"

@@ -1,24 +1,62 @@
 """The card of a recording as text and as a record: why a smoother is or is not better than a filter on it."""
 
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.files.documents import number, rounded
+from toolkit.files.documents import number, read, rounded
 from toolkit.geometry import Array
 from toolkit.noise import Card
 from toolkit.report.comparison_table import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.records import CardRecord
 from toolkit.report.table import MISSING, Table, as_text
 from toolkit.sequence import Sequence
 
+Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
+Quantiles = Annotated[tuple[float, float, float], Meta(description="10, 50 and 90 %")]
+Lags = Annotated[
+    tuple[tuple[float | None, float | None, float | None], ...],
+    Meta(description="at lags of 1, 2 ... frames, in mean column, disparity, row; null where tracks are too short"),
+]
 # Shares and lengths beyond which there is a remark.
 _MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
 # A scale is wrong where it differs from one by this many standard errors and by this much: unbiased errors of
 # disparities make vision 0.15 to 0.25 % too long on average (eight seeds of drive and of drive-realistic).
 _SIGMAS, _SCALE_OFF = 3.0, 0.005
 _STRAYS = ": moving objects or lasting mismatches; the outlier policy matters more than the estimator"
+
+
+class CardRecord(Struct, frozen=True, kw_only=True):
+    """What the visible tracks of a recording are like, without truth."""
+
+    schema: Literal["vislam.card/1", "vislam.card/2"]
+    tracks: Annotated[int, Meta(description="in the stretches that were adjusted", ge=0)]
+    tracks_a_frame: float
+    seen_frames: Annotated[Quantiles, Meta(description="sightings of a track")]
+    depth_m: Quantiles
+    intervals: Annotated[int, Meta(ge=0)]
+    intervals_without_common_track: Annotated[int, Meta(ge=0)]
+    correlated: Annotated[bool, Meta(description="whether the errors of a track are correlated")]
+    track_weight: (
+        Annotated[float, Meta(description="share of its information that a sighting has; not in version 1", ge=0, le=1)]
+        | UnsetType
+    ) = UNSET
+    track_weight_error: float | UnsetType = UNSET
+    correlation: Annotated[Lags, Meta(description="autocorrelation of residuals along a track")]
+    left_right_correlation: float
+    tails: Annotated[float, Meta(description="share of residuals beyond four robust sigmas", ge=0, le=1)]
+    at_odds: Annotated[float, Meta(description="share of tracks that are inconsistent with the motion", ge=0, le=1)]
+    scale: Annotated[float | None, Meta(description="translation by vision over the measured one, or null")]
+    scale_error: float | None
+    words: Annotated[tuple[str, ...], Meta(description="what that means for filters and smoothers")]
+
+
+def read_card(path: Path) -> CardRecord:
+    """Read what ``vislam card --json`` wrote; raises DataError, in one line with the place, where it is not that."""
+    return read(path, CardRecord, remedy="repeat vislam card")
 
 
 def card_lines(card: Card) -> Iterator[str]:

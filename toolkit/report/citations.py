@@ -17,7 +17,7 @@ from toolkit import datasets
 from toolkit.discovery import FoundModule, shown_name
 from toolkit.errors import EstimatorError, no_such
 from toolkit.registry import discover
-from toolkit.report.records import read_manifest
+from toolkit.report.manifest import read_manifest
 from toolkit.report.run_directory import MANIFEST
 
 _ENTRY = re.compile(r"^@\w+\{\s*([^,\s]+)\s*,.*?^\}", re.MULTILINE | re.DOTALL)

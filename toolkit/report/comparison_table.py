@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.noise import MotionScale, TrackWeight
-from toolkit.report.scores_json import path_length_m
+from toolkit.report.scores import path_length_m
 from toolkit.report.table import MISSING, ShownUnit, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Window, outlier_summary

@@ -22,7 +22,7 @@ from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
 from toolkit.files.reading import open_input
 from toolkit.files.writing import replaced_file, write_text
-from toolkit.report.records import Report
+from toolkit.report.report_json import Report
 from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
 BUNDLE, LOCK = "bundle.json", "requirements.txt"

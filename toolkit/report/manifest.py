@@ -21,6 +21,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
+from toolkit.files.documents import read
 from toolkit.noise import MeasuredNoise
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
@@ -85,6 +86,11 @@ class Manifest(Struct, frozen=True, kw_only=True):
         Annotated[tuple[str, ...], Meta(description="that the run wrote, relative to its directory, this one too")]
         | UnsetType
     ) = UNSET
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a ``manifest.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Manifest, remedy="repeat the comparison")
 
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:

@@ -32,21 +32,9 @@ from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
 from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
-from toolkit.report.manifest import manifest_document
-from toolkit.report.records import (
-    CameraFrame,
-    Manifest,
-    MetricsDocument,
-    Report,
-    Seeds,
-    SeedsReport,
-    read_manifest,
-    read_metrics,
-    read_report,
-    read_seeds,
-    read_seeds_report,
-)
-from toolkit.report.scores_json import metrics_document, seeds_document
+from toolkit.report.manifest import Manifest, manifest_document, read_manifest
+from toolkit.report.report_json import CameraFrame, Report, SeedsReport, read_report, read_seeds_report
+from toolkit.report.scores import MetricsDocument, Seeds, metrics_document, read_metrics, read_seeds, seeds_document
 
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
 _Rows = list[tuple[str, Output]]

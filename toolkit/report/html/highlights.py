@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from toolkit.metrics import metrics_called
-from toolkit.report.records import ContestRecord, Rival
+from toolkit.report.report_json import ContestRecord, Rival
 from toolkit.report.verdict import listed, short
 
 Row = dict[str, Any]

@@ -20,9 +20,9 @@ from toolkit.report import curves
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.html.highlights import highlights
 from toolkit.report.looks import look_numbers
-from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
+from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
-from toolkit.report.score_records import ConsistencyMark, MetricOverSeeds, RunOverSeeds
+from toolkit.report.scores import ConsistencyMark, MetricOverSeeds, RunOverSeeds
 from toolkit.report.table import ShownUnit, unit_of
 
 Json = dict[str, Any]
