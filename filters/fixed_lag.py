@@ -23,7 +23,6 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet
 from toolkit.models.factors import points_of
-from toolkit.models.motion import state_cov
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
@@ -80,10 +79,10 @@ class FixedLag:
         state = self._builder.motion.read(self._values, k, self._stamps_ns[k])
         motion, R_world_imu = self._builder.motion, state.T_world_imu[:3, :3]
         try:
-            return replace(state, cov=state_cov(motion, self._tree, k, R_world_imu))
+            return replace(state, cov=motion.state_cov(self._tree, k, R_world_imu))
         except RuntimeError as refusal:
             self._note(self._tree.rebuilt_by_qr(refusal))
-            return replace(state, cov=state_cov(motion, self._tree, k, R_world_imu))
+            return replace(state, cov=motion.state_cov(self._tree, k, R_world_imu))
 
     def _read(self, packet: Packet) -> Estimate:
         """Read the window's landmarks and return its newest state; states that have left keep their last values."""

@@ -31,7 +31,6 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Packet
 from toolkit.models.factors import L, landmark_keys
-from toolkit.models.motion import state_cov
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept; one step a frame, old variables frozen"
@@ -96,7 +95,7 @@ class Isam2:
     def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:
         values = self._tree.read(extension.state_keys)
         estimate = self._builder.motion.read(values, packet.index, packet.frame.t_ns)
-        cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
+        cov = self._builder.motion.state_cov(self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
     def _drop_landmarks(self, seen: dict[int, Array], estimate: Estimate, packet: Packet) -> None:

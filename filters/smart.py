@@ -21,7 +21,7 @@ from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
-from toolkit.models.motion import motion_model, state_keys
+from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import RobustCamera, SolvedWindow, TrackedWindow, solve_window, without_oldest
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
@@ -94,7 +94,7 @@ class Smart:
         self._motion.insert(new, estimate, k)
         values = gtsam.Values(window.values)
         values.insert(new)
-        keys = (*window.keys, tuple(state_keys(self._motion, k)))
+        keys = (*window.keys, tuple(self._motion.keys(k)))
         longer = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
         return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
 

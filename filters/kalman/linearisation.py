@@ -13,8 +13,7 @@ import numpy as np
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray
 from toolkit.measurements import Motion
-from toolkit.models.motion import Increment, MotionModel
-from toolkit.models.state import Prediction
+from toolkit.models.state import Increment, MotionModel, Prediction
 
 
 class Linearisation(Protocol):

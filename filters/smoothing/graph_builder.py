@@ -21,8 +21,8 @@ from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.models.motion import MotionModel, motion_model
-from toolkit.models.state import Belief
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief, MotionModel
 
 
 @dataclass

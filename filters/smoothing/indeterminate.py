@@ -24,7 +24,7 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, se3_inverse, transform
 from toolkit.measurements import StereoRig
 from toolkit.models.factors import kind_of
-from toolkit.models.motion import MotionModel
+from toolkit.models.state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 
 # Sigma of the prior on a variable that nothing else determines: m for a landmark; rad, m, m/s for a state.

@@ -29,7 +29,7 @@ from filters.smoothing.linearisation_error import any_moved_beyond, state_thresh
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
-from toolkit.models.motion import MotionModel
+from toolkit.models.state import MotionModel
 
 # The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings
 # than this: a state costs as much as two landmarks, so a longer track is cheaper in the root than the states it spans.

@@ -14,7 +14,7 @@ from toolkit.geometry import Array, BoolArray, se3_inverse, transform
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
 from toolkit.models.factors import kind_of
-from toolkit.models.motion import MotionModel
+from toolkit.models.state import MotionModel
 
 # How far states may move from their linearisation points: rad; m/s, or the unit of a rate; m/s^2 and rad/s for a bias;
 # and multiples of the baseline, which is the length scale of stereo: the image of a point 20 baselines away is then

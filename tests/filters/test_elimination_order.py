@@ -12,7 +12,7 @@ from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.motion import motion_model, state_keys
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.simulation.faults import standstill
@@ -61,7 +61,7 @@ def test_both_orders_have_every_variable_once_and_lead_to_one_solution():
     maker, truth = StereoFactors(sequence.rig), sequence.truth
     for k, frame in enumerate(frames):
         values.insert(X(k), gtsam.Pose3(truth.T_world_imu[k]))
-        values.insert(state_keys(model, k)[1], np.zeros(3))
+        values.insert(model.keys(k)[1], np.zeros(3))
         for factor in maker.of(frame, k):
             graph.add(factor)
         points = stereo.triangulate_world(frame.uvs_px, truth.T_world_imu[k], sequence.rig)

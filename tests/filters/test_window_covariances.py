@@ -14,7 +14,7 @@ from filters.smoothing.indeterminate import without_gaps
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.measurements import NS_PER_S
-from toolkit.models.motion import motion_model, state_cov, state_keys
+from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import MarginalPrior, Sightings, SolvedWindow, StereoWindow, without_oldest
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -74,8 +74,8 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
         marginals = gtsam.Marginals(without_gaps(tree.getFactorsUnsafe()), tree.getLinearizationPoint())
         for k, stamp_ns in enumerate(sequence.frames_t_ns.tolist()):
             if t_ns - round(LAG_S * NS_PER_S) <= stamp_ns <= t_ns:
-                R_world_imu = window.values().atPose3(state_keys(motion, k)[0]).rotation().matrix()
-                last[k] = state_cov(motion, marginals, k, R_world_imu)
+                R_world_imu = window.values().atPose3(motion.keys(k)[0]).rotation().matrix()
+                last[k] = motion.state_cov(marginals, k, R_world_imu)
         return recovery
 
     monkeypatch.setattr(FixedLagTree, "add", spied)

@@ -55,16 +55,6 @@ def state() -> State:
     return State(se3_exp(np.array([0.4, -0.8, 1.1, 3.0, -2.0, 5.0])), np.array([3.0, -1.0, 0.5]), BIAS + 0.01)
 
 
-def test_intervals_integrated_together_are_each_integrated_by_itself(motion: ImuMotion) -> None:
-    model = imu.ImuModel(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
-    half = ImuMotion(motion.dt_s[:10], motion.accel_mps2[:10], motion.gyro_radps[:10])
-    motions, biases = [motion, half, motion], [BIAS, 2.0 * BIAS, -BIAS]
-    for one, bias, together in zip(motions, biases, model.integrate_each(motions, biases), strict=True):
-        alone = model.integrate(one, bias)
-        assert together.dt_s == alone.dt_s
-        assert together.preintegration.equals(alone.preintegration, 1e-15)
-
-
 def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) -> None:
     noise = FLIGHT.motion.noise
     model = imu.ImuModel(noise, np.array(GRAVITY_WORLD))
@@ -159,7 +149,7 @@ def test_filter_equals_gtsams_factor_on_every_interval_of_kitti00():
         preintegration = imu.preintegrate(packet.motion, prior.bias, params)
         step = imu.predict(preintegration, *start)
         end = State(step.T_world_imu, step.v_world, start.bias)
-        factor = imu.imu_factor(preintegration, packet.index)
+        factor = imu.ImuIncrement(preintegration, 0.0, sequence.gravity_world).factors(packet.index).at(0)
         residual, transition, noise = factor_in_filter_terms(factor, start, end, packet.index)
         # 1e-9 is the promise of docs; double precision gives 1e-14 on entries of the order of 1.
         np.testing.assert_allclose(residual, 0.0, atol=1e-9)

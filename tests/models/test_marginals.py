@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.models.factors import B, V, X, joint_cov
-from toolkit.models.motion import motion_model, state_cov, state_keys
+from toolkit.models.motion import motion_model
 from toolkit.simulation import FLIGHT
 
 
@@ -60,9 +60,9 @@ def test_joint_covariance_is_that_of_gtsam_marginals(tree):
 
 def test_covariance_of_a_state_has_its_velocity_in_the_body_frame(tree):
     model = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
-    keys = state_keys(model, 1)
+    keys = model.keys(1)
     R_world_imu = tree.calculateEstimatePose3(X(1)).rotation().matrix()
-    in_world, in_body = joint_cov(tree, keys), state_cov(model, tree, 1, R_world_imu)
+    in_world, in_body = joint_cov(tree, keys), model.state_cov(tree, 1, R_world_imu)
     np.testing.assert_allclose(R_world_imu @ in_body[6:9, 6:9] @ R_world_imu.T, in_world[6:9, 6:9], rtol=1e-12)
     np.testing.assert_allclose(in_body[:6, 6:9] @ R_world_imu.T, in_world[:6, 6:9], atol=1e-14)
     np.testing.assert_array_equal(in_body, in_body.T)

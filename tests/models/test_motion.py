@@ -10,7 +10,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.measurements import Packet
 from toolkit.models.factors import joint_cov
-from toolkit.models.motion import motion_model, predicted, state_keys
+from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
@@ -53,7 +53,7 @@ def test_what_is_inserted_is_read(scenario):
     estimate = some_belief(sequence).estimate(packet.frame.t_ns)
     model.insert(values, estimate, K)
     read = model.read(values, K, packet.frame.t_ns)
-    assert set(values.keys()) == set(state_keys(model, K))
+    assert set(values.keys()) == set(model.keys(K))
     assert read.t_ns == estimate.t_ns
     # A rotation passes through GTSAM's matrix unchanged.
     np.testing.assert_allclose(read.T_world_imu, estimate.T_world_imu, rtol=0.0, atol=1e-15)
@@ -69,7 +69,7 @@ def test_a_held_state_has_the_covariance_it_is_held_with(scenario):
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
     belief = some_belief(sequence)
     model.insert(values, belief.estimate(packet.frame.t_ns), K)
-    cov = joint_cov(gtsam.Marginals(model.hold(belief, K), values), state_keys(model, K))
+    cov = joint_cov(gtsam.Marginals(model.hold(belief, K), values), model.keys(K))
     sigma = np.sqrt(np.diag(belief.cov))
     in_estimate_order = model.estimate_cov(cov, belief.T_world_imu[:3, :3])
     # Two inversions of a matrix whose condition, scaled to unit variances, is below 1e3.
@@ -89,7 +89,7 @@ def test_a_prediction_is_what_the_graph_of_the_same_increment_says(scenario):
     graph.push_back(model.integrate(packet.motion, before.bias).factors(K))
     # Half the sum of squares of whitened residuals that are all rounding: micrometres over sigmas of micrometres.
     assert graph.error(values) < 1e-9
-    cov = model.estimate_cov(joint_cov(gtsam.Marginals(graph, values), state_keys(model, K)), after.T_world_imu[:3, :3])
+    cov = model.estimate_cov(joint_cov(gtsam.Marginals(graph, values), model.keys(K)), after.T_world_imu[:3, :3])
     sigma = np.sqrt(np.diag(after.cov))
     # GTSAM's factor works about the end's residual: the two covariances agree to the condition of Q.
     assert np.abs((cov - after.cov) / np.outer(sigma, sigma)).max() < 1e-6

@@ -8,8 +8,8 @@ from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
 from toolkit.measurements import TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X
 from toolkit.models.motion import motion_model
-from toolkit.models.smooth_twist import SmoothTwist, smooth_factor, twist_change_cov
 from toolkit.models.state import Belief
+from toolkit.models.twist import SmoothTwist, smooth_factor, twist_change_cov
 
 NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
 DT_S = 0.1

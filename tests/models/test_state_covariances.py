@@ -14,7 +14,7 @@ from toolkit.geometry import Array
 from toolkit.measurements import TwistNoise
 from toolkit.models import state_covariances
 from toolkit.models.factors import L, X, joint_cov, linear_factor
-from toolkit.models.motion import MotionModel, state_cov, state_keys
+from toolkit.models.state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.models.twist import TwistModel
 from toolkit.settings import Settings, Window
@@ -59,7 +59,7 @@ def smoothed(run_estimator):
             run = run_estimator("batch", simulate(SHORT[scenario], 3))
         linear, motion, poses = calls[0]
         tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-        marginals = {k: state_cov(motion, tree, k, poses[k, :3, :3]) for k in range(0, len(poses), 5)}
+        marginals = {k: motion.state_cov(tree, k, poses[k, :3, :3]) for k in range(0, len(poses), 5)}
         return Smoothed(run, replace(run.final, cov=None), linear, motion, marginals)
 
     return smooth
@@ -139,11 +139,11 @@ def _walking_states(step_sigma: float) -> gtsam.GaussianFactorGraph:
     """Return states of which the first has unit covariance, and each follows from the one before it."""
     graph = gtsam.GaussianFactorGraph()
     for k in range(STATES):
-        for key, size in zip(state_keys(TWIST, k), SIZES.values(), strict=True):
+        for key, size in zip(TWIST.keys(k), SIZES.values(), strict=True):
             if k == 0:
                 graph.add(linear_factor([(key, np.eye(size))], np.zeros(size)))
                 continue
-            before = state_keys(TWIST, k - 1)[state_keys(TWIST, k).index(key)]
+            before = TWIST.keys(k - 1)[TWIST.keys(k).index(key)]
             step = np.eye(size) / step_sigma
             graph.add(linear_factor([(before, -step), (key, step)], np.zeros(size)))
     return graph
@@ -152,9 +152,9 @@ def _walking_states(step_sigma: float) -> gtsam.GaussianFactorGraph:
 def test_a_world_far_looser_than_the_steps_in_it_has_covariances():
     """As behind hundreds of frames. GTSAM refuses the clique of two states by its condition; rounding is 1e-5 here."""
     graph, poses = _walking_states(1e-4), np.tile(np.eye(4), (STATES, 1, 1))
-    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, state_keys(TWIST, 0))
+    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, TWIST.keys(0))
     with pytest.raises(RuntimeError, match="Indeterminate"):
-        joint_cov(graph.eliminateMultifrontal(last), state_keys(TWIST, 0))
+        joint_cov(graph.eliminateMultifrontal(last), TWIST.keys(0))
     covs = state_covs(graph, TWIST, poses)
     expected = 1.0 + 1e-8 * np.arange(STATES)
     np.testing.assert_allclose(covs[:, range(9), range(9)], np.tile(expected[:, None], 9), rtol=1e-4)

@@ -42,16 +42,6 @@ def test_pose_follows_the_exponential_of_each_twist(drive):
     assert compared == drive.frame_count - 1
 
 
-def test_intervals_integrated_together_are_those_of_each_alone(motion):
-    """Intervals of one to four pieces, one with a noise of its own, each about another bias."""
-    some = [TwistMotion(motion.dt_s[:n], motion.v_mps[:n], motion.w_radps[:n]) for n in (4, 1, 2)]
-    some.append(TwistMotion(motion.dt_s, motion.v_mps, motion.w_radps, np.linspace(1.0, 3.0, 8).reshape(4, 2)))
-    biases = BIAS * np.arange(1.0, 5.0)[:, None]
-    for step, own, bias in zip(twist.integrate_each(some, biases, NOISE), some, biases, strict=True):
-        for found, expected in zip(step, twist.integrate(own, bias, NOISE), strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)  # the last digit
-
-
 def test_bias_jacobian_is_the_derivative(motion, numerical_jacobian):
     step = twist.integrate(motion, BIAS, NOISE)
 

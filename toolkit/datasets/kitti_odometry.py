@@ -1,7 +1,7 @@
 """KITTI odometry sequences: rectified stereo images, calib.txt, and times.txt and poses where they are there.
 
 A folder with ``image_0`` and ``image_1`` (or ``image_2`` and ``image_3``, or ``image_l`` and ``image_r``). There is no
-motion input: estimators assume a smooth motion (:mod:`toolkit.models.smooth_twist`), which every report says. The body,
+motion input: estimators assume a smooth motion (:mod:`toolkit.models.twist`), which every report says. The body,
 called IMU everywhere, is camera 0 with the axes forward, left, up. Poses are camera 0's, in the folder or, as the
 download has it, in ``../../poses/<name>.txt``.
 Source: Geiger, Lenz & Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite" (CVPR 2012).

@@ -16,7 +16,8 @@ from toolkit.measurements import ImuNoise, Motion, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import B, L, StereoFactors, X, joint_cov
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, MOST_MISMATCHED, chi2_bound
-from toolkit.models.motion import Increment, MotionModel, motion_model, state_keys
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Increment, MotionModel
 from toolkit.sequence import Sequence
 
 # Standard deviations: of the pose that fixes the gauge (rad, m), and of biases before any measurement (m/s^2, rad/s).
@@ -68,7 +69,7 @@ def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess
             break
     first = model.read(values, 0, frames[0].t_ns)
     try:
-        cov = joint_cov(gtsam.Marginals(graph, values), state_keys(model, 0))
+        cov = joint_cov(gtsam.Marginals(graph, values), model.keys(0))
     except RuntimeError as refusal:
         raise _unless_indeterminate(refusal) from refusal
     return AdjustedStart(first, max(scale2, 1.0) * INFLATION * model.estimate_cov(cov, first.T_world_imu[:3, :3]))

@@ -22,8 +22,8 @@ from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import CAP_PX, FEWEST_VIEWS, errors_left_out, reprojection_errors_px
 from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
 from toolkit.models import stereo
-from toolkit.models.corrections import belief_at, integrated
-from toolkit.models.motion import motion_model
+from toolkit.models.corrections import belief_at
+from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Sequence
 
 ORDER = 50
@@ -235,11 +235,10 @@ def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
     if not packets:
         raise Unavailable("there is no pose to integrate the motion from")
     model = motion_model(sequence.noise, sequence.gravity_world)
-    motions = [packet.motion for packet in packets[1:] if packet.motion is not None]
     belief = belief_at(estimate, 0, model)
     poses = [belief.T_world_imu]
-    for increment in integrated(model, motions, [belief.bias] * len(motions)):
-        belief = belief.predicted(increment.predict(belief))
+    for packet in packets[1:]:
+        belief = predicted(belief, model, packet.motion)
         poses.append(belief.T_world_imu)
     motion = Trajectory(np.array([packet.frame.t_ns for packet in packets], dtype=np.int64), np.array(poses))
     return Run("the measured motion", "ok", motion, None, Landmarks.none(), timings=None)

@@ -6,7 +6,6 @@ answer, and is independent of earlier corrections: its estimates are a martingal
 has as its covariance the sum of their reductions.
 """
 
-from collections import abc
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,10 +16,8 @@ import numpy as np
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
 from toolkit.measurements import Motion
-from toolkit.models.imu import ImuModel
-from toolkit.models.motion import Increment, MotionModel, motion_model
-from toolkit.models.state import Belief, Prediction
-from toolkit.models.twist import TwistModel
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief, MotionModel, Prediction
 from toolkit.sequence import Sequence
 
 # Directions in which a correction reduces the variance by less than this share are not tested: there rounding
@@ -66,15 +63,6 @@ def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     return Correction.of(before, after).test(np.sqrt(np.diag(before.cov)))
 
 
-def integrated(
-    model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
-) -> abc.Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,), vectorised if the model allows it."""
-    if isinstance(model, TwistModel | ImuModel) and motions:
-        return model.integrate_each(motions, biases)
-    return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
-
-
 def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
     """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
     d = model.layout.size
@@ -99,11 +87,10 @@ class PredictedStep(NamedTuple):
 def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
     """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames."""
     model = motion_model(sequence.noise, sequence.gravity_world)
-    intervals = list(_intervals(trajectory, sequence))
-    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
-    increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
-    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
-        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), increment.predict(belief))
+    for start, end, motion in _intervals(trajectory, sequence):
+        belief = belief_at(trajectory, start, model)
+        prediction = model.integrate(motion, belief.bias).predict(belief)
+        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), prediction)
 
 
 def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:

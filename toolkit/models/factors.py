@@ -26,13 +26,9 @@ def kind_of(key: int) -> str:
     return chr(key >> _INDEX_BITS)
 
 
-def latest_values(tree: gtsam.ISAM2, keys: Iterable[int], read_bias: Callable[[int], Any]) -> gtsam.Values:
-    """Return the latest values of some states' variables in a tree; ``read_bias`` is its method for their biases."""
-    readers = {"x": tree.calculateEstimatePose3, "v": tree.calculateEstimateVector, "b": read_bias}
-    values = gtsam.Values()
-    for key in keys:
-        values.insert(key, readers[kind_of(key)](key))
-    return values
+def constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:
+    """Return GTSAM's value for a bias (6,) [accel, gyro]."""
+    return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
 
 
 def landmark_keys(track_ids: Iterable[int]) -> list[int]:
@@ -95,15 +91,17 @@ def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> g
     return gaussian if robust is None else gtsam.noiseModel.Robust.Create(robust, gaussian)
 
 
-def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam.NonlinearFactorGraph:
+def joint_prior(at: gtsam.Values, keys: list[int], cov: Array) -> gtsam.NonlinearFactorGraph:
     """Return a joint prior on several variables at their values.
 
-    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces; ``blocks`` gives the slice of each key in it.
+    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces, in the order of the keys.
     """
     root_information = np.linalg.inv(np.linalg.cholesky(cov))
-    terms = [(key, root_information[:, block]) for key, block in blocks.items()]
+    sizes = at.dims()
+    columns = np.split(root_information, np.cumsum([sizes[key] for key in keys])[:-1], axis=1)
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.LinearContainerFactor(linear_factor(terms, np.zeros(len(cov))), at))
+    linear = linear_factor(list(zip(keys, columns, strict=True)), np.zeros(len(cov)))
+    graph.add(gtsam.LinearContainerFactor(linear, at))
     return graph
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian
 from toolkit.models.factors import B, X, linear_factor
-from toolkit.models.motion import Increment
+from toolkit.models.state import Increment
 from toolkit.models.twist import TwistIncrement
 
 Keys = tuple[int, ...]

@@ -37,7 +37,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.models.factors import linear_factor
-from toolkit.models.motion import MotionModel, state_keys
+from toolkit.models.state import MotionModel
 
 # Accepted relative error of a standard deviation, which is read to a tenth.
 _MOST_ROUNDED = 0.01
@@ -72,7 +72,7 @@ def covs_beside(
 
     These variables belong to no frame, like the scale of disparities; they are eliminated after all states.
     """
-    states, has_velocity = [state_keys(motion, k) for k in range(len(poses))], "v" in motion.variable_sizes
+    states, has_velocity = [motion.keys(k) for k in range(len(poses))], "v" in motion.variable_sizes
     try:
         covs = _of_groups(linear, states, beside, has_velocity)
     except RuntimeError:

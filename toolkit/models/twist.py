@@ -1,21 +1,35 @@
-"""Motion by a measured body twist, with a gyro bias (Kang, eqs. 1-2): its integration, its factors, its model.
+"""Motion by a body twist: measured, with a gyro bias (Kang, eqs. 1-2), or not measured and constant but for noise.
 
-The pose moves by T <- T exp(dt [w - b, v]); everything is in GTSAM's order [rotation, position] and perturbed
-on the right. The state is pose and gyro bias; the velocity is measured, not estimated.
+The pose moves by T <- T exp(dt [w - b, v]); everything is in GTSAM's order [rotation, position] and perturbed on the
+right. With measured twists the state is pose and gyro bias; the velocity is measured, not estimated.
+
+Without a measurement the state is pose, velocity and turn rate. Velocity and turn rate stand where a state with an IMU
+has velocity and gyro bias: a gyro that always reads zero has the turn rate, with the sign changed, as its bias. So
+estimators need no code for this kind of motion. Over dt the pose moves by T <- T exp(dt [w, v]), where v is the
+velocity in the body frame, which is constant. White noise of densities q on the twist's change adds q dt^3/3 to the
+covariance of the pose, q dt to that of the twist, and q dt^2/2 to that between them (Barfoot, "State estimation for
+robotics" (2017), eq. 3.202: white noise on acceleration).
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from toolkit.estimate import Estimate
-from toolkit.geometry import Array, se3_adjoint, se3_exp_and_right_jacobian, se3_inverse
-from toolkit.measurements import Motion, Prior, TwistMotion, TwistNoise
-from toolkit.models.factors import B, X, joint_prior, latest_values
-from toolkit.models.state import POSE, TWIST_LAYOUT, Belief, Prediction
+from toolkit.geometry import (
+    Array,
+    se3_adjoint,
+    se3_exp,
+    se3_exp_and_right_jacobian,
+    se3_inverse,
+    se3_log,
+    se3_right_jacobian,
+    skew,
+)
+from toolkit.measurements import Motion, TwistChangeNoise, TwistMotion, TwistNoise, UnmeasuredMotion
+from toolkit.models.factors import B, V, X
+from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, MotionModel, Prediction
 
 
 class TwistStep(NamedTuple):
@@ -33,59 +47,23 @@ class TwistStep(NamedTuple):
 
 
 def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
-    """Integrate the twists of one interval with a gyro bias (3,) rad/s subtracted."""
-    pieces = _pieces(motion.dt_s, motion.w_radps - gyro_bias, motion.v_mps, _density_squared(motion, noise))
-    return _joined(pieces, float(motion.dt_s.sum()))
-
-
-def integrate_each(motions: Sequence[TwistMotion], gyro_biases: Array, noise: TwistNoise) -> list[TwistStep]:
-    """Integrate the twists of N intervals, each with its own gyro bias (N, 3) rad/s subtracted."""
-    pieces = _pieces(
-        np.concatenate([motion.dt_s for motion in motions]),
-        np.concatenate([motion.w_radps - bias for motion, bias in zip(motions, gyro_biases, strict=True)]),
-        np.concatenate([motion.v_mps for motion in motions]),
-        np.concatenate([np.broadcast_to(_density_squared(m, noise), (*m.v_mps.shape[:1], 6)) for m in motions]),
-    )
-    ends = np.cumsum([motion.dt_s.size for motion in motions]).tolist()
-    return [
-        _joined(_Pieces(*(part[start:end] for part in pieces)), float(motion.dt_s.sum()))
-        for motion, start, end in zip(motions, [0, *ends[:-1]], ends, strict=True)
-    ]
-
-
-class _Pieces(NamedTuple):
-    """The part of a step by each twist: motions (n, 4, 4), derivatives (n, 6, 3) and covariances (n, 6, 6)."""
-
-    motions: Array
-    biases: Array
-    covs: Array
-
-
-def _pieces(dt_s: Array, w_radps: Array, v_mps: Array, density_squared: Array) -> _Pieces:
-    """Integrate n twists, each by itself, with squared noise densities (n, 6) or (6,) of turn rate and velocity."""
-    dt_s = dt_s[:, None]
-    motions, d_end_d_xi = se3_exp_and_right_jacobian(dt_s * np.concatenate([w_radps, v_mps], axis=1))
-    covs = (d_end_d_xi * (dt_s * density_squared)[:, None]) @ np.swapaxes(d_end_d_xi, 1, 2)
-    return _Pieces(motions, -dt_s[..., None] * d_end_d_xi[:, :, :3], covs)
-
-
-def _density_squared(motion: TwistMotion, noise: TwistNoise) -> Array:
-    """Return the squared noise densities of turn rate and velocity: of each twist (n, 6), or common to all (6,)."""
+    """Integrate the twists of one interval, piece by piece, with a gyro bias (3,) rad/s subtracted."""
     density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
-    if motion.noise_scale is None:
-        return density_squared
-    return np.asarray(density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1))
-
-
-def _joined(pieces: _Pieces, dt_s: float) -> TwistStep:
-    """Return the step composed of consecutive pieces."""
-    T_start_end, d_step_d_bias, cov = (part[0] for part in pieces)
-    for piece, own_bias, own_cov in zip(*(part[1:] for part in pieces), strict=True):
+    if motion.noise_scale is not None:
+        density_squared = density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
+    dt_s = motion.dt_s[:, None]
+    pieces, d_end_d_xi = se3_exp_and_right_jacobian(
+        dt_s * np.concatenate([motion.w_radps - gyro_bias, motion.v_mps], axis=1)
+    )
+    by_bias = -dt_s[..., None] * d_end_d_xi[:, :, :3]
+    covs = (d_end_d_xi * (dt_s * density_squared)[:, None]) @ np.swapaxes(d_end_d_xi, 1, 2)
+    T_start_end, d_step_d_bias, cov = pieces[0], by_bias[0], covs[0]
+    for piece, own_by_bias, own_cov in zip(pieces[1:], by_bias[1:], covs[1:], strict=True):
         carry = se3_adjoint(se3_inverse(piece))
         T_start_end = T_start_end @ piece
-        d_step_d_bias = carry @ d_step_d_bias + own_bias
+        d_step_d_bias = carry @ d_step_d_bias + own_by_bias
         cov = carry @ cov @ carry.T + own_cov
-    return TwistStep(T_start_end, d_step_d_bias, cov, dt_s)
+    return TwistStep(T_start_end, d_step_d_bias, cov, float(motion.dt_s.sum()))
 
 
 def bias_walk_cov(noise: TwistNoise, dt_s: float) -> Array:
@@ -159,52 +137,144 @@ class TwistIncrement:
         return graph
 
 
-class TwistModel:
+class TwistModel(MotionModel):
     """Pose and gyro bias, moved by a measured twist."""
 
     layout = TWIST_LAYOUT
-    variable_sizes: Mapping[str, int] = {"x": 6, "b": 3}
 
     def __init__(self, noise: TwistNoise) -> None:
         self._noise = noise
-
-    def initial_belief(self, prior: Prior) -> Belief:
-        """Return the belief at the first frame: pose and gyro bias of the prior."""
-        return Belief.of_prior(prior, self.layout)
 
     def integrate(self, motion: Motion, bias: Array) -> TwistIncrement:
         """Integrate the twists between two frames about a bias (6,), of which only the gyro's part is used."""
         assert isinstance(motion, TwistMotion)
         return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
 
-    def integrate_each(self, motions: Sequence[Motion], biases: Sequence[Array]) -> list[TwistIncrement]:
-        """Integrate the twists of some intervals, each about its own bias (6,), vectorised."""
-        twists = [motion for motion in motions if isinstance(motion, TwistMotion)]
-        steps = integrate_each(twists, np.array(biases)[:, 3:], self._noise)
-        return [TwistIncrement(step, bias[3:], self._noise) for step, bias in zip(steps, biases, strict=True)]
 
-    def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
-        """Return the latest values of some variables of a tree."""
-        return latest_values(tree, keys, tree.calculateEstimateVector)
+_VELOCITY, _TURN = slice(6, 9), slice(9, 12)
+SMOOTH_LAYOUT = Layout(12, _VELOCITY, None, _TURN)
 
-    def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
-        """Add state k at an estimate."""
-        assert estimate.bias is not None
-        values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
-        values.insert(B(k), estimate.bias[3:])
 
-    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
-        """Return state k; its accelerometer bias is zero."""
-        bias = np.concatenate([np.zeros(3), values.atVector(B(k))])
-        return Estimate(t_ns, values.atPose3(X(k)).matrix(), bias=bias)
+def _twist(T_world_imu: Array, v_world: Array, bias: Array) -> Array:
+    """Return the body twist (6,) [rad/s, m/s] of a state."""
+    return np.concatenate([-bias, T_world_imu[:3, :3].T @ v_world])
 
-    def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the prior on state k at a belief."""
-        at = gtsam.Values()
-        at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
-        at.insert(B(k), belief.bias[3:])
-        return joint_prior(at, {X(k): POSE, B(k): self.layout.gyro_bias}, belief.cov)
 
-    def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
-        """Return the covariance (9, 9), made exactly symmetric: GTSAM's errors are those of an Estimate here."""
-        return np.asarray(0.5 * (cov + cov.T))
+def twist_change_cov(noise: TwistChangeNoise, dt_s: float) -> Array:
+    """Return the covariance (12, 12) that an interval adds to pose [rotation, position] and twist [rad/s, m/s]."""
+    density = np.concatenate([noise.turn_change_density, noise.velocity_change_density]) ** 2
+    return np.block(
+        [
+            [np.diag(density * dt_s**3 / 3.0), np.diag(density * dt_s**2 / 2.0)],
+            [np.diag(density * dt_s**2 / 2.0), np.diag(density * dt_s)],
+        ]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothIncrement:
+    """An interval of ``dt_s`` in which the twist changes by noise alone."""
+
+    dt_s: float
+    noise: TwistChangeNoise
+
+    def predict(self, start: Belief) -> Prediction:
+        """Predict a state over the interval, moved by the twist of its mean."""
+        xi = self.dt_s * _twist(start.T_world_imu, start.v_world, start.bias[3:])
+        T_start_end = se3_exp(xi)
+        v_body = start.T_world_imu[:3, :3].T @ start.v_world
+        T_world_imu = start.T_world_imu @ T_start_end
+        v_world = T_world_imu[:3, :3] @ v_body
+        transition = _transition(T_start_end, se3_right_jacobian(xi), v_body, self.dt_s)
+        # A rotation error at the end also changes the velocity error, because the body's velocity is fixed in its axes.
+        spread = np.zeros((12, 12))
+        spread[POSE, POSE] = np.eye(6)
+        spread[_VELOCITY, ROTATION] = -skew(v_body)
+        spread[_VELOCITY, 9:12], spread[_TURN, 6:9] = np.eye(3), -np.eye(3)
+        noise = spread @ twist_change_cov(self.noise, self.dt_s) @ spread.T
+        return Prediction(T_world_imu, v_world, transition, 0.5 * (noise + noise.T))
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        """Return the transition (12, 12) from the mean of ``start`` to that of ``end``."""
+        T_start_end = se3_inverse(start.T_world_imu) @ end.T_world_imu
+        v_body = start.T_world_imu[:3, :3].T @ start.v_world
+        return _transition(T_start_end, se3_right_jacobian(se3_log(T_start_end)), v_body, self.dt_s)
+
+    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return the factor between pose, velocity and turn rate of two states."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(smooth_factor(self.dt_s, self.noise, k))
+        return graph
+
+
+def _transition(T_start_end: Array, d_end_d_xi: Array, v_body: Array, dt_s: float) -> Array:
+    """Return F (12, 12): an error of the start's pose, velocity (body) and turn rate, carried to the end."""
+    F = np.zeros((12, 12))
+    F[POSE, POSE] = se3_adjoint(se3_inverse(T_start_end))
+    # The velocity in the body frame depends on the velocity in the world and on the body's attitude.
+    F[POSE, ROTATION] += dt_s * d_end_d_xi[:, 3:] @ skew(v_body)
+    F[POSE, _VELOCITY] = dt_s * d_end_d_xi[:, 3:]
+    F[POSE, _TURN] = -dt_s * d_end_d_xi[:, :3]
+    F[_VELOCITY] = -skew(v_body) @ F[ROTATION]
+    F[_VELOCITY, ROTATION] += skew(v_body)
+    F[_VELOCITY, _VELOCITY] += np.eye(3)
+    F[_TURN, _TURN] = np.eye(3)
+    return F
+
+
+def smooth_factor(dt_s: float, noise: TwistChangeNoise, k: int) -> gtsam.NonlinearFactor:
+    """Return the factor from X, V, B(k - 1) to X, V, B(k); B (3,) is the turn rate with the sign changed.
+
+    The residual (12,) is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``, then the change
+    of the twist [rad/s, m/s].
+    """
+    covariance = gtsam.noiseModel.Gaussian.Covariance(twist_change_cov(noise, dt_s))
+    keys = [X(k - 1), V(k - 1), B(k - 1), X(k), V(k), B(k)]
+
+    def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        x0, v0, b0, x1, v1, b1 = this.keys()
+        start, end = values.atPose3(x0).matrix(), values.atPose3(x1).matrix()
+        before = _twist(start, values.atVector(v0), values.atVector(b0))
+        after = _twist(end, values.atVector(v1), values.atVector(b1))
+        T_start_end = se3_exp(dt_s * before)
+        off = gtsam.Pose3(se3_inverse(start @ T_start_end) @ end)
+        error: Array = gtsam.Pose3.Logmap(off)
+        if jacobians is not None:
+            _fill(jacobians, (start, before), (end, after), off, dt_s)
+        return np.concatenate([error, after - before])
+
+    return gtsam.CustomFactor(covariance, keys, residual)
+
+
+def _fill(
+    jacobians: list[Array], start: tuple[Array, Array], end: tuple[Array, Array], off: gtsam.Pose3, dt_s: float
+) -> None:
+    """Write the Jacobians of the residual to X, V, B at both ends, poses (4, 4) with twists (6,), to a list."""
+    before = start[1]
+    d_error_d_end = gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Logmap(off))
+    d_error_d_step = -d_error_d_end @ off.inverse().AdjointMap()
+    d_error_d_twist = dt_s * d_error_d_step @ se3_right_jacobian(dt_s * before)
+    carried = d_error_d_step @ se3_adjoint(se3_exp(-dt_s * before))
+    # A twist [w, v] changes by the pose through v = R^T v_world, by v_world, and by the bias -w.
+    for place, (T, twist, sign) in enumerate(((*start, -1.0), (*end, 1.0))):
+        by_pose, by_velocity, by_turn = np.zeros((6, 6)), np.zeros((6, 3)), np.zeros((6, 3))
+        by_pose[3:, :3], by_velocity[3:], by_turn[:3] = skew(twist[3:]), T[:3, :3].T, -np.eye(3)
+        through = d_error_d_twist if place == 0 else np.zeros((6, 6))
+        direct = carried if place == 0 else d_error_d_end
+        jacobians[3 * place] = np.vstack([direct + through @ by_pose, sign * by_pose])
+        jacobians[3 * place + 1] = np.vstack([through @ by_velocity, sign * by_velocity])
+        jacobians[3 * place + 2] = np.vstack([through @ by_turn, sign * by_turn])
+
+
+class SmoothTwist(MotionModel):
+    """Pose, velocity and turn rate, moved by a twist that is constant but for noise."""
+
+    layout = SMOOTH_LAYOUT
+
+    def __init__(self, noise: TwistChangeNoise) -> None:
+        self._noise = noise
+
+    def integrate(self, motion: Motion, bias: Array) -> SmoothIncrement:
+        """Return the interval between two frames; nothing was measured in it, and its bias (6,) is not used."""
+        assert isinstance(motion, UnmeasuredMotion)
+        return SmoothIncrement(float(motion.dt_s.sum()), self._noise)

@@ -20,8 +20,8 @@ from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior
 from toolkit.models import stereo
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import chi2_bound
-from toolkit.models.motion import MotionModel, motion_model, state_keys
-from toolkit.models.state import Belief
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief, MotionModel
 from toolkit.models.stereo_adjustment import (
     Evaluated,
     RobustCamera,
@@ -74,7 +74,7 @@ class Stretch:
         model = motion_model(noise, self.gravity_world)
         for packet, state in zip(self.packets, self.start, strict=True):
             model.insert(values, state.estimate(packet.frame.t_ns), packet.index)
-            keys.append(tuple(state_keys(model, packet.index)))
+            keys.append(tuple(model.keys(packet.index)))
             window = replace(tracked.window, keys=tuple(keys), values=values)
             tracked = replace(tracked, window=window).seeing(packet.frame, state.T_world_imu, rig)
         tracked, _ = tracked.in_front(rig)
