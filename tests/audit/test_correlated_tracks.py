@@ -9,9 +9,8 @@ from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
 from toolkit.models.stereo import CHANNELS
 from toolkit.sequence import Sequence
-from toolkit.simulation import SCENARIOS, simulate, track_faults
-from toolkit.simulation.sensors import with_track_noise
-from toolkit.simulation.track_noise import TrackNoise
+from toolkit.simulation import SCENARIOS, faults, simulate
+from toolkit.simulation.sensors import TrackNoise, with_track_noise
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +42,8 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
 def test_tracks_with_a_walk_or_an_offset_of_their_own_are_reported_and_white_ones_are_not(flight: Sequence) -> None:
     drive = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3)
     assert reported(flight) == reported(drive) == []
-    assert "where independent errors have -0.5" in reported(track_faults.track_walk(flight, 4.0, 3))[0]
-    assert reported(track_faults.match_offset(drive, 3.0, 3))
+    assert "where independent errors have -0.5" in reported(faults.track_walk(flight, 4.0, 3))[0]
+    assert reported(faults.match_offset(drive, 3.0, 3))
 
 
 def test_tracks_without_errors_are_left_alone() -> None:

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/moving_objects.py results.jsonl [--seeds 3] [--shares 0,0.3,0.6] [--estimators ekf,batch]
 
-A share of the points of simulated scenes drives along the camera's course (``track_faults.moving_objects``). Each run
+A share of the points of simulated scenes drives along the camera's course (``faults.moving_vehicles``). Each run
 is one line of the results, RMSE of the final position in m, none where the estimator failed; one that is there is not
 made again. The table printed at the end has, for each scene, share and estimator, the means over seeds and the mean
 ratio with its standard error.
@@ -23,7 +23,7 @@ from toolkit.registry import find
 from toolkit.runner import run
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
-from toolkit.simulation.track_faults import moving_objects
+from toolkit.simulation.faults import moving_vehicles
 
 SCENES = {
     "drive": replace(DRIVE, duration_s=12.0),
@@ -47,7 +47,7 @@ def make(options: argparse.Namespace) -> None:
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         for name, scene in SCENES.items():
             for share in options.shares:
-                among = moving_objects(simulate(scene, seed), share, seed)
+                among = moving_vehicles(simulate(scene, seed), share, seed)
                 assert among.prior is not None
                 left, counts = without_moving_tracks(among, among.prior)
                 for estimator in options.estimators:

@@ -12,14 +12,14 @@ from toolkit import runner
 from toolkit.audit import audit
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Run, Trajectory
-from toolkit.geometry import Array, se3, se3_inverse, se3_log
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
-from toolkit.measurements import Prior
+from toolkit.measurements import Prior, StereoRig
 from toolkit.metrics import score_run
+from toolkit.motion_samples import MotionSamples
 from toolkit.registry import discover, find
-from toolkit.sequence import Sequence, is_held_out
+from toolkit.sequence import Observations, Sequence, Truth, is_held_out
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
-from toolkit.simulation.symmetries import STATE_MIRROR, delayed, mirrored, mirrored_poses, renamed, turned
 from toolkit.verify.verification import short
 
 SCENARIOS = {"drive": short(DRIVE, 1.5), "drive-imu": short(DRIVE_IMU, 1.5), "flight": short(FLIGHT, 1.0)}
@@ -35,7 +35,114 @@ AXES_COUNT_FOR = 2e-4
 METRIC_ROUNDING = 1e-5
 COSTS = {"frame_ms_mean", "frame_ms_p95", "frame_ms_max", "total_s", "cpu_s", "peak_rss_mb", "frame_cpu_ms_mean"}
 
+# Reflections of the y-axis of body and world, and of the x-axis of the camera; a rotation vector keeps
+# its component along the reflected axis, and the other two change sign.
+_Y, _ROTATION = np.diag([1.0, -1.0, 1.0]), np.diag([-1.0, 1.0, -1.0])
+_POSE_Y, _CAMERA_X = np.diag([1.0, -1.0, 1.0, 1.0]), np.diag([-1.0, 1.0, 1.0, 1.0])
+# Of rotation, position, velocity and the biases [accel, gyro], in the body frame.
+STATE_MIRROR = np.concatenate([np.diag(axis) for axis in (_ROTATION, _Y, _Y, _Y, _ROTATION)])
+STATE_MIRROR.flags.writeable = False
+
 both_kinds = pytest.mark.parametrize("scenario", ["drive", "flight"])
+
+
+def turned(sequence: Sequence, yaw_rad: float, shift_m: Array) -> Sequence:
+    """Return a recording in another world frame: rotated about the vertical, and then shifted by (3,) m.
+
+    Truth and prior are expressed in it; the measurements stay.
+    """
+    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
+    T_new_old = se3(np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]), shift_m)
+    R_new_old, truth, prior = T_new_old[:3, :3], sequence.truth, sequence.prior
+    if truth is not None:
+        v_world = None if truth.v_world is None else truth.v_world @ R_new_old.T
+        truth = replace(truth, T_world_imu=T_new_old @ truth.T_world_imu, v_world=v_world)
+    if prior is not None:
+        prior = replace(prior, T_world_imu=T_new_old @ prior.T_world_imu, v_world=R_new_old @ prior.v_world)
+    return replace(sequence, truth=truth, prior=prior)
+
+
+def renamed(sequence: Sequence, ids: IntArray) -> Sequence:
+    """Return a recording in which the sightings (N,) have other track ids (N,).
+
+    Which tracks are withheld follows from the ids: rename visible tracks alone, or leave the withheld ones out before.
+    """
+    seen = sequence.observations
+    return replace(sequence, observations=Observations.sorted(seen.frame, ids, seen.uv_px))
+
+
+def delayed(sequence: Sequence, by_ns: int) -> Sequence:
+    """Return a recording with all stamps ``by_ns`` nanoseconds later."""
+    motion, truth, bridges = sequence.motion, sequence.truth, sequence.bridges
+    if bridges is not None:
+        bridges = replace(bridges, begin_t_ns=bridges.begin_t_ns + by_ns, end_t_ns=bridges.end_t_ns + by_ns)
+    return replace(
+        sequence,
+        frames_t_ns=sequence.frames_t_ns + by_ns,
+        motion=motion.of(motion.t_ns + by_ns, motion.values),
+        truth=None if truth is None else replace(truth, t_ns=truth.t_ns + by_ns),
+        bridges=bridges,
+    )
+
+
+def mirrored(sequence: Sequence) -> Sequence:
+    """Return a recording as a mirror shows it: left is right, of body, world and images alike.
+
+    The y-axes of body and world are reflected. The two cameras exchange their places, and columns are counted from the
+    other side, so that the rig is an ordinary one again.
+    """
+    seen, rig, prior = sequence.observations, sequence.rig, sequence.prior
+    uv_px = seen.uv_px[:, [1, 0, 2]]
+    uv_px[:, :2] = 2.0 * rig.cx_px - uv_px[:, :2]
+    return replace(
+        sequence,
+        rig=_mirrored_rig(rig),
+        observations=replace(seen, uv_px=uv_px),
+        motion=_mirrored_samples(sequence.motion),
+        gravity_world=_Y @ sequence.gravity_world,
+        prior=None if prior is None else _mirrored_prior(prior),
+        truth=None if sequence.truth is None else _mirrored_truth(sequence.truth),
+    )
+
+
+def mirrored_poses(T_world_imu: Array) -> Array:
+    """Return poses (..., 4, 4) as a mirror shows them, and those of a mirrored recording as they are."""
+    return np.asarray(_POSE_Y @ T_world_imu @ _POSE_Y)
+
+
+def _mirrored_rig(rig: StereoRig) -> StereoRig:
+    T_left_right = se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
+    exchange = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return replace(
+        rig,
+        T_imu_cam=_POSE_Y @ rig.T_imu_cam @ T_left_right @ _CAMERA_X,
+        cov_uv_px2=exchange @ rig.cov_uv_px2 @ exchange.T,
+    )
+
+
+def _mirrored_samples(motion: MotionSamples) -> MotionSamples:
+    if not motion.values.size:
+        return motion
+    return motion.of(motion.t_ns, motion.values * np.concatenate([np.diag(_Y), np.diag(_ROTATION)]))
+
+
+def _mirrored_prior(prior: Prior) -> Prior:
+    return replace(
+        prior,
+        T_world_imu=mirrored_poses(prior.T_world_imu),
+        v_world=_Y @ prior.v_world,
+        bias=STATE_MIRROR[9:] * prior.bias,
+        cov=STATE_MIRROR[:, None] * prior.cov * STATE_MIRROR,
+    )
+
+
+def _mirrored_truth(truth: Truth) -> Truth:
+    return replace(
+        truth,
+        T_world_imu=mirrored_poses(truth.T_world_imu),
+        v_world=None if truth.v_world is None else truth.v_world @ _Y,
+        bias=None if truth.bias is None else STATE_MIRROR[9:] * truth.bias,
+    )
 
 
 @cache

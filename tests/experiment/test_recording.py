@@ -15,7 +15,7 @@ from toolkit.measurements import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
-from toolkit.simulation.track_faults import moving_objects
+from toolkit.simulation.faults import moving_vehicles
 
 FOUND = Finding("time-gap", 1, repaired=False, detail="a gap", blocking=False)
 
@@ -185,7 +185,7 @@ def test_a_budget_of_tracks_is_kept_and_reported() -> None:
 
 
 def test_what_moves_is_left_out_where_it_is_requested_and_reported() -> None:
-    among = moving_objects(simulate(replace(DRIVE, duration_s=2.0), 0), dose=0.4, seed=0)
+    among = moving_vehicles(simulate(replace(DRIVE, duration_s=2.0), 0), dose=0.4, seed=0)
     plain = prepare(Recording(among))
     requested = prepare(Recording(among, tracks=TrackUse(leave_out_moving=True, budget=60)))
     assert requested.sequence.content_hash() != plain.sequence.content_hash()

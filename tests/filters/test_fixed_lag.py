@@ -19,7 +19,7 @@ from toolkit.models.factors import L, X
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
-from toolkit.simulation.track_faults import moving_objects
+from toolkit.simulation.faults import moving_vehicles
 
 
 def setup_of(sequence: Sequence) -> Setup:
@@ -166,7 +166,7 @@ def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_cont
 
 def convoy() -> Sequence:
     """Return a drive among vehicles: of what moves as fast as the camera, the depth grows without end."""
-    return moving_objects(simulate(replace(DRIVE, duration_s=4.5), seed=1), dose=0.6, seed=1)
+    return moving_vehicles(simulate(replace(DRIVE, duration_s=4.5), seed=1), dose=0.6, seed=1)
 
 
 def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():

@@ -34,7 +34,7 @@ from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
-from toolkit.simulation.track_faults import cut_tracks, moving_objects
+from toolkit.simulation.faults import cut_tracks, moving_vehicles
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
@@ -501,7 +501,7 @@ def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recordin
 
 def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew():
     """Their depths grow without end. One of which nothing was left but its value could not begin anew: it failed."""
-    sequence = moving_objects(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)
+    sequence = moving_vehicles(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)
     ungated = Settings(outliers=Outliers(gate_probability=None))  # the gate refuses the vehicles
     estimator = isam2_of(sequence, ungated)
     newest = [estimator.step(packet) for packet in sequence.packets()][-1]

@@ -11,8 +11,7 @@ from toolkit.models.moving_tracks import LeftOut, without_moving_tracks
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Sequence, is_held_out
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, simulate
-from toolkit.simulation.faults import linear_unit
-from toolkit.simulation.track_faults import moving_objects
+from toolkit.simulation.faults import linear_unit, moving_vehicles
 
 
 @lru_cache(maxsize=3)
@@ -73,7 +72,7 @@ def test_vehicles_are_left_out_and_what_stands_is_not():
     """With an IMU nothing but vision tells the speed, and half of the sightings are on vehicles."""
     for name in ("drive", "drive-imu", "flight"):
         standing = simulated(name)
-        among = moving_objects(standing, dose=0.5, seed=1)
+        among = moving_vehicles(standing, dose=0.5, seed=1)
         out, _ = checked(among)
         where = np.searchsorted(keys(standing), keys(among), sorter=np.argsort(keys(standing)))
         before_px = standing.observations.uv_px[np.argsort(keys(standing))[where]]
@@ -85,14 +84,14 @@ def test_vehicles_are_left_out_and_what_stands_is_not():
 
 
 def test_a_frame_is_checked_by_what_was_seen_until_then():
-    among = moving_objects(simulated(), dose=0.3, seed=1)
+    among = moving_vehicles(simulated(), dose=0.3, seed=1)
     whole, part = checked(among)[0], checked(among.truncated(25))[0]
     np.testing.assert_array_equal(whole[among.observations.frame < 25], part)
     assert part.any()
 
 
 def test_held_out_tracks_stay_whatever_they_do():
-    among = moving_objects(simulated(), dose=0.5, seed=1)
+    among = moving_vehicles(simulated(), dose=0.5, seed=1)
     assert among.prior is not None
     left, counts = without_moving_tracks(among, among.prior)
     np.testing.assert_array_equal(left.held_out.uv_px, among.held_out.uv_px)

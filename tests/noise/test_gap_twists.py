@@ -13,7 +13,7 @@ from toolkit.noise import with_gap_twists
 from toolkit.sequence import Sequence
 from toolkit.settings import Noise
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
-from toolkit.simulation.track_faults import cut_tracks
+from toolkit.simulation.faults import cut_tracks
 
 
 def gappy(seed: int, noisier: float = 1.0) -> Sequence:

@@ -19,7 +19,7 @@ from toolkit.noise.stretches import MotionFit, Stretch
 from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import SCENARIOS, noise_free, simulate
-from toolkit.simulation.track_faults import track_walk
+from toolkit.simulation.faults import track_walk
 
 AS_STATED = Noise(track_weight=1.0, motion_scale=1.0)
 

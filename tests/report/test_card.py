@@ -21,7 +21,7 @@ from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
 from toolkit.simulation import DRIVE, noise_free, simulate
-from toolkit.simulation.track_faults import disparity_scale, match_offset, persistent_mismatch, track_walk
+from toolkit.simulation.faults import match_offset, persistent_mismatch, stretched_disparity, track_walk
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_white_errors_are_not() -> None:
 
 def test_a_scale_and_strays_are_reported(walking: Sequence) -> None:
     short = walking.truncated(70)
-    card = card_of(disparity_scale(persistent_mismatch(short, 0.2, 4), 0.03))
+    card = card_of(stretched_disparity(persistent_mismatch(short, 0.2, 4), 1.03))
     assert card.scale is not None
     assert card.scale.value == pytest.approx(1.0 / 1.03, abs=0.01)
     # A mismatch in the last sighting of a track, or of one too short, does not show.

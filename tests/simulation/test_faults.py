@@ -12,13 +12,12 @@ from toolkit.geometry import se3_inverse, so3_exp
 from toolkit.measurements import NS_PER_S
 from toolkit.models.stereo import CHANNELS, triangulate
 from toolkit.sequence import Sequence, check_runnable
-from toolkit.simulation import SCENARIOS, faults, simulate, track_faults
+from toolkit.simulation import SCENARIOS, faults, simulate
 
 INJECTORS = {
     name: function
-    for module in (faults, track_faults)
-    for name, function in getmembers(module, isfunction)
-    if function.__module__.startswith(module.__name__) and not name.startswith("_")
+    for name, function in getmembers(faults, isfunction)
+    if function.__module__ == faults.__name__ and not name.startswith("_")
 }
 # What an estimator is not given without a repair or a refusal first.
 NOT_RUNNABLE = {"nan_span", "clock_jump", "zero_intrinsics", "negative_focal"}
@@ -183,33 +182,32 @@ def test_a_walk_grows_with_the_root_of_the_age_and_an_offset_stays(drive: Sequen
     seen = drive.observations
     _, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
     age = seen.frame - seen.frame[first][row]
-    walked_px = (track_faults.track_walk(drive, 0.2, 1).observations.uv_px - seen.uv_px) @ CHANNELS.T
+    walked_px = (faults.track_walk(drive, 0.2, 1).observations.uv_px - seen.uv_px) @ CHANNELS.T
     assert not walked_px[age == 0].any()
     for frames in (1, 4, 9):
         # Some hundred tracks are as old: 10 % is three standard errors and more.
         spread = walked_px[age == frames].std()
         assert spread == pytest.approx(0.2 * np.sqrt(frames), rel=0.1)
-    off_px = (track_faults.match_offset(drive, 0.7, 1).observations.uv_px - seen.uv_px) @ CHANNELS.T
+    off_px = (faults.match_offset(drive, 0.7, 1).observations.uv_px - seen.uv_px) @ CHANNELS.T
     assert np.abs(off_px - off_px[first][row]).max() < 1e-9
     assert off_px[first].std(axis=0) == pytest.approx([0.0, 0.7, 0.0], rel=0.1, abs=1e-9)
 
 
 def test_larger_disparities_bring_all_points_nearer(drive: Sequence) -> None:
-    near = track_faults.disparity_scale(drive, 0.02).observations.uv_px @ CHANNELS.T
-    far = drive.observations.uv_px @ CHANNELS.T
-    np.testing.assert_allclose(near, far * [1.0, 1.02, 1.0], atol=1e-9)
+    near, far = (one.observations.uv_px @ CHANNELS.T for one in (faults.stretched_disparity(drive, 1.02), drive))
+    np.testing.assert_allclose(near[:, 1], 1.02 * far[:, 1], atol=1e-9)
 
 
 def test_a_mismatch_persists_to_the_end_of_its_track(drive: Sequence) -> None:
     seen = drive.observations
-    away_px = track_faults.persistent_mismatch(drive, 0.3, 2).observations.uv_px - seen.uv_px
+    away_px = faults.persistent_mismatch(drive, 0.3, 2).observations.uv_px - seen.uv_px
     for track in np.unique(seen.track_id[away_px[:, 2] != 0.0]):
         steps = np.diff(away_px[seen.track_id == track], axis=0)
         assert np.count_nonzero(np.abs(steps).max(axis=1) > 1e-9) <= 1
 
 
 def test_moving_objects_move_a_share_of_the_tracks_and_keep_their_first_sightings(drive: Sequence) -> None:
-    moved = track_faults.moving_objects(drive, 0.2, 3).observations
+    moved = faults.moving_vehicles(drive, 0.2, 3).observations
     rows = np.isin(
         drive.observations.frame * 100_000 + drive.observations.track_id, moved.frame * 100_000 + moved.track_id
     )
@@ -220,4 +218,4 @@ def test_moving_objects_move_a_share_of_the_tracks_and_keep_their_first_sighting
     lasting = np.unique(moved.track_id, return_counts=True)[1] > 1
     assert struck.size / lasting.sum() == pytest.approx(0.2, abs=0.04)
     with pytest.raises(DataError, match="need the truth"):
-        track_faults.moving_objects(replace(drive, truth=None))
+        faults.moving_vehicles(replace(drive, truth=None))

@@ -8,7 +8,8 @@ import pytest
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project
 from toolkit.simulation import DRIVE, FLIGHT, Scenario
-from toolkit.simulation.world import follow, roadside, room, visibility
+from toolkit.simulation.scenes import roadside, room
+from toolkit.simulation.sensors import follow, visibility
 
 
 def view(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

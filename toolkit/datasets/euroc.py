@@ -47,9 +47,9 @@ from toolkit.motion_samples import ImuSamples
 from toolkit.progress import Progress
 from toolkit.sequence import Observations, Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
-from toolkit.simulation import sensors, world
+from toolkit.simulation import scenes, sensors
 from toolkit.simulation.filming import is_simulated, with_scene_errors
-from toolkit.simulation.world import CameraLimits
+from toolkit.simulation.sensors import CameraLimits
 
 CITES = ("burri2016euroc",)
 REAL = "real IMU, stereo tracks from the images"
@@ -293,7 +293,7 @@ def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, 
     """
     tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
     points = _room_around(T_world_imu[:, :3, 3])
-    tracks = world.follow(world.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
+    tracks = sensors.follow(sensors.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
     exact = sensors.sightings(tracks, points, T_world_imu, rig)
     noisy = sensors.with_pixel_noise(exact, 1.0, rig.cov_uv_px2, camera.step_px, pixels_rng)
     # Track ids grow with time and a frame's places keep their order, so the rows are sorted already.
@@ -312,7 +312,7 @@ def _check_room(root: Path, positions: Array) -> None:
 def _room_around(positions: Array) -> Array:
     lower, upper = _corners(positions)
     count = round(_LANDMARKS_PER_M2 * _surface_m2(lower, upper))
-    return world.room(lower, upper, count, np.random.default_rng(_WORLD_SEED))
+    return scenes.room(lower, upper, count, np.random.default_rng(_WORLD_SEED))
 
 
 def _corners(positions: Array) -> tuple[Array, Array]:

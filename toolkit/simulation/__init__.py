@@ -1,13 +1,12 @@
 """Simulated recordings with exact truth: a smooth trajectory, landmarks to look at, and sensors with known noise.
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
-``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` plants faults in a
-recording, ``track_faults`` lasting errors of tracks by ``track_noise``; ``symmetries`` turn, mirror, delay or reverse
-one. ``filming`` renders images instead of tracks, with ``surfaces`` (the visible world) and ``renderer``, and measures
-the errors of tracks made of them.
+``trajectory`` (B-splines) and ``sensors`` (visibility, tracks and noise). ``faults`` plants faults in a recording.
+``filming`` renders images instead of tracks, with ``surfaces`` (the visible world) and ``renderer``, and measures the
+errors of tracks made of them.
 """
 
-from toolkit.simulation import faults, symmetries, track_faults
+from toolkit.simulation import faults
 from toolkit.simulation.scenarios import (
     DRIVE,
     DRIVE_IMU,
@@ -31,6 +30,4 @@ __all__ = [
     "faults",
     "noise_free",
     "simulate",
-    "symmetries",
-    "track_faults",
 ]

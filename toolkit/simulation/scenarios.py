@@ -20,12 +20,10 @@ from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3, 
 from toolkit.measurements import GRAVITY_WORLD, NS_PER_S, ImuNoise, Prior, StereoRig, TwistNoise
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
-from toolkit.simulation import sensors, world
+from toolkit.simulation import sensors
 from toolkit.simulation.scenes import Scene, SceneOf, hall, road
-from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
-from toolkit.simulation.track_noise import TrackNoise
+from toolkit.simulation.sensors import CameraLimits, Imu, ImuStamps, MotionMeasurements, Odometer, TrackNoise
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
-from toolkit.simulation.world import CameraLimits
 
 START_NS = 1_600_000_000 * NS_PER_S
 # The measurements of an hour take a gigabyte.
@@ -138,7 +136,7 @@ def _viewed_once(scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: C
 def _viewed(scene: Scene, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
     frames_t_ns = sensors.stamps_ns(START_NS, camera.rate_hz, duration_s)
     motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
-    return _View(scene, frames_t_ns, motion, world.visibility(scene.points, motion.T_world_imu, rig, camera))
+    return _View(scene, frames_t_ns, motion, sensors.visibility(scene.points, motion.T_world_imu, rig, camera))
 
 
 def _measure_motion(
@@ -157,7 +155,7 @@ def _measure_motion(
 def _observe(scenario: Scenario, view: _View, streams: list[np.random.Generator]) -> Observations:
     rig, camera = scenario.rig, scenario.camera
     tracks_rng, pixels_rng, outliers_rng, slips_rng = streams
-    tracks = world.follow(view.in_view, camera, tracks_rng)
+    tracks = sensors.follow(view.in_view, camera, tracks_rng)
     exact = sensors.sightings(tracks, view.scene.points, view.motion.T_world_imu, rig)
     scale = scenario.noise_scale
     if scenario.track_noise is not None:

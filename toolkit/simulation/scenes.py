@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from toolkit.geometry import Array, about_z, so3_exp
-from toolkit.simulation import world
+from toolkit.geometry import Array, BoolArray, about_z, so3_exp
 from toolkit.simulation.trajectory import SPLINE_ORDER as ORDER
 from toolkit.simulation.trajectory import (
     FreeTrajectory,
@@ -78,7 +78,7 @@ def road(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     travelled_m = np.cumsum(0.02 * np.linalg.norm(trajectory.position.at(fine_t_s, 1), axis=1))
     even_m = np.arange(travelled_m[0], travelled_m[-1], _ROAD_POSE_SPACING_M)
     path = trajectory.at(np.interp(even_m, travelled_m, fine_t_s)).T_world_imu
-    return Scene(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, _landmark_rng(drawn)))
+    return Scene(trajectory, roadside(path, _ROAD_LANDMARKS_PER_POSE, _landmark_rng(drawn)))
 
 
 def _road_positions(t_s: Array, streets: _Streets) -> Array:
@@ -120,7 +120,7 @@ def hall(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     tilt = so3_exp(np.stack([zero, pitch, zero], axis=-1)) @ so3_exp(np.stack([roll, zero, zero], axis=-1))
     rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
     trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
-    return Scene(trajectory, world.room(HALL_LOWER_M, HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
+    return Scene(trajectory, room(HALL_LOWER_M, HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
 
 
 def _landmark_rng(drawn: np.random.Generator | None) -> np.random.Generator:
@@ -135,3 +135,47 @@ def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:
     start_s = -before * step_s
     control_t_s: Array = start_s + step_s * np.arange(count, dtype=np.float64)
     return UniformKnots(start_s, step_s), control_t_s
+
+
+def room(lower_m: Array, upper_m: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return landmarks (count, 3) on the six faces of a box, with the same density on each face.
+
+    They stand up to 0.3 m in front of their wall, as shelves and posters do, so that no face is a plane.
+    """
+    size = upper_m - lower_m
+    normal = np.repeat([0, 1, 2], 2)
+    share = np.prod(size) / size[normal]
+    face = rng.choice(6, size=count, p=share / share.sum())
+    points = lower_m + rng.uniform(size=(count, 3)) * size
+    depth_m = rng.uniform(0.0, 0.3, size=count)
+    rows, axis, far = np.arange(count), normal[face], face % 2 == 1
+    points[rows, axis] = np.where(far, upper_m[axis] - depth_m, lower_m[axis] + depth_m)
+    return points
+
+
+def roadside(path: Array, per_pose: int, rng: np.random.Generator) -> Array:
+    """Return landmarks (M, 3) left and right of a road given by poses (N, 4, 4) of the car, x forward, z up.
+
+    They lie 3.5 to 22 m to a side and from the road's surface to 6 m above the poses, more of them low and
+    near; none stands within 3 m of the path, where the car would drive through it.
+    """
+    count = len(path) * per_pose
+    share = rng.uniform(size=(count, 4))
+    side = np.where(share[:, 0] < 0.5, -1.0, 1.0)
+    offset_m = np.stack(
+        [4.0 * share[:, 1] - 2.0, side * (3.5 + 18.5 * share[:, 2] ** 1.5), 7.0 * share[:, 3] ** 1.3 - 1.0], axis=-1
+    )
+    pose = np.repeat(path, per_pose, axis=0)
+    points = (pose[:, :3, :3] @ offset_m[:, :, None])[:, :, 0] + pose[:, :3, 3]
+    return points[~_near_path(points, path, 3.0)]
+
+
+def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
+    """Say which points (M, 3) are within a radius of the path (N, 4, 4), seen from above.
+
+    The nearest pose is looked up first, because all distances between an hour's path and its points would take 25 GB.
+    """
+    along = path[:, :2, 3]
+    _, nearest = cKDTree(along).query(points[:, :2])
+    squared = ((points[:, :2] - along[nearest]) ** 2).sum(axis=-1)
+    return np.asarray(squared < radius_m**2)

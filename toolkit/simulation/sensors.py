@@ -1,4 +1,4 @@
-"""Sensor measurements of the exact motion: stereo pixels, body twists and IMU samples with known noise.
+"""Sensor measurements of the exact motion: stereo tracks, body twists and IMU samples with known noise.
 
 Continuous densities have Kalibr's names and units; a sample of white noise over dt has the standard deviation density /
 sqrt(dt), a step of a random walk over dt has density * sqrt(dt) (Furgale et al., "Kalibr", IMU noise model).
@@ -8,14 +8,63 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
+from toolkit.arrays import freeze_arrays
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log, transform
 from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistNoise
 from toolkit.models.stereo import CHANNELS, project
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.sequence import Observations
-from toolkit.simulation.track_noise import TrackNoise
 from toolkit.simulation.trajectory import SmoothTrajectory
-from toolkit.simulation.world import CameraLimits, Tracks
+
+# Poses projected at a time: bounds the memory of the (poses, 3, landmarks) intermediate.
+_POSES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class CameraLimits:
+    """The limits of a stereo pair and of its tracker.
+
+    A landmark is seen where its true projection lies ``border_px`` or more inside both images and its depth inside
+    ``depth_m``; at most ``max_tracks`` are followed at a time, and a track that could go on ends at a frame with
+    probability ``loss_per_frame``. Coordinates are rounded to steps of ``step_px`` (0: not rounded); a share
+    ``outlier_rate`` of the sightings is displaced by a length inside ``outlier_px``. The noise of the coordinates is
+    the rig's ``cov_uv_px2``.
+    """
+
+    rate_hz: float
+    size_px: tuple[int, int]
+    depth_m: tuple[float, float]
+    max_tracks: int
+    loss_per_frame: float
+    border_px: float = 6.0
+    step_px: float = 2.0**-8
+    outlier_rate: float = 0.0
+    outlier_px: tuple[float, float] = (5.0, 30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackNoise:
+    """Standard deviations (3,) in the channels (c, d, v) of the parts of a track's error.
+
+    A tracker that follows a patch from image to image adds a small error at every step (a random walk). One that
+    matches left and right only in the first frame of a track has the same disparity error in all its frames (an
+    offset). Simulators draw white noise alone, and most estimators assume it.
+
+    ``white_px`` px of every sighting by itself; ``walk_px`` px per root frame; ``offset_px`` px of the track, constant.
+    The covariance of the errors of sightings j and k, whose ages in frames are a_j and a_k, is
+    ``white^2 [j = k] + walk^2 min(a_j, a_k) + offset^2``.
+    """
+
+    white_px: Array
+    walk_px: Array
+    offset_px: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, white_px=(3,), walk_px=(3,), offset_px=(3,))
+
+    def scaled(self, factor: float) -> "TrackNoise":
+        """Return the noise with all its standard deviations multiplied."""
+        return TrackNoise(factor * self.white_px, factor * self.walk_px, factor * self.offset_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +115,61 @@ class ImuStamps:
         """Return the stamps for a recording."""
         count = int(np.floor(duration_s * rate_hz + 1e-9)) + 2
         return cls(start_ns + np.round((np.arange(count) - 0.5) * (NS_PER_S / rate_hz)).astype(np.int64), start_ns)
+
+
+def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
+    """Say for each of K poses (K, 4, 4) and M landmarks (M, 3) whether the pair sees it, (K, M)."""
+    T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
+    seen = np.empty((len(T_world_imu), len(points)), dtype=bool)
+    for begin in range(0, len(T_world_imu), _POSES_AT_ONCE):
+        T = T_cam_world[begin : begin + _POSES_AT_ONCE]
+        points_cam = np.swapaxes(T[:, :3, :3] @ points.T + T[:, :3, 3:], 1, 2)
+        seen[begin : begin + _POSES_AT_ONCE] = _in_view(points_cam, rig, camera)
+    return seen
+
+
+def _in_view(points_cam: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
+    depth = points_cam[..., 2]
+    in_depth = (depth >= camera.depth_m[0]) & (depth <= camera.depth_m[1])
+    result = np.zeros(depth.shape, dtype=bool)
+    u_left, u_right, v = project(points_cam[in_depth], rig).T
+    right, bottom = camera.size_px[0] - 1 - camera.border_px, camera.size_px[1] - 1 - camera.border_px
+    # With a positive baseline uR < uL, so two of the four horizontal limits imply the others.
+    result[in_depth] = (u_right >= camera.border_px) & (u_left <= right) & (v >= camera.border_px) & (v <= bottom)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """The landmark of each sighting: frame (N,), track id (N,) and landmark (N,), by frame then track."""
+
+    frame: IntArray
+    track_id: IntArray
+    landmark: IntArray
+
+
+def follow(seen: BoolArray, camera: CameraLimits, rng: np.random.Generator) -> Tracks:
+    """Follow landmarks through frames as a KLT tracker does, given what is visible (K, M).
+
+    A track ends where its landmark leaves the view or by chance; free places are filled at random from the
+    visible landmarks nobody follows. A track id never comes back: a landmark seen again is a new track.
+    """
+    landmark, track_id = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    next_id, rows = 0, []
+    for k, visible in enumerate(seen):
+        kept = visible[landmark] & (rng.uniform(size=landmark.size) >= camera.loss_per_frame)
+        free = visible.copy()
+        free[landmark] = False  # also if its track has just been lost: it is not found again at once
+        landmark, track_id = landmark[kept], track_id[kept]
+        candidates = np.flatnonzero(free)
+        wanted = min(max(camera.max_tracks - landmark.size, 0), candidates.size)
+        found = rng.choice(candidates, size=wanted, replace=False)
+        landmark = np.concatenate([landmark, found])
+        track_id = np.concatenate([track_id, np.arange(next_id, next_id + wanted)])
+        next_id += wanted
+        rows.append(np.stack([np.full(landmark.size, k), track_id, landmark]))
+    frame, track_id, landmark = np.concatenate(rows, axis=1) if rows else np.empty((3, 0), dtype=np.int64)
+    return Tracks(frame, track_id, landmark)
 
 
 def sightings(tracks: Tracks, points: Array, T_world_imu: Array, rig: StereoRig) -> Observations:
