@@ -44,7 +44,7 @@ def flown(rig: RectifiedPair, noise_px: float, slide_px: float, speed_m: float =
 
 def verdicts(rig: RectifiedPair, tracks: Iterator[Shown]) -> list[BoolArray]:
     """Return for each pair which tracks are said to be at their points."""
-    rigidity, found = Rigidity.of(rig, 2.0), []
+    rigidity, found = Rigidity(rig.stereo_rig, 2.0), []
     for shown in tracks:
         found.append(rigidity.agrees(*shown, np.arange(TRACKS)))
         rigidity = rigidity.after(*shown, np.arange(TRACKS))
@@ -79,7 +79,7 @@ def test_a_far_point_may_be_off_by_what_its_disparity_leaves_open(rig: Rectified
     off[SLIDING, 0] += 0.5
     tracks[0] = Shown(tracks[0].left_px, off)
     # The pair compared with the first one that has it: the others would be compared with sound pairs.
-    rigidity = Rigidity.of(rig, 2.0).after(*tracks[0], np.arange(TRACKS))
+    rigidity = Rigidity(rig.stereo_rig, 2.0).after(*tracks[0], np.arange(TRACKS))
     for shown in tracks[1:5]:
         rigidity = rigidity.after(*shown, np.arange(TRACKS))
     assert rigidity.agrees(*tracks[5], np.arange(TRACKS)).all()
@@ -90,7 +90,7 @@ def test_a_far_point_may_be_off_by_what_its_disparity_leaves_open(rig: Rectified
 
 
 def test_new_tracks_and_too_few_are_not_checked(rig: RectifiedPair) -> None:
-    rigidity = Rigidity.of(rig, 2.0)
+    rigidity = Rigidity(rig.stereo_rig, 2.0)
     *before, last = flown(rig, NOISE_PX, 0.35)
     for shown in before:
         rigidity = rigidity.after(*shown, np.arange(TRACKS))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray
+from toolkit.measurements import StereoRig
 
 Image = npt.NDArray[np.uint8]
 Pinhole = tuple[float, float, float, float]
@@ -65,6 +66,12 @@ class RectifiedPair:
     size_px: tuple[int, int]
     R_rect_cam: Array
     maps: tuple[Maps, Maps] | None = None
+
+    @property
+    def stereo_rig(self) -> StereoRig:
+        """Return it as a rig in the camera's own axes; the noise of a place is a pixel, of v, a mean, half of that."""
+        pinhole_px = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        return StereoRig(*pinhole_px, self.baseline_m, np.eye(4), np.diag([1.0, 1.0, 0.5]))
 
     def apply(self, image: Image, side: int) -> Image:
         """Return a rectified image of the left (0) or right (1) camera."""

@@ -11,19 +11,19 @@ it looks the same.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.frontend.cameras import RectifiedPair
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_exp, skew, transform, transposed
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
 
-_FEWEST_OF_A_POSE = 8
+_FEWEST_OF_A_POSE, _LEAST_SHARE_OF_A_POSE = 8, 0.3
 _ITERATIONS, _CONFIDENCE = 200, 0.999
 # A depth from a small disparity is uncertain, and with it what is expected in the right image.
 _LEAST_DISPARITY_PX = 0.5
+_LEAST_DEPTH_M = 1e-3
 # Tracks are held against a pair that is five to ten pairs back.
 _PAIRS_BACK = 5
 # A track has left its point where it is off by so many times the median of all tracks, in their own uncertainty, and
@@ -42,7 +42,8 @@ class StereoMotion:
     ``T_now_before`` takes coordinates of the camera before to those of the camera now.
     """
 
-    rig: RectifiedPair
+    rig: StereoRig
+    size_px: tuple[int, int]
     threshold_px: float
     track_ids: IntArray | None = None
     points: Array | None = None
@@ -50,62 +51,46 @@ class StereoMotion:
 
     def at(self, left_px: Array, right_px: Array, track_ids: IntArray) -> "StereoMotion":
         """Return the motion with the points that the tracks (N,) show now."""
-        rig = self.rig
-        depth = rig.fx_px * rig.baseline_m / np.maximum(left_px[:, 0] - right_px[:, 0], _LEAST_DISPARITY_PX)
-        rays = np.stack(
-            [
-                (left_px[:, 0] - rig.cx_px) / rig.fx_px,
-                (left_px[:, 1] - rig.cy_px) / rig.fy_px,
-                np.ones(len(left_px)),
-            ],
-            axis=1,
-        )
-        return replace(self, track_ids=track_ids, points=rays * depth[:, None])
+        nearest_px = np.minimum(right_px[:, 0], left_px[:, 0] - _LEAST_DISPARITY_PX)
+        points = stereo.triangulate(np.column_stack([left_px[:, 0], nearest_px, left_px[:, 1]]), self.rig)
+        return replace(self, track_ids=track_ids, points=points)
 
     def predicted(self, left_px: Array) -> Array:
         """Return where tracks at (N, 2) px are expected in the next left image if the camera moves on as it did."""
         if self.T_now_before is None or self.points is None:
             return left_px
-        expected = self._projected(transform(self.T_now_before, self.points))
-        width, height = self.rig.size_px
-        inside = (expected[:, [0, 2]] >= 0.0).all(axis=1) & (expected[:, 0] < width) & (expected[:, 2] < height)
-        return np.where(inside[:, None], expected[:, [0, 2]], left_px)
+        expected = self._expected(self.T_now_before, self.points)[:, [0, 2]]
+        inside = ((expected >= 0.0) & (expected < np.array(self.size_px))).all(axis=1, keepdims=True)
+        return np.where(inside, expected, left_px)
 
     def moved(self, rows: IntArray, left_px: Array) -> tuple["StereoMotion", BoolArray]:
         """Find the motion from where some of the tracks (rows) are now (M, 2) px, and which of them agree with it (M,).
 
         If there are too few tracks, all agree and the motion is unknown.
         """
-        unknown = replace(self, T_now_before=None), np.ones(len(rows), dtype=bool)
-        if self.points is None:
-            return unknown
-        T_now_before = pose_of(self.points[rows], left_px, self.rig, self.threshold_px)
-        if T_now_before is None:
-            return unknown
-        moved = replace(self, T_now_before=T_now_before)
-        expected = self._projected(transform(T_now_before, self.points[rows]))
-        off_px = np.linalg.norm(expected[:, [0, 2]] - left_px, axis=1)
-        return moved, np.asarray(off_px < self.threshold_px)
+        points = None if self.points is None else self.points[rows]
+        T_now_before = None if points is None else _pose_of(points, left_px, self.rig, self.threshold_px)
+        if points is None or T_now_before is None:
+            return replace(self, T_now_before=None), np.ones(len(rows), dtype=bool)
+        off_px = np.linalg.norm(self._expected(T_now_before, points)[:, [0, 2]] - left_px, axis=1)
+        return replace(self, T_now_before=T_now_before), np.asarray(off_px < self.threshold_px)
 
     def agrees(self, left_px: Array, right_px: Array, track_ids: IntArray) -> BoolArray:
         """Say of tracks (N,), each known to the pair before, whether the right image shows them where it should."""
         if self.T_now_before is None or self.points is None or self.track_ids is None:
             return np.ones(len(track_ids), dtype=bool)
-        rows = np.searchsorted(self.track_ids, track_ids)
-        expected = self._projected(transform(self.T_now_before, self.points[rows]))
-        off_px = (left_px[:, 0] - right_px[:, 0]) - (expected[:, 0] - expected[:, 1])
+        expected = self._expected(self.T_now_before, self.points[np.searchsorted(self.track_ids, track_ids)])
+        off_px = left_px[:, 0] - right_px[:, 0] - stereo.disparity_px(expected)
         return np.asarray(np.abs(off_px) < self.threshold_px)
 
-    def _projected(self, points: Array) -> Array:
-        """Return (uL, uR, v) (N, 3) px of points (N, 3); of a point that is not in front of the camera, NaN."""
-        rig = self.rig
-        depth = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
-        u = rig.fx_px * points[:, 0] / depth + rig.cx_px
-        v = rig.fy_px * points[:, 1] / depth + rig.cy_px
-        return np.stack([u, u - rig.fx_px * rig.baseline_m / depth, v], axis=1)
+    def _expected(self, T_now_before: Array, points: Array) -> Array:
+        """Return (uL, uR, v) (N, 3) px of points (N, 3) of before; of one that is not in front of the camera, NaN."""
+        moved = transform(T_now_before, points)
+        moved[:, 2] = np.where(moved[:, 2] > _LEAST_DEPTH_M, moved[:, 2], np.nan)
+        return stereo.project(moved, self.rig)
 
 
-def pose_of(points: Array, left_px: Array, rig: RectifiedPair | StereoRig, threshold_px: float) -> Array | None:
+def _pose_of(points: Array, left_px: Array, rig: StereoRig, threshold_px: float) -> Array | None:
     """Return T_now_before (4, 4) from points (N, 3) m of the camera before and their places (N, 2) px in it now.
 
     None where fewer than eight of them, or three in ten, agree to the threshold.
@@ -122,7 +107,8 @@ def pose_of(points: Array, left_px: Array, rig: RectifiedPair | StereoRig, thres
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < max(_FEWEST_OF_A_POSE, 0.3 * len(points)):
+    fewest = max(_FEWEST_OF_A_POSE, _LEAST_SHARE_OF_A_POSE * len(points))
+    if not found or inliers is None or len(inliers) < fewest:
         return None
     return se3(np.asarray(cv2.Rodrigues(turn)[0], dtype=float), np.ravel(shift))
 
@@ -143,13 +129,6 @@ class Rigidity:
     threshold_px: float
     earlier: tuple[_Earlier, ...] = ()
 
-    @classmethod
-    def of(cls, pair: RectifiedPair, threshold_px: float) -> Self:
-        """Return what no pair has been seen with yet; the noise of a place is one pixel, and of v, a mean, half that
-        variance."""
-        pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
-        return cls(StereoRig(*pinhole_px, pair.baseline_m, np.eye(4), np.diag([1.0, 1.0, 0.5])), threshold_px)
-
     def after(self, left_px: Array, right_px: Array, track_ids: IntArray) -> "Rigidity":
         """Return what the next pair is held against, after one with the tracks (N,) at (N, 2) px."""
         kept = tuple(pair._replace(pairs=pair.pairs + 1) for pair in self.earlier)
@@ -169,7 +148,7 @@ class Rigidity:
         if len(now) < _FEWEST_OF_A_MEDIAN:
             return sound
         points = stereo.triangulate(self.earlier[0].uvs_px[then], self.rig)
-        T_now_then = pose_of(points, left_px[now], self.rig, self.threshold_px)
+        T_now_then = _pose_of(points, left_px[now], self.rig, self.threshold_px)
         if T_now_then is None:
             return sound
         seen_px = _measured(left_px[now], right_px[now])
@@ -200,17 +179,15 @@ def _measured(left_px: Array, right_px: Array) -> Array:
 def _deviations(points: Array, T_now_then: Array, seen_px: Array, rig: StereoRig) -> _Deviations:
     """Hold tracks (N, 3) px against their points (N, 3) m of then.
 
-    Both places have a pixel of noise: that of then is carried over by the point, whose depth it makes uncertain.
+    Both places have the rig's noise: that of then is carried over by the point, whose depth it makes uncertain.
     """
     moved = transform(T_now_then, points)
     now, then = stereo.projection_jacobian(moved, rig), stereo.projection_jacobian(points, rig)
     carried = now @ T_now_then[:3, :3] @ np.linalg.inv(then)
-    information = np.linalg.inv(rig.cov_uv_px2 + carried @ rig.cov_uv_px2 @ transposed(carried))
+    information = np.asarray(np.linalg.inv(rig.cov_uv_px2 + carried @ rig.cov_uv_px2 @ transposed(carried)))
     off_px = seen_px - stereo.project(moved, rig)
     sizes = np.sqrt(np.einsum("ni,nij,nj->n", off_px, information, off_px))
-    return _Deviations(
-        off_px, np.asarray(information, dtype=float), sizes, np.concatenate([-now @ skew(moved), now], axis=2)
-    )
+    return _Deviations(off_px, information, sizes, np.concatenate([-now @ skew(moved), now], axis=2))
 
 
 def _refined(found: _Deviations) -> Array:

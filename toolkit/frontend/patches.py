@@ -81,7 +81,7 @@ class Patches:
         places = -np.linalg.solve(of_warp, with_shift[:, :, None])[:, :, 0]
         return np.asarray(np.clip(places, -_FARTHEST_PX, _FARTHEST_PX))
 
-    def select(self, rows: BoolArray | IntArray) -> "Patches":
+    def __getitem__(self, rows: BoolArray | IntArray) -> "Patches":
         """Return the patches of the tracks of a mask or of some rows."""
         return Patches(self.values[rows], self.solvers[rows], self.warps[rows])
 

@@ -7,7 +7,7 @@ patch, the row and the sign of the disparity.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,22 +53,15 @@ class _Tracks:
     def select(self, rows: BoolArray) -> "_Tracks":
         if rows.all():  # as most tests leave it; the patches are megabytes
             return self
-        return _Tracks(
-            *(self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows)),
-            *(self.right_warps[rows], self.sound[rows]),
-        )
+        return _Tracks(**{name: values[rows] for name, values in vars(self).items()})
 
     def joined(self, others: "_Tracks") -> "_Tracks":
         if len(others.ids) == 0:
             return self
-        return _Tracks(
-            np.concatenate([self.ids, others.ids]),
-            np.concatenate([self.left_px, others.left_px]),
-            np.concatenate([self.right_px, others.right_px]),
-            self.patches.joined(others.patches),
-            np.concatenate([self.right_warps, others.right_warps]),
-            np.concatenate([self.sound, others.sound]),
-        )
+        joined: dict[str, Any] = {"patches": self.patches.joined(others.patches)}
+        names = vars(self).keys() - joined.keys()
+        joined |= {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in names}
+        return _Tracks(**joined)
 
 
 _NO_TRACKS = _Tracks(
@@ -93,8 +86,8 @@ class Tracker:
         requested = self.settings
         self._flow = Flow(requested.window_px, requested.levels, requested.forward_backward_px)
         self._across = Flow(requested.window_px, _LEVELS_RIGHT, 2.0 * requested.forward_backward_px)
-        self._motion = StereoMotion(self.rig, requested.ransac_px)
-        self._rigidity = Rigidity.of(self.rig, requested.ransac_px)
+        self._motion = StereoMotion(self.rig.stereo_rig, self.rig.size_px, requested.ransac_px)
+        self._rigidity = Rigidity(self.rig.stereo_rig, requested.ransac_px)
         self._seen = self.rig.seen(0), self.rig.seen(1)
         self._grid = grid_of(self.rig.size_px, requested.max_tracks)
 
@@ -131,17 +124,21 @@ class Tracker:
         rows = np.flatnonzero(found)
         motion, moved_alike = self._motion.moved(rows, left_px[rows])
         rows = rows[moved_alike]
-        patches, fitted_px, correlation = before.patches.select(rows).fitted(floats, left_px[rows])
-        off_px = np.linalg.norm(fitted_px - left_px[rows], axis=1)
-        same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
+        patches, fitted_px, same = self._same(before.patches[rows], floats, left_px[rows])
         # The position of a track is where its first patch fits: the accumulated errors of KLT would drift away from it.
-        rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
+        rows, patches, here_px = rows[same], patches[same], fitted_px[same]
         shift_px = here_px - before.left_px[rows]
         right_warps = before.right_warps[rows] @ inverse(before.patches.warps[rows]) @ patches.warps
         followed = _Tracks(
             *(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches, right_warps, before.sound[rows])
         )
         return followed, motion
+
+    def _same(self, patches: Patches, image: Floats, places_px: Array) -> tuple[Patches, Array, BoolArray]:
+        """Fit first patches to an image from places (N, 2) px: return them, where they fit, and which still do."""
+        fitted, fitted_px, correlation = patches.fitted(image, places_px)
+        off_px = np.linalg.norm(fitted_px - places_px, axis=1)
+        return fitted, fitted_px, (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
         """Return the tracks found in the right image, near where they are in ``right_px``."""
@@ -154,9 +151,7 @@ class Tracker:
         The right camera sees a slanted surface under another angle: a window that only shifts would bias its disparity.
         """
         as_seen = replace(tracks.patches, warps=tracks.right_warps)
-        patches, fitted_px, correlation = as_seen.fitted(right, tracks.right_px)
-        off_px = np.linalg.norm(fitted_px - tracks.right_px, axis=1)
-        same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
+        patches, fitted_px, same = self._same(as_seen, right, tracks.right_px)
         same &= np.abs(tracks.left_px[:, 1] - fitted_px[:, 1]) < self.settings.epipolar_px
         same &= (tracks.left_px[:, 0] - fitted_px[:, 0] > _LEAST_DISPARITY_PX) & self._inside(fitted_px, 1)
         return replace(tracks, right_px=fitted_px, right_warps=patches.warps).select(same)
