@@ -53,7 +53,7 @@ def run_on(run_estimator: Callable[..., Run]) -> RunOn:
 def scored(run: Run, case: Case, output: Output, *metrics: str) -> list[float | None]:
     """Return the metrics asked for of a run that went well."""
     assert run.status == "ok", run.log
-    values = score_run(run, output, case.sequence, only=metrics).values
+    values = score_run(run, output, case.sequence).values
     return [values[metric] for metric in metrics]
 
 

@@ -28,7 +28,7 @@ from toolkit.experiment.configuration import Configuration, Request, plan_of, re
 from toolkit.progress import silent
 from toolkit.registry import find_all
 from toolkit.report.comparison_table import comparison_table, requested_columns
-from toolkit.report.table import Table, as_markdown, as_text
+from toolkit.report.text import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
 

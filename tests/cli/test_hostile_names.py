@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.report.prose import in_markdown
+from toolkit.report.text import in_markdown
 
 Vislam = Callable[..., int]
 RECORDING = Path(__file__).parents[2] / "data" / "drive_small"

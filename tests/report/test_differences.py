@@ -6,10 +6,11 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from msgspec.structs import replace
 
 from toolkit.cli import main
-from toolkit.files.documents import schema
-from toolkit.report.differences import Change, Differences, DiffRecord, diff_text
+from toolkit.files.documents import read, schema
+from toolkit.report.differences import ChangeRecord, DiffRecord, diff_text
 
 DOCUMENTS = Path(__file__).parent / "documents"
 
@@ -93,8 +94,9 @@ def test_a_run_does_not_differ_from_itself(messages, runs, name: str, capsys) ->
 def test_what_differs_at_the_end_of_a_long_text_is_shown() -> None:
     """As of a commit and the same commit changed."""
     commit = "8498ca72c387555fad878cff71f56b44dc9a20cc"
-    revision = Change("git_revision", commit, f"{commit}+changed")
-    assert "+changed" in diff_text(Differences(("a", "b"), (), (revision,), (), (), (), 0, paired=False))
+    found = read(DOCUMENTS / "diff.json", DiffRecord)
+    revision = ChangeRecord(name="git_revision", before=commit, after=f"{commit}+changed")
+    assert "+changed" in diff_text(replace(found, environment=(revision,)))
 
 
 def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(messages, runs, capsys) -> None:

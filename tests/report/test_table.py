@@ -14,11 +14,11 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Scores, known_metrics
 from toolkit.registry import discover
-from toolkit.report import prose
+from toolkit.report import text as texts
 from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.messages import note_lines
-from toolkit.report.table import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
+from toolkit.report.text import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
@@ -274,13 +274,13 @@ def test_remarks_are_reported_once_and_those_on_the_vertical_beside_the_table(
     assert report.count("tilted") == 1
 
 
-@pytest.mark.parametrize(("columns", "width"), [(80, 80), (200, prose.WIDTH), (7, 40)])
+@pytest.mark.parametrize(("columns", "width"), [(80, 80), (200, texts.WIDTH), (7, 40)])
 def test_prose_is_as_wide_as_the_terminal_and_no_wider_than_tables(
     columns: int, width: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prose, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
-    assert prose.width_of_output() is None  # read by a program: not wrapped
+    monkeypatch.setattr(texts, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
+    assert texts.width_of_output() is None  # read by a program: not wrapped
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    assert prose.width_of_output() == width
-    lines = prose.filled("word " * 100, prose.width_of_output(), "notes: ", "       ").splitlines()
+    assert texts.width_of_output() == width
+    lines = texts.filled("word " * 100, texts.width_of_output(), "notes: ", "       ").splitlines()
     assert max(map(len, lines)) <= width

@@ -138,9 +138,9 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.files.documents import to_line
     from toolkit.report.comparison_table import requested_columns
     from toolkit.report.comparison_text import comparison_text
-    from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
     from toolkit.report.scores import scores_document
+    from toolkit.report.text import width_of_output
 
     columns = requested_columns(options.columns)
     requested = _configuration(options)

@@ -100,7 +100,7 @@ def _shown(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argpar
     from toolkit.evaluation.document import evaluation_document
     from toolkit.files.documents import to_text
     from toolkit.report import evaluation_text as texts
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
 
     if options.json:
         return to_text(evaluation_document(found))

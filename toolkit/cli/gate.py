@@ -261,7 +261,7 @@ def check(options: argparse.Namespace) -> int:
     """
     from toolkit.files.writing import check_writable
     from toolkit.report.gate import BEGINNINGS, gate_text, write_check
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
     if len({path.resolve() for path in files.values()}) < len(files):

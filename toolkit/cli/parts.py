@@ -65,7 +65,7 @@ def _summary(kind: str, names: list[str]) -> str:
 
 def _listing(entries: Mapping[str, str]) -> str:
     """Return names with their one-line summaries."""
-    from toolkit.report.prose import filled, width_of_output
+    from toolkit.report.text import filled, width_of_output
 
     longest, width = max(map(len, entries), default=0), width_of_output()
     lines = (filled(text, width, f"{name:<{longest}}  ", " " * (longest + 2)) for name, text in entries.items())
@@ -114,7 +114,7 @@ def verify(options: argparse.Namespace) -> int:
     """
     from toolkit.cli.progress_display import of_this_process
     from toolkit.files.documents import to_text
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
     from toolkit.report.verify_text import verification_document, verification_text
     from toolkit.verify.subject import subject_of
     from toolkit.verify.verification import verify

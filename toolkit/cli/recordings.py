@@ -54,7 +54,7 @@ def check_data(options: argparse.Namespace) -> int:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.recording import audited_recording
     from toolkit.report.comparison_text import audit_text
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
 
     recording = replace(requested_recording(options), truth=options.truth)
     with of_this_process()(options.sequence) as progress:
@@ -80,7 +80,7 @@ def card(options: argparse.Namespace) -> int:
     from toolkit.files.documents import to_text
     from toolkit.files.writing import check_writable, write_text
     from toolkit.report.card import card_record, card_text
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
 
     if options.json is not None:
         check_writable(options.json, "{")

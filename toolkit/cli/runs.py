@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ from toolkit.cli.arguments import WORKERS, UsageError, arg, choice, command, fla
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from toolkit.report.differences import Differences
+    from toolkit.report.differences import DiffRecord
     from toolkit.report.export import BundleRecord
 
 _PAGE = "report.html"
@@ -106,14 +105,14 @@ def diff(options: argparse.Namespace) -> int:
     """
     from toolkit.files.documents import to_text
     from toolkit.metrics import known_metrics, metrics_called
-    from toolkit.report.differences import diff_document, diff_text, differences
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.differences import diff_text, differences
     from toolkit.report.run_directory import read_run
+    from toolkit.report.text import width_of_output
 
     columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
     found = differences(read_run(options.before), read_run(options.after))
     if options.json:
-        print(to_text(diff_document(found)), end="")
+        print(to_text(found), end="")
     else:
         print(diff_text(found, columns, width_of_output()))
     return 0
@@ -139,8 +138,10 @@ def reproduce(options: argparse.Namespace) -> int:
     """
     import tempfile
 
+    from msgspec.structs import replace
+
     from toolkit.files.documents import to_text
-    from toolkit.report.differences import diff_document, differences
+    from toolkit.report.differences import differences
     from toolkit.report.export import unpack_bundle
     from toolkit.report.run_directory import read_run
 
@@ -150,9 +151,9 @@ def reproduce(options: argparse.Namespace) -> int:
         before = read_run(there)
         out = Path(folder) / "here" if options.out is None else options.out
         _run_again(there, out, options)
-        found = replace(differences(before, read_run(out)), names=(str(options.bundle), str(out)))
+        found = replace(differences(before, read_run(out)), before=str(options.bundle), after=str(out))
     if options.json:
-        print(to_text(diff_document(found)), end="")
+        print(to_text(found), end="")
     elif not options.quiet:
         _print(found, record, options.bundle)
     return 0 if found.same_results else 1
@@ -174,10 +175,10 @@ def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
         requested.command(requested)
 
 
-def _print(found: Differences, record: BundleRecord, bundle: Path) -> None:
+def _print(found: DiffRecord, record: BundleRecord, bundle: Path) -> None:
     from toolkit.report.differences import diff_text
     from toolkit.report.export import installed_packages
-    from toolkit.report.prose import width_of_output
+    from toolkit.report.text import width_of_output
 
     here = installed_packages()
     others = [f"{name} {release}" for name, release in record.packages.items() if here.get(name) != release]

@@ -11,8 +11,7 @@ from toolkit.files.documents import number, read, rounded
 from toolkit.geometry import Array
 from toolkit.noise import Card
 from toolkit.report.comparison_table import sequence_line
-from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.table import MISSING, Table, as_text
+from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, filled
 from toolkit.sequence import Sequence
 
 Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]

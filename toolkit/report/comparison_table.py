@@ -13,7 +13,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.noise import MotionScale, TrackWeight
 from toolkit.report.scores import path_length_m
-from toolkit.report.table import MISSING, ShownUnit, Table, cell, heading, number, unit_of
+from toolkit.report.text import MISSING, ShownUnit, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Window, outlier_summary
 

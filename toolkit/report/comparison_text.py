@@ -20,8 +20,17 @@ from toolkit.report.messages import (
     remark_lines,
     undecided_lines,
 )
-from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
-from toolkit.report.table import Table, as_markdown, as_text
+from toolkit.report.text import (
+    WIDTH,
+    Table,
+    Width,
+    as_markdown,
+    as_text,
+    filled,
+    in_markdown,
+    markdown_section,
+    section,
+)
 from toolkit.report.verdict import verdict
 
 # Notes below the printed table, and lines of them with the verdict's; the report has all notes.

@@ -1,6 +1,6 @@
 """What differs between two run directories: settings, versions, data, how runs ended, and metrics beyond chance.
 
-As values, as text for people and as JSON.
+As the document ``vislam.diff/1`` and as text.
 """
 
 import math
@@ -12,118 +12,113 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, to_builtins
 
 from toolkit.estimate import Status
-from toolkit.files.documents import of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
-from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.run_directory import RunFiles, SeedsFiles
-from toolkit.report.table import MISSING, Table, as_text, cell
+from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, cell, filled
 
 Files = RunFiles | SeedsFiles
 _SAME = 1e-6
 _FEWEST_PAIRS = 2
 _COSTS = frozenset(metric.key for metric in cost.METRICS)
 # Parts of a manifest that are compared: request, settings, versions and data; the rest is place and time.
+_ASKS_FOR = ("compare", "settings")
 _RUNS_WITH = ("versions", "git_revision", "cpu", "os", "threads")
 _READS = ("sequence", "start", "seeds", "references")
 _LONGEST = 40
 
 
-@dataclass(frozen=True)
-class Change:
-    """A named value that differs between the two sides, as text; "" where a side has none."""
+class ChangeRecord(Struct, frozen=True, kw_only=True):
+    """A thing that the two have otherwise, as text; empty where one has none."""
 
     name: str
     before: str
     after: str
 
 
-@dataclass(frozen=True)
-class MetricChange:
-    """A metric of one line of the tables: its values, or means over seeds, and whether the change is beyond chance.
-
-    ``p`` is corrected for all tests, None where there are too few runs to tell.
-    """
+class MetricChangeRecord(Struct, frozen=True, kw_only=True):
+    """A metric of one estimator and output; over seeds the mean over the runs that are ok."""
 
     estimator: str
     output: str
     metric: str
     before: float | None
     after: float | None
-    p: float | None
-
-    @property
-    def change_percent(self) -> float | None:
-        """Return by how much it grew; None where a side has no value, or none but zero."""
-        if self.before is None or self.after is None or self.before == 0.0:
-            return None
-        return 100.0 * (self.after / self.before - 1.0)
-
-    @property
-    def moved(self) -> bool:
-        """Say whether the two sides differ by more than rounding."""
-        if self.before is None or self.after is None:
-            return self.before is not self.after
-        return not math.isclose(self.before, self.after, rel_tol=_SAME, abs_tol=1e-12)
-
-    @property
-    def beyond_chance(self) -> bool | None:
-        """Say whether the change is significant, None where it cannot be tested."""
-        return None if self.p is None else self.p <= FALSE_ALARM_RATE
-
-    @property
-    def is_cost(self) -> bool:
-        """Say whether it is time or memory, which differ between any two runs."""
-        return self.metric in _COSTS
+    change_percent: float | None
+    moved: Annotated[bool, Meta(description="by more than a millionth")]
+    p: Annotated[float | None, Meta(description="p-value of equal means, corrected for all tests")]
+    beyond_chance: Annotated[bool | None, Meta(description="null where there are too few runs")]
 
 
-@dataclass(frozen=True)
-class Differences:
-    """All that differs between two run directories, and every metric of the lines that both have."""
+class DiffRecord(Struct, frozen=True, kw_only=True):
+    """What differs between two run directories."""
 
-    names: tuple[str, str]
-    settings: tuple[Change, ...]
-    environment: tuple[Change, ...]
-    data: tuple[Change, ...]
-    ends: tuple[Change, ...]
-    metrics: tuple[MetricChange, ...]
-    tests: int
-    paired: bool
-
-    @property
-    def same_results(self) -> bool:
-        """Say whether runs ended alike and every metric but time and memory is the same to a millionth."""
-        return not self.ends and not any(change.moved and not change.is_cost for change in self.metrics)
+    schema: Literal["vislam.diff/1"]
+    before: str
+    after: str
+    same_results: Annotated[bool, Meta(description="all but time and memory, to a millionth")]
+    paired: Annotated[bool, Meta(description="whether both read the same recordings")]
+    settings: tuple[ChangeRecord, ...]
+    environment: tuple[ChangeRecord, ...]
+    data: tuple[ChangeRecord, ...]
+    ends: tuple[ChangeRecord, ...]
+    metrics: tuple[MetricChangeRecord, ...]
 
 
-def differences(before: Files, after: Files) -> Differences:
+def differences(before: Files, after: Files) -> DiffRecord:
     """Compare two run directories."""
-    one, two = (to_builtins(files.manifest) for files in (before, after))
     lines = [_lines(files) for files in (before, after)]
     both = [key for key in lines[0] if key in lines[1] and not all(_repeats_causal(side, key) for side in lines)]
     paired = _reads_the_same(before, after)
     values = [(key, metric) for key in both for metric in known_metrics()]
     raw = [_tested(lines[0][key], lines[1][key], metric, paired=paired) for key, metric in values]
-    tested = [p for p in raw if p is not None]
-    corrected = iter(holm(np.array(tested)).tolist() if tested else [])
+    corrected = iter(holm(np.array([p for p in raw if p is not None])).tolist())
     changes = []
     for (key, metric), p in zip(values, raw, strict=True):
         was, is_ = (side[key].value(metric) for side in lines)
-        changes.append(MetricChange(*key, metric.key, was, is_, None if p is None else next(corrected)))
-    return Differences(
-        (str(before.directory), str(after.directory)),
-        _changes(
-            {key: one.get(key) for key in ("compare", "settings")},
-            {key: two.get(key) for key in ("compare", "settings")},
-        ),
-        _changes({key: one.get(key) for key in _RUNS_WITH}, {key: two.get(key) for key in _RUNS_WITH}),
-        _changes({key: one.get(key) for key in _READS}, {key: two.get(key) for key in _READS}),
-        tuple(_ends(*lines)),
-        tuple(change for change in changes if change.before is not None or change.after is not None),
-        len(tested),
-        paired,
+        adjusted = None if p is None else next(corrected)
+        if was is not None or is_ is not None:
+            changes.append(_metric_change(*key, metric.key, was, is_, adjusted))
+    ends = tuple(_ends(*lines))
+    manifests = [to_builtins(files.manifest) for files in (before, after)]
+    settings, environment, data = (
+        tuple(_changes(*({name: one.get(name) for name in names} for one in manifests)))
+        for names in (_ASKS_FOR, _RUNS_WITH, _READS)
+    )
+    return DiffRecord(
+        schema="vislam.diff/1",
+        before=str(before.directory),
+        after=str(after.directory),
+        same_results=not ends and not any(one.moved and one.metric not in _COSTS for one in changes),
+        paired=paired,
+        settings=settings,
+        environment=environment,
+        data=data,
+        ends=ends,
+        metrics=tuple(changes),
+    )
+
+
+def _metric_change(
+    estimator: str, output: str, metric: str, before: float | None, after: float | None, p: float | None
+) -> MetricChangeRecord:
+    """Return by how much a metric changed, and whether by more than rounding and, by its corrected p, than chance."""
+    moved, change_percent = before is not after, None
+    if before is not None and after is not None:
+        moved = not math.isclose(before, after, rel_tol=_SAME, abs_tol=1e-12)
+        change_percent = 100.0 * (after / before - 1.0) if before else None
+    return MetricChangeRecord(
+        estimator=estimator,
+        output=output,
+        metric=metric,
+        before=before,
+        after=after,
+        change_percent=change_percent,
+        moved=moved,
+        p=p,
+        beyond_chance=None if p is None else p <= FALSE_ALARM_RATE,
     )
 
 
@@ -211,12 +206,12 @@ def _array(values: Mapping[int, float]) -> Array:
     return np.array(list(values.values()))
 
 
-def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[Change]:
+def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[ChangeRecord]:
     """Yield each line whose runs ended differently, or that only one side has."""
     for key in dict.fromkeys((*before, *after)):
         counts = [_counts(side[key]) if key in side else "" for side in (before, after)]
         if counts[0] != counts[1]:
-            yield Change(" ".join(key), *counts)
+            yield ChangeRecord(name=" ".join(key), before=counts[0], after=counts[1])
 
 
 def _counts(line: _Line) -> str:
@@ -224,10 +219,11 @@ def _counts(line: _Line) -> str:
     return ends[0] if len(ends) == 1 else f"{ends.count('ok')} of {len(ends)} ok"
 
 
-def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> tuple[Change, ...]:
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> Iterator[ChangeRecord]:
     one, two = dict(_flat(before)), dict(_flat(after))
-    names = dict.fromkeys((*one, *two))
-    return tuple(Change(name, one.get(name, ""), two.get(name, "")) for name in names if one.get(name) != two.get(name))
+    for name in dict.fromkeys((*one, *two)):
+        if one.get(name) != two.get(name):
+            yield ChangeRecord(name=name, before=one.get(name, ""), after=two.get(name, ""))
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -239,64 +235,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
             yield f"{prefix}{key}", ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-class ChangeRecord(Struct, frozen=True, kw_only=True):
-    """A thing that the two have otherwise, as text; empty where one has none."""
-
-    name: str
-    before: str
-    after: str
-
-
-class MetricChangeRecord(Struct, frozen=True, kw_only=True):
-    """A metric of one estimator and output; over seeds the mean over the runs that are ok."""
-
-    estimator: str
-    output: str
-    metric: str
-    before: float | None
-    after: float | None
-    change_percent: float | None
-    moved: Annotated[bool, Meta(description="by more than a millionth")]
-    p: Annotated[float | None, Meta(description="p-value of equal means, corrected for all tests")]
-    beyond_chance: Annotated[bool | None, Meta(description="null where there are too few runs")]
-
-
-class DiffRecord(Struct, frozen=True, kw_only=True):
-    """What differs between two run directories."""
-
-    schema: Literal["vislam.diff/1"]
-    before: str
-    after: str
-    same_results: Annotated[bool, Meta(description="all but time and memory, to a millionth")]
-    paired: Annotated[bool, Meta(description="whether both read the same recordings")]
-    settings: tuple[ChangeRecord, ...]
-    environment: tuple[ChangeRecord, ...]
-    data: tuple[ChangeRecord, ...]
-    ends: tuple[ChangeRecord, ...]
-    metrics: tuple[MetricChangeRecord, ...]
-
-
-def diff_document(found: Differences) -> DiffRecord:
-    """Return the differences as a record."""
-    return DiffRecord(
-        schema="vislam.diff/1",
-        before=found.names[0],
-        after=found.names[1],
-        same_results=found.same_results,
-        paired=found.paired,
-        settings=_records(found.settings),
-        environment=_records(found.environment),
-        data=_records(found.data),
-        ends=_records(found.ends),
-        metrics=tuple(of_attributes(MetricChangeRecord, one) for one in found.metrics),
-    )
-
-
-def _records(changes: tuple[Change, ...]) -> tuple[ChangeRecord, ...]:
-    return tuple(of_attributes(ChangeRecord, one) for one in changes)
-
-
-def diff_text(found: Differences, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
+def diff_text(found: DiffRecord, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
     """Return the differences as text: what was asked for, read and run with, then the metrics that moved.
 
     Without ``columns`` the metrics are those of the tables.
@@ -318,7 +257,7 @@ def diff_text(found: Differences, columns: tuple[Metric, ...] = (), width: Width
     return "\n".join(lines)
 
 
-def _section(title: str, changes: tuple[Change, ...]) -> list[str]:
+def _section(title: str, changes: tuple[ChangeRecord, ...]) -> list[str]:
     if not changes:
         return [f"{title}: the same", ""]
     rows = tuple((one.name, _short(one.before), _short(one.after)) for one in changes)
@@ -331,7 +270,7 @@ def _short(text: str) -> str:
     return (text if len(text) <= _LONGEST else f"{text[:half]}...{text[-half:]}") or MISSING
 
 
-def _table(moved: list[MetricChange], metrics: dict[str, Metric]) -> Table:
+def _table(moved: list[MetricChangeRecord], metrics: dict[str, Metric]) -> Table:
     rows = tuple(
         (
             one.estimator,
@@ -349,14 +288,15 @@ def _table(moved: list[MetricChange], metrics: dict[str, Metric]) -> Table:
     return Table(tuple((head, "%" if head == "change" else "") for head in heads), rows, labels=3)
 
 
-def _summary_lines(found: Differences, moved: int, shown: int) -> Iterator[str]:
+def _summary_lines(found: DiffRecord, moved: int, shown: int) -> Iterator[str]:
     if found.same_results:
         yield "the results are the same, to a millionth; time and memory never are"
     elif not moved:
         yield f"none of the {shown} metrics of the tables moved; --columns all has the others"
-    if found.tests:
+    tests = sum(one.p is not None for one in found.metrics)
+    if tests:
         how = "paired by seed" if found.paired else "as independent draws, for the recordings are not the same"
         rate = f"{100.0 * FALSE_ALARM_RATE:g} %"
-        yield f"chance: {found.tests} tests, {how}, which share a false-alarm rate of {rate} (Holm)"
+        yield f"chance: {tests} tests, {how}, which share a false-alarm rate of {rate} (Holm)"
     else:
         yield "chance: unknown from one run on each side; compare over --seeds"

@@ -3,13 +3,12 @@
 The page is one HTML file that opens from disk, in the style of the report's page.
 """
 
-import html
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 
-from toolkit.errors import DataError, printable
+from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.standings import EvaluatedRun, EvaluatedSystems
 from toolkit.files.documents import to_text
@@ -24,7 +23,7 @@ from toolkit.report.evaluation_text import (
     paired_lines,
     sequences_table,
 )
-from toolkit.report.table import Table
+from toolkit.report.text import Table, as_html, in_html
 
 EVALUATION = "evaluation.json"
 _FILES = (EVALUATION, "leaderboard.html", "leaderboard.md", "runs.csv")
@@ -35,14 +34,13 @@ main { padding: 1rem clamp(.75rem, 3vw, 2rem); display: grid; gap: var(--gap); m
 .card > h2 { margin-bottom: .5rem; }
 .scroll { overflow-x: auto; }
 thead th { padding: .35rem .55rem; font-size: .84rem; white-space: normal; line-height: 1.25; min-width: 3.6rem; }
-td .unit, th .unit { white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; font-weight: 600; }
 figure { margin: 0; }
 svg text { fill: var(--text); font-size: 11px; }
 svg .grid { stroke: var(--grid); }
 svg .failed { stroke: var(--bad); stroke-width: 1.6; }
 .key { display: inline-flex; gap: .4rem; align-items: center; margin-right: 1rem; font-size: .85rem; }
 .key i { width: .7rem; height: .7rem; border-radius: 50%; }
-.bad { color: var(--bad); }
 """
 _PAGE = """<!doctype html>
 <html lang="en">
@@ -98,60 +96,32 @@ def leaderboard_page(evaluation: EvaluatedSystems) -> str:
     title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
     if len(evaluation.sequences) > 3:
         title += f" and {len(evaluation.sequences) - 3} more"
-    cards = [_card("Leaderboard", _paragraphs(header_lines(evaluation)) + html_table(leaderboard_table(evaluation)))]
+    cards = [_card("Leaderboard", _paragraphs(header_lines(evaluation)) + _html_table(leaderboard_table(evaluation)))]
     if len(evaluation.sequences) > 1:
         name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
-        cards.append(_card(name, html_table(sequences_table(evaluation))))
+        cards.append(_card(name, _html_table(sequences_table(evaluation))))
     cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
     for heading, lines in (
         ("Is it more than chance?", paired_lines(evaluation)),
         ("Runs that failed", failure_lines(evaluation, None)),
         ("Notes", note_lines(evaluation)),
     ):
-        entries = "".join(f"<li>{_text(line)}</li>" for line in lines)
+        entries = "".join(f"<li>{in_html(line)}</li>" for line in lines)
         cards += [_card(heading, f"<ul>{entries}</ul>")] if entries else []
     style = files("toolkit.report.html").joinpath("style.css").read_text(encoding="utf-8") + _STYLE
-    return _PAGE.format(title=_text(title), style=style, cards="\n".join(cards))
+    return _PAGE.format(title=in_html(title), style=style, cards="\n".join(cards))
 
 
-def html_table(table: Table) -> str:
-    """Return a table as HTML, the best cells marked; what failed stands out."""
-    heads = "".join(
-        f'<th scope="col" class="{_side(table, j)}">{_heading(lines)}</th>' for j, lines in enumerate(table.headings)
-    )
-    rows = "".join(f"<tr>{''.join(_cells(table, i))}</tr>" for i in range(len(table.rows)))
-    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
-
-
-def _cells(table: Table, row: int) -> Iterator[str]:
-    for column, text in enumerate(table.rows[row]):
-        classes = [_side(table, column)]
-        classes += ["best"] if (row, column) in table.best else []
-        classes += ["bad"] if "failed" in text and column >= table.labels else []
-        tag = "th scope='row'" if column == 0 else "td"
-        yield f'<{tag} class="{" ".join(classes)}">{_text(text)}</{tag[:2]}>'
-
-
-def _side(table: Table, column: int) -> str:
-    return "word" if column < table.labels else "number"
-
-
-def _heading(lines: tuple[str, ...]) -> str:
-    *words, unit = lines
-    name = _text(" ".join(filter(None, words)).replace("- ", "-"))
-    return f'{name} <span class="unit">[{_text(unit)}]</span>' if unit else name
+def _html_table(table: Table) -> str:
+    return f'<div class="scroll">{as_html(table)}</div>'
 
 
 def _card(title: str, body: str) -> str:
-    return f'<section class="card"><h2>{_text(title)}</h2>{body}</section>'
+    return f'<section class="card"><h2>{in_html(title)}</h2>{body}</section>'
 
 
 def _paragraphs(lines: Iterable[str]) -> str:
-    return "".join(f'<p class="fine">{_text(line)}</p>' for line in lines)
-
-
-def _text(text: str) -> str:
-    return html.escape(printable(text))
+    return "".join(f'<p class="fine">{in_html(line)}</p>' for line in lines)
 
 
 def _figure(evaluation: EvaluatedSystems) -> str:
@@ -171,10 +141,10 @@ def _figure(evaluation: EvaluatedSystems) -> str:
     for i, (sequence, system) in enumerate(rows):
         y, colour = 10.0 + _ROW * (i + 0.5), evaluation.systems.index(system) % _COLOURS
         if i % len(evaluation.systems) == 0:
-            marks.append(f'<text x="0" y="{y + 4:.1f}">{_text(sequence[:30])}</text>')
+            marks.append(f'<text x="0" y="{y + 4:.1f}">{in_html(sequence[:30])}</text>')
         for run in evaluation.cells[system, sequence].runs:
             value = _value(run, evaluation)
-            title = f"<title>{_text(_named(run, value))}</title>"
+            title = f"<title>{in_html(_named(run, value))}</title>"
             if run.status == "ok" and value is not None:
                 x = _NAMES + scale * (math.log10(value) - low)
                 style = f'style="fill:var(--line-{colour});fill-opacity:.75"'
@@ -184,14 +154,14 @@ def _figure(evaluation: EvaluatedSystems) -> str:
                 cross = f"M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"
                 marks.append(f'<path class="failed" d="{cross}">{title}</path>')
     keys = "".join(
-        f'<span class="key"><i style="background:var(--line-{i % _COLOURS})"></i>{_text(system)}</span>'
+        f'<span class="key"><i style="background:var(--line-{i % _COLOURS})"></i>{in_html(system)}</span>'
         for i, system in enumerate(evaluation.systems)
     )
     unit = f" [{evaluation.ranked_by.unit}]" if evaluation.ranked_by.unit else ""
     label = f"{evaluation.ranked_by.name}{unit} of every run, logarithmic; a cross is a run that failed"
     box = f"0 0 {_NAMES + _DOTS + _MARGIN:.0f} {height:.0f}"
-    drawing = f'<svg viewBox="{box}" role="img" aria-label="{_text(label)}">{"".join(marks)}</svg>'
-    return f'<figure>{keys}{drawing}<figcaption class="fine">{_text(label)}</figcaption></figure>'
+    drawing = f'<svg viewBox="{box}" role="img" aria-label="{in_html(label)}">{"".join(marks)}</svg>'
+    return f'<figure>{keys}{drawing}<figcaption class="fine">{in_html(label)}</figcaption></figure>'
 
 
 def _value(run: EvaluatedRun, evaluation: EvaluatedSystems) -> float | None:

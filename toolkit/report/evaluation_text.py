@@ -10,17 +10,22 @@ from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedTest, Sta
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
-from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
-from toolkit.report.table import (
+from toolkit.report.text import (
     MISSING,
+    WIDTH,
     ShownUnit,
     Table,
+    Width,
     as_latex,
     as_markdown,
     as_text,
     cell,
+    filled,
     heading,
+    in_markdown,
+    markdown_section,
     number,
+    section,
     unit_of,
     unrivalled,
 )

@@ -16,8 +16,7 @@ from toolkit.files.writing import write_text
 from toolkit.gate.case_check import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict, check_document
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.prose import WIDTH, Width, section
-from toolkit.report.table import MISSING, Table, as_markdown, as_text
+from toolkit.report.text import DIGITS, MISSING, WIDTH, Table, Width, as_markdown, as_text, number, section
 
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
@@ -27,8 +26,8 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
-# A length below this (m) is told in millimetres; a value has so many digits at least and at most.
-_SHORT_M, _DIGITS, _MOST_DIGITS = 0.1, 3, 7
+# A length below this (m) is told in millimetres; a value has at most so many digits.
+_SHORT_M, _MOST_DIGITS = 0.1, 7
 _NUMBERS = (
     ("before", "", ""),
     ("now", "", ""),
@@ -92,14 +91,10 @@ def _value(value: float | None, factor: float, unit: str, differs: float) -> str
     if value is None:
         return MISSING
     scaled = factor * value
-    if not math.isfinite(scaled) or scaled == 0.0:
-        return f"{scaled:g} {unit}".rstrip()
-    first = math.floor(math.log10(abs(scaled)))
-    of_difference = first - math.floor(math.log10(differs)) + 2 if math.isfinite(differs) and differs else 0
-    digits = min(max(_DIGITS, of_difference), _MOST_DIGITS)
-    decimals = max(digits - 1 - first, 0)
-    text = f"{scaled:.{decimals}f}" if -_DIGITS <= first < _MOST_DIGITS else f"{scaled:.{_DIGITS - 1}e}"
-    return f"{text} {unit}".rstrip()
+    of_difference = 0
+    if math.isfinite(scaled) and scaled and math.isfinite(differs) and differs:
+        of_difference = math.floor(math.log10(abs(scaled))) - math.floor(math.log10(differs)) + 2
+    return f"{number(scaled, min(max(DIGITS, of_difference), _MOST_DIGITS))} {unit}".rstrip()
 
 
 def _percent(value: float | None, sign: str = "") -> str:

@@ -16,8 +16,7 @@ from toolkit.metrics import Metric, is_on_request, metrics_called, unavailable
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.reprojection import RATIO
 from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
-from toolkit.report.table import cell, number
-from toolkit.report.verdict import listed
+from toolkit.report.text import cell, listed, number
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
@@ -132,16 +131,16 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
     metric = next((metric for metric in shown_metrics(comparison) if metric.best), None)
     if metric is None:
         return
-    listed = []
+    medians = []
     for row in comparison.lines:
         found = row.quantiles_of_all(metric)
         if found is not None:
             ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
             median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
-            listed.append(f"{_name_of(row)} {median} ({ended})")
-    if listed:
+            medians.append(f"{_name_of(row)} {median} ({ended})")
+    if medians:
         what = f"median {metric.name} with bad runs as infinitely bad"
-        yield f"{what}: {'; '.join(listed)}"
+        yield f"{what}: {'; '.join(medians)}"
 
 
 def _contradicted(comparison: Comparison) -> Iterator[str]:
@@ -149,8 +148,8 @@ def _contradicted(comparison: Comparison) -> Iterator[str]:
     rows = [row for row in comparison.lines if row.mark == "contradicted"]
     found = [(_name_of(row), one) for row in rows if (one := row.consistency) is not None]
     if found:
-        names, trends = listed(name for name, _ in found), listed(_figure(one.mean) for _, one in found)
-        limit = _figure(max(one.high for _, one in found))
+        names, trends = listed(name for name, _ in found), listed(number(one.mean) for _, one in found)
+        limit = number(max(one.high for _, one in found))
         yield f"contradicted: tracks push {names} one way, trend {trends} (limit {limit}); check calibration and stamps"
 
 
@@ -160,8 +159,8 @@ def _marks(comparison: Comparison) -> Iterator[str]:
     for row in comparison.lines:
         found = row.consistency
         if found is not None and row.mark in _REMEDY:
-            name, band = metrics_called((found.metric,))[0].name, f"{_figure(found.low)} to {_figure(found.high)}"
-            by_band.setdefault((row.mark, name, band), []).append((row, _figure(found.mean)))
+            name, band = metrics_called((found.metric,))[0].name, f"{number(found.low)} to {number(found.high)}"
+            by_band.setdefault((row.mark, name, band), []).append((row, number(found.mean)))
     for (mark, name, band), marked in sorted(by_band.items(), key=lambda item: list(_REMEDY).index(item[0][0])):
         names, values = listed(_name_of(row) for row, _ in marked), listed(value for _, value in marked)
         yield f"{mark}: {names}, {name} {values} (consistent: {band}); {_REMEDY[mark]}"
@@ -192,7 +191,7 @@ def _far_from_motion(comparison: Comparison) -> Iterator[str]:
     found = too_far(comparison.lines)
     if found:
         worst = max(found, key=lambda one: one.squared)
-        apart = f"{_figure(worst.distance_m)} m and {_figure(worst.angle_deg)} deg apart at {worst.t_s:.0f} s"
+        apart = f"{number(worst.distance_m)} m and {number(worst.angle_deg)} deg apart at {worst.t_s:.0f} s"
         more = f" (and {len(found) - 1} more)" if found[1:] else ""
         yield (
             f"{_name_of(worst.row)}{more} and the measured motion disagree, {apart}: look for slip, moving objects or "
@@ -216,10 +215,6 @@ def _seeds(seeds: Iterable[int]) -> str:
     """Name seeds: "seed 3", "seeds 3 and 5"."""
     given = list(map(str, seeds))
     return f"seed{'s' if len(given) > 1 else ''} {listed(given)}"
-
-
-def _figure(value: float) -> str:
-    return number(value)
 
 
 def consistency_lines(comparison: Comparison) -> Iterator[str]:
@@ -272,15 +267,13 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
         return f"equal to that of {best} under all {found.n} seeds"
     decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else 2
     figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
-    listed = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
+    said = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
     if found.is_significant:
-        return listed
+        return said
     if found.seeds_needed > _MOST_SEEDS:
-        return f"{listed}: practically equal, {_MOST_SEEDS} seeds would not distinguish them"
+        return f"{said}: practically equal, {_MOST_SEEDS} seeds would not distinguish them"
     more = max(1, math.ceil(found.seeds_needed) - found.n)
-    return (
-        f"{listed}: may be chance; {more} more seed{'s' if more > 1 else ''} would show a difference as large as this"
-    )
+    return f"{said}: may be chance; {more} more seed{'s' if more > 1 else ''} would show a difference as large as this"
 
 
 def _equal(one: Row, other: Row) -> bool:

@@ -4,17 +4,15 @@ Only differences that a paired test supports are called differences (:mod:`toolk
 """
 
 import math
-from collections.abc import Iterable
 
 from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import COST, HELD_OUT, Contest, cheaper_near
 from toolkit.experiment.drift_test import CONFIDENCE, Advantage
 from toolkit.metrics import metrics_called
+from toolkit.report.text import listed, number
 
 # An estimator is named as nearly as good where its error is within this factor, and it saves this share of the time.
 _NEAR, _SAVES = 1.25, 0.2
-# More names than these are counted, not listed.
-_MOST_NAMES = 4
 
 
 def verdict(comparison: Comparison) -> str:
@@ -33,25 +31,9 @@ def main_contest(comparison: Comparison) -> Contest | None:
     return next((by_question[question] for question in wanted if question in by_question), None)
 
 
-def listed(names: Iterable[str]) -> str:
-    """Return names as in a sentence: "a", "a and b", "a, b and c", "a, b, c and 4 more"."""
-    given = list(dict.fromkeys(names)) or [""]
-    if len(given) > _MOST_NAMES:
-        given = [*given[: _MOST_NAMES - 1], f"{len(given) - _MOST_NAMES + 1} more"]
-    return " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
-
-
-def short(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, without powers of ten up to a million."""
-    if not value or abs(value) >= 1e6 or abs(value) < 1e-4:
-        return f"{value:.{digits}g}"
-    decimals = digits - 1 - math.floor(math.log10(abs(value)))
-    return f"{round(value, decimals):.{max(0, decimals)}f}"
-
-
 def advantage_text(found: Advantage) -> str:
     """Return a factor with its interval, as in "2.2 times (99 %: 1.4 to 3.7)"."""
-    return f"{short(found.ratio)} times ({100 * CONFIDENCE:.0f} %: {short(found.low)} to {short(found.high)})"
+    return f"{number(found.ratio)} times ({100 * CONFIDENCE:.0f} %: {number(found.low)} to {number(found.high)})"
 
 
 def _of_few(comparison: Comparison) -> str:
@@ -72,7 +54,7 @@ def _accuracy(contest: Contest, over_seeds: bool) -> str:
         claim = "predicts withheld tracks best" if contest.metric == HELD_OUT else "is most accurate"
         opening = f"{first.estimator} {claim} ({name} {_with_unit(contest, first)}"
     else:
-        least = short(first.value(contest.metric) or 0.0)
+        least = number(first.value(contest.metric) or 0.0)
         given = f"{least} to {_with_unit(contest, leaders[-1])}"
         opening = f"No clear winner between {listed(row.estimator for row in leaders)} ({name} {given}"
     runs = f"{len(first.outcomes)} seeds" if over_seeds else "one run"
@@ -91,7 +73,7 @@ def _beaten(contest: Contest, over_seeds: bool) -> str:
 
 
 def _with_unit(contest: Contest, row: Row) -> str:
-    return f"{short(row.value(contest.metric) or 0.0)} {metrics_called((contest.metric,))[0].unit}"
+    return f"{number(row.value(contest.metric) or 0.0)} {metrics_called((contest.metric,))[0].unit}"
 
 
 def _limits(contest: Contest) -> str:
@@ -116,7 +98,7 @@ def _trust(comparison: Comparison) -> str:
         trusted = "Trust nobody's stated uncertainty"
     worst = max(judged, key=_overconfidence)
     errs = _overconfidence(worst)
-    return trusted + (f"; {worst.estimator} errs {short(errs, 2)} times what it states." if errs else ".")
+    return trusted + (f"; {worst.estimator} errs {number(errs, 2)} times what it states." if errs else ".")
 
 
 def _overconfidence(row: Row) -> float:
@@ -132,8 +114,8 @@ def _cost(contest: Contest) -> str:
         return ""
     if near is not None:
         more = 100.0 * ((near.value(contest.metric) or 0.0) / (first.value(contest.metric) or 1.0) - 1.0)
-        share = short((near.value(COST) or 0.0) / cost, 2)
+        share = number((near.value(COST) or 0.0) / cost, 2)
         return f"{near.estimator} comes within {max(1, math.ceil(more))} % of {first.estimator} in {share} of its time."
     other = contest.worse[0][0] if contest.worse else first
     times = cost / (other.value(COST) or cost)
-    return f"{first.estimator} takes {short(times, 2)} times the time of {other.estimator}." if times > 1.0 else ""
+    return f"{first.estimator} takes {number(times, 2)} times the time of {other.estimator}." if times > 1.0 else ""

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from toolkit.files.documents import of_attributes
-from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.table import Table, as_text
+from toolkit.report.text import WIDTH, Table, Width, as_text, filled
 from toolkit.verify.verification import Result, Verification
 
 

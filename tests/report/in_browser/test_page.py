@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.metrics import known_metrics
 from toolkit.report.html import write_html
-from toolkit.report.table import cell, unit_of
+from toolkit.report.text import cell, unit_of
 
 pytest.importorskip("selenium.webdriver", reason="needs selenium, from the extra 'test'")
 

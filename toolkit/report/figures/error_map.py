@@ -44,7 +44,7 @@ from toolkit.report.figures.top_view import (
     true_track,
     view_of,
 )
-from toolkit.report.table import number
+from toolkit.report.text import number
 
 # Plasma (Smith and van der Walt 2015) without its yellow, which white paper swallows: legible for the colour-blind.
 _COLOURS = LinearSegmentedColormap.from_list("plasma without yellow", colormaps["plasma"](np.linspace(0.0, 0.85, 64)))

@@ -33,7 +33,7 @@ from toolkit.report.figures.style import (
     style_axes,
     width_of,
 )
-from toolkit.report.table import number
+from toolkit.report.text import number
 
 # What leaves a panel is drawn up to this many times the largest error of what does not.
 _ROOM_BEYOND = 1.5

@@ -8,7 +8,7 @@ from typing import Any
 
 from toolkit.metrics import metrics_called
 from toolkit.report.report_json import ContestRecord, Rival
-from toolkit.report.verdict import listed, short
+from toolkit.report.text import listed, number
 
 Row = dict[str, Any]
 _TITLES = {
@@ -52,19 +52,19 @@ def _of_contest(contest: ContestRecord, rows: Sequence[Row], runs: str) -> dict[
         return _card(question, "no winner", leads, f"next: {after}")
     last = next(one for one in reversed(contest.rivals) if one.estimator in contest.leaders)
     apart = 100.0 * (last.value / first.value - 1.0) if first.value else 0.0
-    return _card(question, _UNDECIDED, f"{listed(contest.leaders)}: {short(apart, 2)} % apart, {runs}", after)
+    return _card(question, _UNDECIDED, f"{listed(contest.leaders)}: {number(apart, 2)} % apart, {runs}", after)
 
 
 def _figure(rival: Rival, contest: ContestRecord) -> str:
     known = metrics_called((contest.metric,))[0]
-    return f"{short(rival.value)} {known.unit} {known.column}"
+    return f"{number(rival.value)} {known.unit} {known.column}"
 
 
 def _how_much(rival: Rival, contest: ContestRecord) -> str:
     if rival.ratio is None or rival.interval is None:
         return ""
-    low, high = map(short, rival.interval)
-    return f"; {short(rival.ratio)} times as much (99 %: {low} to {high}) over {contest.by}"
+    low, high = map(number, rival.interval)
+    return f"; {number(rival.ratio)} times as much (99 %: {low} to {high}) over {contest.by}"
 
 
 def _row_of(rival: Rival, rows: Sequence[Row]) -> Row | None:
@@ -88,7 +88,7 @@ def _fastest(rows: Sequence[Row]) -> Iterator[dict[str, str | None]]:
     if len(cost_of) < 2:
         return
     (name, cost), (other, next_cost), *_ = sorted(cost_of.items(), key=lambda pair: pair[1])
-    figures = f"{short(cost)} ms of processor time a frame", f"next: {other}, {short(next_cost)} ms"
+    figures = f"{number(cost)} ms of processor time a frame", f"next: {other}, {number(next_cost)} ms"
     if next_cost >= _FASTER * cost:
         yield _card("Fastest", name, *figures, next(row for row in able if row["estimator"] == name))
     else:

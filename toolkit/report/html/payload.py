@@ -23,7 +23,7 @@ from toolkit.report.looks import look_numbers
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import ConsistencyMark, MetricOverSeeds, RunOverSeeds
-from toolkit.report.table import ShownUnit, unit_of
+from toolkit.report.text import ShownUnit, unit_of
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles

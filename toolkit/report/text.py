@@ -1,19 +1,31 @@
-"""Tables for a terminal, for Markdown and for LaTeX, and a metric's heading and value as they stand in one.
+"""How a report writes words, numbers and tables: for a terminal, in Markdown, HTML and LaTeX.
 
-The heading is said by the metrics' own records. Numbers have three significant digits, lengths of centimetres and less
-are in millimetres, a whole column in one unit; tabulate renders the cells.
+Numbers have three significant digits; lengths of centimetres and less are in millimetres, a whole column in one unit.
+Lines are wrapped to the width of a terminal, and whole where they go into a file or a pipe. tabulate lays tables out.
 """
 
+import html
 import math
-from collections.abc import Iterable, Iterator
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator
+from shutil import get_terminal_size
 from typing import Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
 from toolkit.errors import printable
 from toolkit.metrics import Metric
-from toolkit.report.prose import in_markdown
 
+# Widest table and text; on a terminal, text has its width, but at least 40 columns.
+WIDTH, _NARROWEST = 100, 40
+Width = int | None
+_LABEL = 7
+# An underscore inside a word is none; a minus, a plus or a number is one only at the beginning of a line.
+_MARKUP = re.compile(r"[\\`*<>\[\]|&]|(?<!\w)_|_(?!\w)|^[#~+-]|^\d+(?=[.)] )")
+# More names than these are counted, not listed.
+_MOST_NAMES = 4
 MISSING = "-"
 DIGITS = 3
 # Numbers outside of these are written in powers of ten: that of a diverged estimator may have any size.
@@ -37,6 +49,49 @@ _LATEX = {character: rf"\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
     "±": r"$\pm$",
 }
+
+
+def width_of_output() -> Width:
+    """Return the width of text on standard output: None where it is not a terminal."""
+    if not sys.stdout.isatty():
+        return None
+    return min(max(get_terminal_size((WIDTH, 24)).columns, _NARROWEST), WIDTH)
+
+
+def filled(text: str, width: Width, first: str = "", further: str = "  ") -> str:
+    """Return a text in lines no wider than ``width``, behind what its first line and the others begin with."""
+    text = printable(text)
+    if width is None:
+        return first + text
+    return textwrap.fill(text, width, initial_indent=first, subsequent_indent=further)
+
+
+def in_markdown(text: str) -> str:
+    """Return a text in one line that Markdown shows as it is: no markup, no table, no HTML, nothing that acts."""
+    return _MARKUP.sub(r"\\\g<0>", printable(text))
+
+
+def markdown_section(title: str, entries: Iterable[str]) -> Iterator[str]:
+    """Yield the heading and the list of a section of Markdown, each a paragraph; nothing where there is no entry."""
+    lines = [f"- {in_markdown(entry)}" for entry in entries]
+    if lines:
+        yield f"## {title}"
+        yield "\n".join(lines)
+
+
+def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
+    """Yield entries under a title that stands before the first."""
+    for i, entry in enumerate(entries):
+        label = f"{title}:" if i == 0 else ""
+        yield filled(entry, width, f"{label:<{_LABEL}}", " " * (_LABEL + 2))
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names as in a sentence: "a", "a and b", "a, b and c", "a, b, c and 4 more"."""
+    given = list(dict.fromkeys(names)) or [""]
+    if len(given) > _MOST_NAMES:
+        given = [*given[: _MOST_NAMES - 1], f"{len(given) - _MOST_NAMES + 1} more"]
+    return " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
 
 
 class Table(NamedTuple):
@@ -136,32 +191,45 @@ def _marked(lines: list[str], table: Table) -> Iterator[str]:
 
 
 def as_markdown(table: Table) -> str:
-    """Return the table in Markdown; units stand in brackets behind the names."""
-    heads = [_in_one_line(lines) for lines in table.headings]
+    """Return the table in Markdown; units stand in brackets behind the names, the best cells are bold."""
     marks = table.marks or ("",) * len(table.rows)
-    labelled = (_with_mark(row, mark) for row, mark in zip(table.rows, marks, strict=True))
-    plain = [(*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in labelled]
-    rows = [
-        tuple(f"**{text}**" if (i, j) in table.best else text for j, text in enumerate(row))
-        for i, row in enumerate(plain)
+    marked = [
+        (*row[:2], f"{row[2]}, {mark}", *row[3:]) if mark else row for row, mark in zip(table.rows, marks, strict=True)
     ]
+    escaped = tuple((*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in marked)
+    rows = _cells(table._replace(rows=escaped), str, "**{}**")
+    heads = [_in_one_line(lines) for lines in table.headings]
     text = tabulate(rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
     return "\n\n".join(filter(None, (text, "\n".join(f"- {in_markdown(line)}" for line in table.under))))
+
+
+def as_html(table: Table) -> str:
+    """Return the table as an element of HTML; units stand in brackets behind the names, the best cells are bold."""
+    heads = [in_html(_in_one_line(lines)) for lines in table.headings]
+    rows = _cells(table, in_html, '<b class="best">{}</b>')
+    return str(tabulate(rows, heads, "unsafehtml", colalign=_sides(table), disable_numparse=True))
 
 
 def as_latex(table: Table) -> str:
     """Return the table as LaTeX of the package booktabs; units stand in brackets, the best cells are bold."""
     sides = "".join(side[0] for side in _sides(table))
     heads = " & ".join(_in_latex(_in_one_line(lines)) for lines in table.headings)
-    rows = [" & ".join(_latex_cells(table, i)) for i in range(len(table.rows))]
+    rows = [" & ".join(row) for row in _cells(table, _in_latex, r"\textbf{{{}}}")]
     lines = [rf"\begin{{tabular}}{{{sides}}}", r"\toprule", rf"{heads} \\", r"\midrule"]
     return "\n".join([*lines, *(rf"{row} \\" for row in rows), r"\bottomrule", r"\end{tabular}"])
 
 
-def _latex_cells(table: Table, row: int) -> Iterator[str]:
-    for column, text in enumerate(table.rows[row]):
-        escaped = _in_latex(text)
-        yield rf"\textbf{{{escaped}}}" if (row, column) in table.best else escaped
+def _cells(table: Table, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
+    """Return the cells as text of some markup, the best ones in bold."""
+    return [
+        [bold.format(escaped(text)) if (i, j) in table.best else escaped(text) for j, text in enumerate(row)]
+        for i, row in enumerate(table.rows)
+    ]
+
+
+def in_html(text: str) -> str:
+    """Return a text that HTML shows as it is."""
+    return html.escape(printable(text))
 
 
 def _in_latex(text: str) -> str:
@@ -174,10 +242,6 @@ def _in_one_line(heading: tuple[str, ...]) -> str:
     *words, unit = heading
     name = " ".join(filter(None, words)).replace("- ", "-")
     return f"{name} [{unit}]" if unit else name
-
-
-def _with_mark(row: tuple[str, ...], mark: str) -> tuple[str, ...]:
-    return (*row[:2], f"{row[2]}, {mark}", *row[3:]) if mark else row
 
 
 def _sides(table: Table) -> list[Literal["left", "right"]]:
