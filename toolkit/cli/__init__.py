@@ -67,24 +67,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
     with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as end_requests:
-        return _guarded(given, end_requests)
-
-
-def _guarded(given: list[str], end_requests: Collection[float]) -> int:
-    try:
-        return _run(given)
-    except VislamError as error:
-        return _ended_with(str(error), error.exit_status)
-    except KeyboardInterrupt:
-        return _interrupted()
-    except BrokenPipeError:
-        # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
-        _give_up_output()
-        return _READER_GONE
-    except Exception as error:  # the last resort: whatever it is, it is told in one line
-        if end_requests:  # compiled code may make any error of an interrupt
+        try:
+            return _run(given)
+        except VislamError as error:
+            return _ended_with(str(error), error.exit_status)
+        except KeyboardInterrupt:
             return _interrupted()
-        return _unexpected(error)
+        except BrokenPipeError:
+            # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
+            _give_up_output()
+            return _READER_GONE
+        except Exception as error:  # the last resort: whatever it is, it is told in one line
+            # Compiled code may make any error of an interrupt.
+            return _interrupted() if end_requests else _unexpected(error)
 
 
 def _run(given: list[str]) -> int:
@@ -157,34 +152,32 @@ def _unexpected(error: Exception) -> int:
     """Tell in one line what the commands do not foresee, and return its exit status."""
     if os.environ.get(_WITH_TRACEBACK, "0") not in ("", "0"):
         traceback.print_exc()
-    behind = _means_behind(error)
     if isinstance(error, OSError) and error.filename is None and error.errno in _NOT_WRITTEN:
         _give_up_output()
-        return _ended_with(
-            f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status
-        )
-    if behind is not None:
-        return _ended_with(_refused(behind), _SYSTEM)
-    if isinstance(error, UnicodeError):
-        return _ended_with(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
-    kind = type(error).__name__
-    how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
+        what = f"the standard output cannot be written ({error.strerror or error})"
+        return _ended_with(what, OutputError.exit_status)
+    behind = _means_behind(error)
+    if isinstance(behind, MemoryError):
+        lacking = "out of memory; use a part of the recording, a shorter one, or fewer --workers"
+    elif isinstance(behind, ImportError):
+        lacking = f"a library cannot be loaded ({behind}); allow more memory, or install it again"
+    elif behind is not None:
+        lacking = f"an operating-system call failed: {behind}"
+    elif isinstance(error, UnicodeError):
+        lacking = f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8"
+    else:
+        return _ended_with(_defect(error), _DEFECT)
+    return _ended_with(lacking, _SYSTEM)
+
+
+def _defect(error: Exception) -> str:
+    """Return whose defect an error is, and what to do."""
     from toolkit.discovery import line_of_another_package  # slow for a help text
 
+    told, how = f"{type(error).__name__}: {error}", f"set {_WITH_TRACEBACK}=1 to see where, and report it"
     if theirs := line_of_another_package(error):
-        return _ended_with(
-            f"a defect of {theirs}, which another package brings ({kind}: {error}); {how} there", _DEFECT
-        )
-    return _ended_with(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
-
-
-def _refused(behind: BaseException) -> str:
-    """Return what of the system's means is missing, and what to do."""
-    if isinstance(behind, MemoryError):
-        return "out of memory; use a part of the recording, a shorter one, or fewer --workers"
-    if isinstance(behind, ImportError):
-        return f"a library cannot be loaded ({behind}); allow more memory, or install it again"
-    return f"an operating-system call failed: {behind}"
+        return f"a defect of {theirs}, which another package brings ({told}); {how} there"
+    return f"a defect of vislam itself, not of your data ({told}); {how}"
 
 
 def _means_behind(error: BaseException | None) -> BaseException | None:
@@ -215,17 +208,10 @@ def _memory_limit() -> int | None:
 
 
 def _interrupted() -> int:
-    _forget_where_interrupted()
-    return _ended_with("interrupted; what was not finished is not written", _INTERRUPTED)
-
-
-def _forget_where_interrupted() -> None:
-    """Have ``python -m toolkit.cli`` end with our status wherever the interrupt came.
-
-    CPython notes that one was raised in source text it had been handed, as the making of a dataclass is, and ends by
-    SIGINT though we caught it; it forgets the note when it is handed the next text.
-    """
+    # CPython notes an interrupt that was raised in source text it had been handed, as the making of a dataclass is, and
+    # `python -m toolkit.cli` would then end by SIGINT though we caught it. It forgets the note at the next such text.
     exec("")
+    return _ended_with("interrupted; what was not finished is not written", _INTERRUPTED)
 
 
 def _give_up_output() -> None:

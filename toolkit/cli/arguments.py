@@ -127,17 +127,18 @@ class Group(NamedTuple):
             one.add_to(group)
 
 
-def arg(name: str, metavar: str | None, kind: Callable[[str], Any] | None, help: str, **how: Any) -> Argument:
-    """Return an argument with a value of a ``kind``; a default other than an empty one ends its help."""
+def arg(usage: str, help: str, kind: Callable[[str], Any] | None = str, **how: Any) -> Argument:
+    """Return an argument with a value, named as ``--out DIR`` or ``sequences SEQUENCE``; a default ends its help."""
+    name, _, metavar = usage.partition(" ")
     default = how.get("default")
     shown = f"{default:g}" if isinstance(default, float) else default
     end = "" if default in (None, (), []) else f" (default: {shown})"
-    return Argument(name, {"metavar": metavar, "type": kind, "help": help + end, **how})
+    return Argument(name, {"metavar": metavar or None, "type": kind, "help": help + end, **how})
 
 
-def choice(name: str, choices: Sequence[str], help: str, **how: Any) -> Argument:
+def choice(usage: str, choices: Sequence[str], help: str, **how: Any) -> Argument:
     """Return an argument that is one of some words, which the help names."""
-    return arg(name, how.pop("metavar", None), None, help, choices=choices, **how)
+    return arg(usage, help, None, choices=choices, **how)
 
 
 def flag(name: str, help: str, **how: Any) -> Argument:
@@ -267,7 +268,7 @@ def topics(text: str) -> str:
 def estimators(what: str) -> Argument:
     """Return the argument that names estimators; ``what`` says what they are named for."""
     default = "my_filter.py is a file of your own (default: those that 'vislam list estimators' marks)"
-    return arg("--estimators", "NAME,...", names, f"{what}; {default}")
+    return arg("--estimators NAME,...", f"{what}; {default}", names)
 
 
 def output(as_json: str, quiet: str = "see the exit status") -> OneOf:
@@ -277,16 +278,16 @@ def output(as_json: str, quiet: str = "see the exit status") -> OneOf:
 
 _AFTER = "after the first frame, as in 10s"
 PART = (
-    arg("--from", "TIME", seconds_from_start, f"leave out frames before it, {_AFTER}", dest="from_s"),
-    arg("--to", "TIME", seconds_from_start, f"leave out frames after it, {_AFTER}", dest="to_s"),
-    arg("--every", "N", at_least(1), "use one frame in N"),
-    arg("--max-frames", "N", at_least(2), "use the first N of these frames only"),
+    arg("--from TIME", f"leave out frames before it, {_AFTER}", seconds_from_start, dest="from_s"),
+    arg("--to TIME", f"leave out frames after it, {_AFTER}", seconds_from_start, dest="to_s"),
+    arg("--every N", "use one frame in N", at_least(1)),
+    arg("--max-frames N", "use the first N of these frames only", at_least(2)),
 )
-WORKERS = arg("--workers", "N", at_least(1, MOST_WORKERS), "processes side by side (default: one a CPU)")
+WORKERS = arg("--workers N", "processes side by side (default: one a CPU)", at_least(1, MOST_WORKERS))
 REPAIR = OneOf(
     (
         flag("--no-repair", "report the faults of a recording, repair none"),
-        arg("--keep", "FAULT,...", names, "do not repair these, see 'vislam list faults'"),
+        arg("--keep FAULT,...", "do not repair these, see 'vislam list faults'", names),
     )
 )
 
@@ -303,10 +304,9 @@ def setting(key: str, made: Argument) -> Argument:
 TOPICS = setting(
     "frontend.topics",
     arg(
-        "--topics",
-        "ROLE=TOPIC,...",
-        topics,
+        "--topics ROLE=TOPIC,...",
         f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
+        topics,
     ),
 )
 TRACKS = setting(
@@ -319,11 +319,11 @@ TRACKS = setting(
     ),
 )
 RECORDING = (
-    arg("sequence", "SEQUENCE", str, "a recording's path, or a built-in name"),
+    arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
     REPAIR,
     TRACKS,
     TOPICS,
-    arg("--seed", "N", at_least(0), "of a simulated sequence", default=0),
+    arg("--seed N", "of a simulated sequence", at_least(0), default=0),
 )
 
 
@@ -339,20 +339,18 @@ class _Once(argparse.Action):
 
 
 SETTINGS = (
-    arg("--config", "FILE", Path, "settings in TOML, or the manifest.json of a run to repeat", action=_Once),
+    arg("--config FILE", "settings in TOML, or the manifest.json of a run to repeat", Path, action=_Once),
     setting(
         "outliers.policy",
-        arg("--outliers", "POLICY", str, "how every estimator treats inconsistent measurements (see docs/settings.md)"),
+        arg("--outliers POLICY", "how every estimator treats inconsistent measurements (see docs/settings.md)"),
     ),
     setting(
         "window.lag_s",
-        arg("--window", "SECONDS", positive_seconds, "length of the window of windowed filters and smoothers"),
+        arg("--window SECONDS", "length of the window of windowed filters and smoothers", positive_seconds),
     ),
     flag("--no-fast", "use NumPy only, even where the extra 'fast' provides compiled code for filters"),
     arg(
-        "--set",
-        "KEY=VALUE",
-        str,
+        "--set KEY=VALUE",
         "one setting, as in window.lag_s=3 (see 'vislam list settings'); may be repeated",
         action="append",
         default=[],

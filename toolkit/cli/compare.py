@@ -50,31 +50,23 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
 @command(
     "compare",
     "run estimators on the same measurements and compare them",
-    arg(
-        "sequences",
-        "SEQUENCE",
-        str,
-        f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
-        nargs="*",
-    ),
+    arg("sequences SEQUENCE", f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})", nargs="*"),
     estimators("estimators to compare, see 'vislam list estimators'; 'ladder' is every rung"),
-    arg("--truth", "FILE.tum", str, "ground truth; with exactly one SEQUENCE"),
+    arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE"),
     arg(
-        "--trajectory",
-        "NAME=FILE",
-        named_file,
+        "--trajectory NAME=FILE",
         "another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the estimators; "
         "may be repeated; with exactly one SEQUENCE",
+        named_file,
         action="append",
         dest="trajectories",
         default=[],
     ),
     arg(
-        "--out",
-        "DIR",
-        Path,
+        "--out DIR",
         "run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the same "
         "command continues where it stopped",
+        Path,
     ),
     *PART,
     REPAIR,
@@ -88,8 +80,8 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     ),
     TRACKS,
     TOPICS,
-    setting("first_seed", arg("--seed", "N", at_least(0), "of simulated sequences (default: 0)")),
-    setting("seeds", arg("--seeds", "N", at_least(1), "repeat simulated sequences over N seeds, from --seed")),
+    setting("first_seed", arg("--seed N", "of simulated sequences (default: 0)", at_least(0))),
+    setting("seeds", arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1))),
     setting(
         "vary",
         choice(
@@ -104,10 +96,9 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         default=None,
     ),
     arg(
-        "--columns",
-        "NAME,...",
-        names,
+        "--columns NAME,...",
         "of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
+        names,
         default=(),
     ),
     *SETTINGS,
@@ -121,9 +112,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     ),
     output("what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"),
     arg(
-        "--scheduler",
-        "ADDRESS",
-        str,
+        "--scheduler ADDRESS",
         "run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
     ),
     examples=("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",),

@@ -41,21 +41,17 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
     "baseline",
     "measure the baseline that vislam check compares with",
     arg(
-        "sequences",
-        "SEQUENCE",
-        str,
+        "sequences SEQUENCE",
         "a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
         nargs="*",
     ),
     estimators("estimators to measure, see 'vislam list estimators'"),
-    arg("--out", "FILE", Path, "the baseline (default: named by the releases)"),
-    arg("--seeds", "N", at_least(FEWEST_SEEDS), "seeds of each simulated sequence, from 0", default=SEEDS),
-    arg("--repeats", "N", at_least(1), "runs of each recorded sequence", default=1),
-    arg("--duration", "S", positive_seconds, "seconds of every sequence without its own (default: all of it)"),
+    arg("--out FILE", "the baseline (default: named by the releases)", Path),
+    arg("--seeds N", "seeds of each simulated sequence, from 0", at_least(FEWEST_SEEDS), default=SEEDS),
+    arg("--repeats N", "runs of each recorded sequence", at_least(1), default=1),
+    arg("--duration S", "seconds of every sequence without its own (default: all of it)", positive_seconds),
     arg(
-        "--truth",
-        "SEQUENCE=FILE.tum",
-        str,
+        "--truth SEQUENCE=FILE.tum",
         "ground truth of a recorded sequence, from the same places; may be given several times; with --trajectories "
         "also a folder that has SEQUENCE.tum",
         action="append",
@@ -65,11 +61,10 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
         "baselines of another system's trajectories",
         (
             arg(
-                "--trajectories",
-                "DIR|FILE",
-                Path,
+                "--trajectories DIR|FILE",
                 "run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against "
                 "--truth; or take the scores of an evaluation.json",
+                Path,
             ),
             choice(
                 "--align",
@@ -77,10 +72,9 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
                 "what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
             ),
             arg(
-                "--gap",
-                "S",
-                positive_seconds,
+                "--gap S",
                 "the longest time between two keyframes that counts as covered (default: 5)",
+                positive_seconds,
             ),
         ),
     ),
@@ -212,25 +206,21 @@ def _bad_ends(baseline: Baseline) -> Iterator[str]:
     "check",
     "fail if accuracy, consistency or speed are not a baseline's",
     arg(
-        "--baseline",
-        "FILE",
-        Path,
+        "--baseline FILE",
         "file that vislam baseline wrote; of a folder, the one for the releases installed here",
+        Path,
         required=True,
     ),
     WORKERS,
-    *(arg(f"--{name}", "FILE", Path, f"write the verdicts as {what}") for name, what in _FILES.items()),
+    *(arg(f"--{name} FILE", f"write the verdicts as {what}", Path) for name, what in _FILES.items()),
     arg(
-        "--trajectories",
-        "DIR|FILE",
-        Path,
+        "--trajectories DIR|FILE",
         "run nothing; check another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
         "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
+        Path,
     ),
     arg(
-        "--truth",
-        "DIR|SEQUENCE=FILE",
-        str,
+        "--truth DIR|SEQUENCE=FILE",
         "with --trajectories: path of the truth, if it is not the baseline's",
         action="append",
         default=[],
@@ -241,9 +231,7 @@ def _bad_ends(baseline: Baseline) -> Iterator[str]:
     ),
     flag("--skip-speed", "do not check time, for example on a machine of another make"),
     arg(
-        "--speed-against",
-        "REVISION|WHEEL",
-        str,
+        "--speed-against REVISION|WHEEL",
         "check time by alternating runs with another version of the code: a git revision of the current checkout, or "
         "a wheel; detects 15 %%, on any machine",
     ),

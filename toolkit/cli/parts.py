@@ -20,7 +20,7 @@ _EXAMPLES = 4
 @command(
     "list",
     "list estimators, metrics, faults, settings, formats and built-in sequences",
-    choice("kind", KINDS, f"one of {', '.join(KINDS)}", metavar="KIND", nargs="?"),
+    choice("kind KIND", KINDS, f"one of {', '.join(KINDS)}", nargs="?"),
     examples=("vislam list", "vislam list estimators"),
 )
 def list_parts(options: argparse.Namespace) -> int:
@@ -89,7 +89,7 @@ def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:
 @command(
     "cite",
     "print BibTeX for estimators and data sets",
-    arg("names", "NAME|RUN_DIR", str, "an estimator, a format, an estimator's file, a run directory", nargs="*"),
+    arg("names NAME|RUN_DIR", "an estimator, a format, an estimator's file, a run directory", nargs="*"),
     examples=("vislam cite msckf-fej euroc",),
 )
 def cite(options: argparse.Namespace) -> int:
@@ -103,7 +103,7 @@ def cite(options: argparse.Namespace) -> int:
 @command(
     "verify",
     "check that an estimator of your own keeps what every estimator promises",
-    arg("estimator", "FILE.py|NAME", str, "a file or a module with build(setup), or an installed estimator"),
+    arg("estimator FILE.py|NAME", "a file or a module with build(setup), or an installed estimator"),
     output("the result as JSON"),
     examples=("vislam verify dead-reckoning",),
 )

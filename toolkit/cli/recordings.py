@@ -43,7 +43,7 @@ _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 @command(
     "check-data",
     "find the faults of a recording",
-    arg("--truth", "FILE.tum", Path, "ground truth, to check that the two overlap"),
+    arg("--truth FILE.tum", "ground truth, to check that the two overlap", Path),
     *RECORDING,
     examples=("vislam check-data drive",),
 )
@@ -66,8 +66,8 @@ def check_data(options: argparse.Namespace) -> int:
 @command(
     "card",
     "describe the tracks of a recording: length, errors, depths",
-    arg("--json", "FILE", Path, "write the card as JSON, too (see docs/tracks.md)"),
-    arg("--max-frames", "N", at_least(2), "use the first N frames only"),
+    arg("--json FILE", "write the card as JSON, too (see docs/tracks.md)", Path),
+    arg("--max-frames N", "use the first N frames only", at_least(2)),
     *RECORDING,
     examples=("vislam card drive-realistic --max-frames 60",),
 )
@@ -96,12 +96,12 @@ def card(options: argparse.Namespace) -> int:
 @command(
     "tracks",
     "draw stereo tracks over the images they were made of",
-    arg("images", "FOLDER|BAG", str, "a folder with images, as EuRoC's or KITTI's, or a bag"),
+    arg("images FOLDER|BAG", "a folder with images, as EuRoC's or KITTI's, or a bag"),
     TOPICS,
-    arg("--out", "DIR", Path, "directory of the stills", required=True),
+    arg("--out DIR", "directory of the stills", Path, required=True),
     OneOf(
         (
-            arg("--count", "N", at_least(1, _MOST_STILLS), "how many stills", default=10),
+            arg("--count N", "how many stills", at_least(1, _MOST_STILLS), default=10),
             flag("--video", "a video of every frame instead of stills"),
         )
     ),
@@ -147,9 +147,9 @@ def _summary(tracks: ImageTracks) -> str:
     "simulate",
     "write a simulated recording",
     choice("scenario", SCENARIOS, "scenario: the vehicle and its path"),
-    arg("--out", "DIR", Path, "directory of the recording", required=True),
-    arg("--seed", "N", at_least(0), "seed of every error", default=0),
-    arg("--duration", "S", positive_seconds, "seconds (default: the scenario's)"),
+    arg("--out DIR", "directory of the recording", Path, required=True),
+    arg("--seed N", "seed of every error", at_least(0), default=0),
+    arg("--duration S", "seconds (default: the scenario's)", positive_seconds),
     Group(
         "images",
         (
@@ -160,12 +160,11 @@ def _summary(tracks: ImageTracks) -> str:
                 "the distortion of both cameras, which are then not aligned (default: none, rectified)",
             ),
             arg(
-                "--blur",
-                "MS",
-                number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS),
+                "--blur MS",
                 "milliseconds of exposure (default: 0)",
+                number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS),
             ),
-            arg("--moving", "N", at_least(0, _MOST_CRATES), "moving crates (default: 0)"),
+            arg("--moving N", "moving crates (default: 0)", at_least(0, _MOST_CRATES)),
         ),
     ),
     examples=(
@@ -219,17 +218,16 @@ def _film(scenario: Scenario, options: argparse.Namespace) -> int:
 @command(
     "import",
     "make a recording of your own tables",
-    arg("--tracks", "FILE.csv", Path, "t, track_id, uL, uR and v, or vL and vR", required=True),
+    arg("--tracks FILE.csv", "t, track_id, uL, uR and v, or vL and vR", Path, required=True),
     arg(
-        "--motion",
-        "FILE.csv",
-        Path,
+        "--motion FILE.csv",
         "t and ax, ay, az, gx, gy, gz of an IMU, or vx, vy, vz, wx, wy, wz of the body",
+        Path,
         required=True,
     ),
-    arg("--rig", "FILE.toml", Path, "calibration of the rectified pair, and noise", required=True),
-    arg("--truth", "FILE.tum", Path, "ground truth"),
-    arg("--out", "DIR", Path, "directory of the recording", required=True),
+    arg("--rig FILE.toml", "calibration of the rectified pair, and noise", Path, required=True),
+    arg("--truth FILE.tum", "ground truth", Path),
+    arg("--out DIR", "directory of the recording", Path, required=True),
     examples=(
         "vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out recordings/own",
     ),

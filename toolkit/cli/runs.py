@@ -25,8 +25,8 @@ _RUN = "as vislam compare writes it"
 @command(
     "report",
     "show run directories as one interactive HTML page",
-    arg("runs", "RUN_DIR", Path, _RUN, nargs="+"),
-    arg("--out", "FILE", Path, f"the page (default: {_PAGE} in the run directory; ./{_PAGE} for several)"),
+    arg("runs RUN_DIR", _RUN, Path, nargs="+"),
+    arg("--out FILE", f"the page (default: {_PAGE} in the run directory; ./{_PAGE} for several)", Path),
     examples=(
         "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
         "vislam report runs/drive",
@@ -51,16 +51,15 @@ def report(options: argparse.Namespace) -> int:
 @command(
     "export",
     "write a trajectory of a run directory in another program's format, or a bundle",
-    arg("run", "RUN_DIR", Path, _RUN),
-    arg("--estimator", "NAME", str, "an estimator, or truth (default: the only one there is)"),
+    arg("run RUN_DIR", _RUN, Path),
+    arg("--estimator NAME", "an estimator, or truth (default: the only one there is)"),
     choice("--output", ("causal", "final"), "default: final, where there is one"),
     choice("--format", FORMATS, "of the file; KITTI has no stamps"),
-    arg("--out", "FILE", Path, "the file to write"),
+    arg("--out FILE", "the file to write", Path),
     arg(
-        "--bundle",
-        "FILE.zip",
-        Path,
+        "--bundle FILE.zip",
         "write settings, versions, hashes, trajectories and metrics of the run as one file for vislam reproduce",
+        Path,
     ),
     examples=(
         "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
@@ -89,9 +88,9 @@ def export(options: argparse.Namespace) -> int:
 @command(
     "diff",
     "show what differs between two run directories",
-    arg("before", "RUN_A", Path, _RUN),
-    arg("after", "RUN_B", Path, "the run directory to compare with it"),
-    arg("--columns", "KEY,...", names, "metrics to show, or all (default: the tables')", default=()),
+    arg("before RUN_A", _RUN, Path),
+    arg("after RUN_B", "the run directory to compare with it", Path),
+    arg("--columns KEY,...", "metrics to show, or all (default: the tables')", names, default=()),
     flag("--json", "print every metric and difference as JSON"),
     examples=(
         "vislam compare drive --estimators ekf --max-frames 40 --out runs/before",
@@ -121,9 +120,9 @@ def diff(options: argparse.Namespace) -> int:
 @command(
     "reproduce",
     "repeat the run of a bundle and show what differs",
-    arg("bundle", "BUNDLE", Path, "as vislam export --bundle writes it"),
-    arg("--data", "SEQUENCE", str, "path of the recording here, if it is not the bundle's"),
-    arg("--out", "DIR", Path, "keep the new run directory (default: it is not kept)"),
+    arg("bundle BUNDLE", "as vislam export --bundle writes it", Path),
+    arg("--data SEQUENCE", "path of the recording here, if it is not the bundle's"),
+    arg("--out DIR", "keep the new run directory (default: it is not kept)", Path),
     output("every difference as JSON, and nothing else"),
     WORKERS,
     examples=(
