@@ -25,7 +25,6 @@ solver finds what a longer window would add.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import gtsam
@@ -47,16 +46,13 @@ from toolkit.models import stereo
 from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.motion import motion_model
-from toolkit.models.stacked_factors import StackedFactors, stacked
+from toolkit.models.state import Increment
+from toolkit.settings.records import Outliers
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"
 RULES = {"window": "it keeps every state"}
 DEFAULT = True
-
-# Those of the first two solves were chosen by looking at recordings that are scored with them.
-_HUBER_STOPPING, _CAUCHY_STOPPING = Stopping(1e-2, 20, at_overshoot=True), Stopping(3e-3, 60)
-_LAST_STOPPING = Stopping(1e-4, 60)
 
 
 def build(setup: Setup) -> Estimator:
@@ -65,22 +61,31 @@ def build(setup: Setup) -> Estimator:
 
 
 class Stage(NamedTuple):
-    """One solve: its name, the threshold (sigma) of its loss or None for no loss, the loss, and when it ends."""
+    """One solve: its name, its loss with the threshold (sigma), None for no loss, and when it ends."""
 
     name: str
-    threshold: float | None
     loss: Loss
+    threshold: float | None
     stopping: Stopping
-    is_last: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Smoothed:
+class Smoothed(NamedTuple):
     """The last solution, its graph, and the frames (K,) with the sightings in it."""
 
     solution: Solution
     graph: gtsam.NonlinearFactorGraph
     frames: list[StereoFrame]
+
+
+def stages(outliers: Outliers) -> list[Stage]:
+    """Return the solves; a first or second one without a threshold is left out.
+
+    The ends of the first two were chosen by looking at recordings that are scored with them.
+    """
+    first = Stage("solving with Huber's loss", HUBER, outliers.batch_huber, Stopping(1e-2, 20, at_overshoot=True))
+    second = Stage("solving with Cauchy's loss", CAUCHY, outliers.batch_cauchy, Stopping(3e-3, 60))
+    last = Stage("solving without outliers", HUBER, outliers.batch_last_huber, Stopping(1e-4, 60))
+    return [*(stage for stage in (first, second) if stage.threshold is not None), last]
 
 
 class Batch:
@@ -131,33 +136,25 @@ class Batch:
         sighting of it has no gradient and would leave it there. Once a step has raised the error, landmarks are moved
         in images from the first step of later solves on.
         """
-        motion, stacks = self._motion_factors()
+        motion, increments = self._motion_factors()
         order_of, overshot = cheaper_order(motion, frames), False
-        for stage in self._stages():
-            if stage.is_last:
+        *softened, last = stages(self._outliers)
+        for stage in (*softened, last):
+            if stage is last:
                 frames = _placed_by_stereo(self._plausible(frames, values))
             graph = _with_sightings(motion, frames, StereoFactors(self._rig, stage.threshold, stage.loss))
             # The first solve need not reach its minimum, which would take twice as long without a gain.
             images = None if stage.stopping.at_overshoot else FirstImages.of(frames, self._rig, at_once=overshot)
             start, order = _only_seen(values, frames), order_of(graph, frames)
-            problem = MixedGraph(graph, stacks)
+            problem = MixedGraph(graph, increments)
             solution = solve(problem, start, stage.stopping, self._progress, stage.name, images, order)
             values, overshot = solution.values, overshot or solution.overshot
-            if not stage.is_last:
+            if stage is not last:
                 frames = _without_those_behind(frames, values, self._rig)
         return Smoothed(solution, graph, frames)
 
-    def _stages(self) -> Iterator[Stage]:
-        outliers = self._outliers
-        huber, cauchy, last = outliers.batch_huber, outliers.batch_cauchy, outliers.batch_last_huber
-        if huber is not None:
-            yield Stage("solving with Huber's loss", huber, HUBER, _HUBER_STOPPING)
-        if cauchy is not None:
-            yield Stage("solving with Cauchy's loss", cauchy, CAUCHY, _CAUCHY_STOPPING)
-        yield Stage("solving without outliers", last, HUBER, _LAST_STOPPING, is_last=True)
-
-    def _motion_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[StackedFactors]]:
-        """Return the prior and the motion factors, about the causal pass's last bias, and stacks of those in Python."""
+    def _motion_factors(self) -> tuple[gtsam.NonlinearFactorGraph, dict[int, Increment]]:
+        """Return the prior and the motion factors, about the causal pass's last bias, and the increments of these."""
         graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias
         assert best_bias is not None
@@ -165,7 +162,7 @@ class Batch:
         increments = {k: self._motion.integrate(motion, best_bias) for k, motion in moved.items()}
         for k, increment in increments.items():
             graph.push_back(increment.factors(k))
-        return graph, stacked(increments)
+        return graph, increments
 
     def _plausible(self, frames: list[StereoFrame], values: gtsam.Values) -> list[StereoFrame]:
         """Return the frames without the sightings whose residuals are improbable by the stated noise."""

@@ -38,7 +38,7 @@ from toolkit.measurements import StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.settings import Outliers
+from toolkit.settings.records import Outliers
 
 
 class FollowedTracks(NamedTuple):

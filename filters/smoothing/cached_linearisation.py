@@ -30,12 +30,6 @@ class CachedLinearisation:
         return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
 
 
-def python_factors(factors: gtsam.NonlinearFactorGraph) -> dict[int, gtsam.CustomFactor]:
-    """Return the Python factors of a graph by their index in it."""
-    places = ((i, factors.at(i)) for i in range(factors.size()))
-    return {i: factor for i, factor in places if isinstance(factor, gtsam.CustomFactor)}
-
-
 def with_linearisations(
     factors: gtsam.NonlinearFactorGraph, cached: dict[int, CachedLinearisation]
 ) -> gtsam.NonlinearFactorGraph:

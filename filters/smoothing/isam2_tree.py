@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
+from filters.smoothing.cached_linearisation import CachedLinearisation, with_linearisations
 from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables, key_list
 from filters.smoothing.indeterminate import (
     LAST,
@@ -28,7 +28,7 @@ from filters.smoothing.indeterminate import (
 from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
-from toolkit.models.factors import kind_of
+from toolkit.models.factors import kind_of, python_factors
 from toolkit.models.state import MotionModel
 
 # The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings

@@ -1,11 +1,9 @@
 """Levenberg-Marquardt, one iteration at a time, with the ways a solve can go wrong checked.
 
-GTSAM's optimizer returns unchanged values without a message when an error is not a number, so the error is checked
-first. GTSAM also passes a Python factor a copy of all values at each call, which makes a thousand twist factors take
-ten times as long as sixty thousand stereo factors. Graphs with Python factors are therefore solved here, and factors of
-one form are linearised and evaluated at once if a stack of them is given. The damping is Levenberg's multiple of the
-identity in both cases: it is divided by ten after a step that lowered the error, and multiplied by ten after one that
-did not.
+The damping is Levenberg's multiple of the identity, as in GTSAM's optimizer: it is divided by ten after a step that
+lowered the error, and multiplied by ten after one that did not. GTSAM's optimizer itself would not do: it returns
+unchanged values without a message when an error is not a number, it is slow with Python factors (``mixed_graph``), and
+it moves landmarks in metres only.
 
 A step of GTSAM's turns a pose about itself and moves a landmark along a straight line, and the two separate where the
 step is long. A weakly determined direction, such as the drift of a long drive, is then damped as if it overshot, and a
@@ -14,10 +12,9 @@ the first step on that raises the error, landmarks are therefore moved in images
 (:class:`~filters.smoothing.landmark_steps.FirstImages`), with hardly any damping.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -43,9 +40,9 @@ class Stopping:
     """When to stop: at a small decrease of the error, absolute or relative to it, or after too many iterations.
 
     ``at_overshoot`` is for a solve that need not reach the minimum: it ends at the first step that raises the error
-    after one that lowered it, where steps are taken here, because damping that step until it lowers the error takes an
-    elimination for each attempt. A solve that has used up its iterations still counts as converged if the last one
-    gained no more than a share ``enough`` of the error.
+    after one that lowered it, because damping that step until it lowers the error takes an elimination for each
+    attempt. A solve that has used up its iterations still counts as converged if the last one gained no more than a
+    share ``enough`` of the error.
     """
 
     relative_decrease: float = 1e-5
@@ -68,6 +65,14 @@ class Solution(NamedTuple):
     overshot: bool = False
 
 
+class _Reached(NamedTuple):
+    """The values that a solve has reached, their error, and the damping of its next step."""
+
+    values: gtsam.Values
+    error: float
+    damping: float
+
+
 def solve(
     graph: gtsam.NonlinearFactorGraph | MixedGraph,
     start: gtsam.Values,
@@ -86,202 +91,72 @@ def solve(
     is not finite: some measurement or initial value is NaN.
     """
     mixed = graph if isinstance(graph, MixedGraph) else MixedGraph(graph)
-    error = mixed.error(start)
-    if not np.isfinite(error):
-        raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
-    advance = partial(progress.advance, total=stopping.max_iterations, stage=stage)
     if ordering is None:
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(mixed.whole)
-    in_metres = _GraphSolver(mixed, ordering, stopping.at_overshoot)
-    solver = _ImageSolver(in_metres, landmarks) if landmarks is not None else in_metres
-    return _solved(solver, start, error, stopping, advance)._replace(overshot=in_metres.overshot)
+    steps = _Steps(mixed, ordering, start.dims(), stopping.at_overshoot)
+    in_images = landmarks if landmarks is not None and landmarks.at_once else None
+    here = _Reached(start, mixed.error(start), _FIRST_DAMPING if in_images is None else _DAMPING_IN_IMAGES)
+    if not np.isfinite(here.error):
+        raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
+    overshot = False
+    for iteration in range(1, stopping.max_iterations + 1):
+        progress.advance(iteration - 1, total=stopping.max_iterations, stage=stage)
+        before, here = here, steps.next(here, in_images)
+        gained = before.error - here.error
+        if in_images is None and here.damping >= before.damping:
+            overshot = True
+            if landmarks is not None:
+                # That step's damping does not show how near the minimum is, so it never ends the solve.
+                in_images, here, gained = landmarks, here._replace(damping=_DAMPING_IN_IMAGES), np.inf
+        if gained <= max(stopping.relative_decrease * here.error, stopping.decrease):
+            return Solution(here.values, here.error, iteration, True, overshot)
+    enough = gained <= stopping.enough * here.error
+    return Solution(here.values, here.error, stopping.max_iterations, enough, overshot)
 
 
-class _SolveState(Protocol):
-    """The state of a solve: its error, and whether damping kept its last step short."""
-
-    @property
-    def error(self) -> float: ...
-    @property
-    def is_limited(self) -> bool: ...
-    def values(self) -> gtsam.Values: ...
-
-
-State = TypeVar("State", bound=_SolveState)
-
-
-class _Solver(Protocol[State]):
+class _Steps:
     """Takes the steps of one solve."""
 
-    def started(self, values: gtsam.Values, error: float) -> State:
-        """Return the initial state of the solve."""
-
-    def advanced(self, here: State) -> State:
-        """Return the state after the next step that lowers the error; the same state if none does."""
-
-
-def _solved(
-    solver: _Solver[State],
-    start: gtsam.Values,
-    error: float,
-    stopping: Stopping,
-    advance: Callable[[int], None],
-) -> Solution:
-    here, enough = solver.started(start, error), False
-    for iteration in range(1, stopping.max_iterations + 1):
-        advance(iteration - 1)
-        before, here = here.error, solver.advanced(here)
-        little = before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease)
-        if little and not here.is_limited:
-            return Solution(here.values(), here.error, iteration, converged=True)
-        enough = before - here.error <= stopping.enough * here.error and not here.is_limited
-    return Solution(here.values(), here.error, stopping.max_iterations, converged=enough)
-
-
-class _GtsamState(NamedTuple):
-    """The state of a solve by GTSAM's optimizer, which has the values and the damping, and its error."""
-
-    optimizer: gtsam.LevenbergMarquardtOptimizer
-    error: float
-    is_limited: bool = False
-
-    @property
-    def damping(self) -> float:
-        """Return the damping of the next step."""
-        return self.optimizer.lambda_()
-
-    def values(self) -> gtsam.Values:
-        """Return a copy of the values: GTSAM's own do not outlive the next iteration."""
-        return gtsam.Values(self.optimizer.values())
-
-
-class _DampedState(NamedTuple):
-    """The state of a solve: its values, its error, and the damping of its next step."""
-
-    reached: gtsam.Values
-    error: float
-    damping: float
-    is_limited: bool = False
-
-    def values(self) -> gtsam.Values:
-        """Return the values."""
-        return self.reached
-
-
-class _GraphSolver:
-    """Takes the steps of a solve of factors alone: by GTSAM's optimizer if none of them is a Python factor."""
-
-    def __init__(self, graph: MixedGraph, ordering: gtsam.Ordering, ends_at_overshoot: bool = False) -> None:
-        self._graph, self._ordering, self._ends_at_overshoot = graph, ordering, ends_at_overshoot
-        # Whether a step raised the error, and whether one lowered it.
-        self.overshot, self._lowered = False, False
+    def __init__(
+        self, graph: MixedGraph, ordering: gtsam.Ordering, sizes: Mapping[int, int], ends_at_overshoot: bool
+    ) -> None:
+        self._graph, self._ordering, self._sizes, self._ends = graph, ordering, sizes, ends_at_overshoot
+        self._has_lowered = False
         self._damping_factors: dict[float, gtsam.GaussianFactorGraph] = {}
 
-    def started(self, values: gtsam.Values, error: float) -> _GtsamState | _DampedState:
-        """Return the initial state of the solve."""
-        if self._graph.has_python:
-            return _DampedState(values, error, _FIRST_DAMPING)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph.native, values, self._params())
-        return _GtsamState(optimizer, error)
+    def next(self, here: _Reached, images: FirstImages | None) -> _Reached:
+        """Return the least damped step that lowers the error, with landmarks moved in images or, if None, in metres.
 
-    def _params(self) -> gtsam.LevenbergMarquardtParams:
-        params = gtsam.LevenbergMarquardtParams()
-        params.setOrdering(self._ordering)
-        # On one thread, elimination by variables takes three quarters of the time of elimination by cliques.
-        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-        params.setlambdaInitial(_FIRST_DAMPING)
-        params.setlambdaUpperBound(_MOST_DAMPING)
-        params.setlambdaFactor(_DAMPING_FACTOR)
-        return params
-
-    def advanced(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
-        """Return the state after the next step that lowers the error; the same state if none does."""
-        tried, there = here.damping, self._stepped_in_metres(here)
-        self.overshot |= there.damping >= tried
-        return there
-
-    def _stepped_in_metres(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
-        if isinstance(here, _DampedState):
-            return self.stepped(here, gtsam.Values.retract, 0.0)
-        here.optimizer.iterate()
-        return _GtsamState(here.optimizer, here.optimizer.error())
-
-    def stepped(
-        self,
-        here: _DampedState,
-        taken: Callable[[gtsam.Values, gtsam.VectorValues], gtsam.Values],
-        least_damping: float,
-    ) -> _DampedState:
-        """Return the state after the least damped step that lowers the error; ``taken`` applies a step to values.
-
-        If a step raises the error only negligibly the state is at a minimum: more damping would gain no more (GTSAM's
-        rule).
+        Returns the same if none does. If a step raises the error only negligibly the solve is at a minimum: more
+        damping would gain no more (GTSAM's rule).
         """
-        linear, damping = self._graph.linear(here.reached), here.damping
+        linear, damping = self._graph.linear(here.values), here.damping
         while damping < _MOST_DAMPING:
-            step = self._step(linear, here.reached, damping)
+            step = self._eliminated(linear, damping)
             if step is not None:
-                there = taken(here.reached, step)
+                there = here.values.retract(step) if images is None else images.taken(here.values, step)
                 error = self._graph.error(there)
                 if error <= here.error:
-                    self._lowered = True
-                    return _DampedState(there, error, max(damping / _DAMPING_FACTOR, least_damping))
-                if error - here.error < _NEGLIGIBLE_INCREASE * here.error or (
-                    self._ends_at_overshoot and self._lowered
-                ):
+                    self._has_lowered = True
+                    least = 0.0 if images is None else _DAMPING_IN_IMAGES
+                    return _Reached(there, error, max(damping / _DAMPING_FACTOR, least))
+                if error - here.error < _NEGLIGIBLE_INCREASE * here.error or (self._ends and self._has_lowered):
                     break
             damping *= _DAMPING_FACTOR
-        return here._replace(is_limited=False)
+        return here
 
-    def _step(
-        self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
-    ) -> gtsam.VectorValues | None:
-        """Return the damped step from some values; None if the linear system does not determine it."""
+    def _eliminated(self, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.VectorValues | None:
+        """Return the damped step; None if the linear system does not determine it."""
         if damping not in self._damping_factors:
-            self._damping_factors[damping] = _damping_factors(values.dims(), damping)
-        return _eliminated(_joined(linear, self._damping_factors[damping]), self._ordering)
-
-
-class _ImageSolver:
-    """Takes steps in metres until one raises the error, and from then on steps whose landmarks move in images.
-
-    The rejected step's damping does not show how near the minimum is, so that step never ends the solve.
-    """
-
-    def __init__(self, in_metres: _GraphSolver, images: FirstImages) -> None:
-        self._in_metres, self._images = in_metres, images
-
-    def started(self, values: gtsam.Values, error: float) -> _GtsamState | _DampedState:
-        """Return the initial state of the solve."""
-        if self._images.at_once:
-            return _DampedState(values, error, _DAMPING_IN_IMAGES)
-        return self._in_metres.started(values, error)
-
-    def advanced(self, here: _GtsamState | _DampedState) -> _GtsamState | _DampedState:
-        """Return the state after the next step that lowers the error; the same state if none does."""
-        if self._images.at_once or self._in_metres.overshot:
-            assert isinstance(here, _DampedState)
-            return self._in_metres.stepped(here, self._images.taken, _DAMPING_IN_IMAGES)
-        there = self._in_metres.advanced(here)
-        if self._in_metres.overshot:
-            return _DampedState(there.values(), there.error, _DAMPING_IN_IMAGES, is_limited=True)
-        return there
-
-
-def _joined(one: gtsam.GaussianFactorGraph, other: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-    both = gtsam.GaussianFactorGraph()
-    both.push_back(one)
-    both.push_back(other)
-    return both
-
-
-def _eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues | None:
-    """Return the solution of a linear system; None if it is indeterminate."""
-    try:
-        return linear.eliminateSequential(ordering).optimize()
-    except RuntimeError as refusal:
-        variable_named(refusal)
-        return None
+            self._damping_factors[damping] = _damping_factors(self._sizes, damping)
+        damped = gtsam.GaussianFactorGraph()
+        damped.push_back(linear)
+        damped.push_back(self._damping_factors[damping])
+        try:
+            return damped.eliminateSequential(self._ordering).optimize()
+        except RuntimeError as refusal:
+            variable_named(refusal)
+            return None
 
 
 def _damping_factors(sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:

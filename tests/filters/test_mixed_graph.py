@@ -1,4 +1,4 @@
-"""A graph with Python factors: a solver sees the same, in stacks or one by one, and calls none that is stacked."""
+"""A graph with Python factors: a solver sees the same, together or one by one, and calls none that is on arrays."""
 
 from dataclasses import replace
 
@@ -7,18 +7,23 @@ import numpy as np
 import pytest
 
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from filters.smoothing.mixed_graph import MixedGraph
+from filters.smoothing.mixed_graph import MixedGraph, TwistFactors
 from toolkit.estimate import Estimate
-from toolkit.geometry import Array
-from toolkit.models.factors import L, StereoFactors, X
+from toolkit.geometry import Array, se3_exp
+from toolkit.measurements import TwistMotion, TwistNoise
+from toolkit.models.factors import B, L, StereoFactors, X
 from toolkit.models.motion import motion_model
-from toolkit.models.stacked_factors import StackedFactors, stacked
+from toolkit.models.state import Increment
 from toolkit.models.stereo import triangulate_world
+from toolkit.models.twist import TwistIncrement, TwistModel, twist_factor
 from toolkit.simulation import DRIVE, simulate
 
+NOISE = TwistNoise(np.array([0.01, 0.02, 0.03]), np.array([0.1, 0.2, 0.3]), np.full(3, 1e-5))
+STATES = 7
 
-def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[StackedFactors]]:
-    """Return two seconds of a drive from disturbed truth, and the stacks."""
+
+def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, Increment]]:
+    """Return two seconds of a drive from disturbed truth, and the increments."""
     sequence = simulate(replace(DRIVE, duration_s=2.0), 2)
     model, rng = motion_model(sequence.noise, sequence.gravity_world), np.random.default_rng(5)
     graph, start = model.hold(model.initial_belief(sequence.prior), 0), gtsam.Values()
@@ -35,16 +40,15 @@ def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[StackedFacto
         for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
             if not start.exists(L(track_id)):
                 start.insert(L(track_id), point)
-    return graph, start, stacked(increments)
+    return graph, start, increments
 
 
 def test_errors_and_linearisations_are_the_graphs_own():
-    graph, start, stacks = drive()
+    graph, start, increments = drive()
     expected = graph.linearize(start)
     step = start.zeroVectors().scale(0.0)
-    for stacked_or_not in ((), stacks):
-        mixed = MixedGraph(graph, stacked_or_not)
-        assert mixed.has_python
+    for together in ({}, increments):
+        mixed = MixedGraph(graph, together)
         assert mixed.error(start) == pytest.approx(graph.error(start), rel=1e-10)
         linear = mixed.linear(start)
         assert linear.error(step) == pytest.approx(expected.error(step), rel=1e-10)
@@ -53,15 +57,8 @@ def test_errors_and_linearisations_are_the_graphs_own():
             np.testing.assert_allclose(found.at(key), own.at(key), atol=1e-8 * np.abs(own.at(X(0))).max())
 
 
-def test_a_solve_comes_to_the_same_place_with_stacks_and_without():
-    graph, start, stacks = drive()
-    single, together = (solve(it, start, Stopping(1e-10, 50)) for it in (graph, MixedGraph(graph, stacks)))
-    assert together.iterations == single.iterations
-    assert together.error == pytest.approx(single.error, rel=1e-10)
-
-
-def test_a_factor_that_is_stacked_is_never_called():
-    graph, start, stacks = drive()
+def test_a_factor_that_is_on_arrays_is_never_called():
+    graph, start, increments = drive()
     called: list[int] = []
 
     def counted(_this: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -70,15 +67,33 @@ def test_a_factor_that_is_stacked_is_never_called():
             jacobians[i] = np.zeros((6, (6, 6, 3)[i]))
         return np.zeros(6)
 
-    for keys in stacks[0].keys:
-        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), list(keys), counted))
-    solve(MixedGraph(graph, stacks), start, Stopping(1e-3, 2))
+    for k in increments:
+        keys = [X(k - 1), X(k), B(k - 1)]
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, counted))
+    solve(MixedGraph(graph, increments), start, Stopping(1e-3, 2))
     assert not called
-    solve(MixedGraph(graph, ()), start, Stopping(1e-3, 1))
+    solve(MixedGraph(graph), start, Stopping(1e-3, 1))
     assert called
 
 
-def test_without_python_factors_there_is_none():
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
-    assert not MixedGraph(graph).has_python
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-2, 0.7])
+def test_twists_together_have_the_errors_and_linearisations_of_their_factors(size):
+    """At states that are off what the steps predict by about a size (rad, m)."""
+    rng, model, steps = np.random.default_rng(3), TwistModel(NOISE), dict[int, TwistIncrement]()
+    values, pose = gtsam.Values(), se3_exp(rng.standard_normal(6))
+    for k in range(STATES):
+        if k:
+            motion = TwistMotion(np.array([0.04, 0.07]), 8.0 * rng.standard_normal((2, 3)), rng.standard_normal((2, 3)))
+            steps[k] = model.integrate(motion, 0.1 * rng.standard_normal(6))
+            pose = pose @ steps[k].step.T_start_end
+        values.insert(X(k), gtsam.Pose3(pose @ se3_exp(size * rng.standard_normal(6))))
+        values.insert(B(k), 0.1 * rng.standard_normal(3))
+    single = [twist_factor(increment.step, increment.gyro_bias, k) for k, increment in steps.items()]
+    together = TwistFactors.of(steps)
+    assert together.keys == [tuple(factor.keys()) for factor in single]
+    errors = 0.5 * np.square(together.residuals(values)).sum(axis=1)
+    # Twelve digits of squares that the smallest sigma makes a million times the residuals'.
+    np.testing.assert_allclose(errors, [factor.error(values) for factor in single], rtol=1e-9, atol=1e-16)
+    for found, factor in zip(together.linear(values), single, strict=True):
+        expected = factor.linearize(values).augmentedInformation()
+        np.testing.assert_allclose(found.augmentedInformation(), expected, atol=1e-9 * np.abs(expected).max())

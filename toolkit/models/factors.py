@@ -130,3 +130,9 @@ def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
     """
     cov = tree.jointMarginalCovariance(keys).fullMatrix()
     return np.asarray(0.5 * (cov + cov.T))
+
+
+def python_factors(factors: gtsam.NonlinearFactorGraph) -> dict[int, gtsam.CustomFactor]:
+    """Return the Python factors of a graph by their index in it."""
+    places = ((i, factors.at(i)) for i in range(factors.size()))
+    return {i: factor for i, factor in places if isinstance(factor, gtsam.CustomFactor)}
