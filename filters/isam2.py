@@ -22,10 +22,9 @@ import numpy as np
 
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
-from filters.smoothing.isam2_tree import Isam2Tree
+from filters.smoothing.isam2_tree import Isam2Tree, linearised_badly
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from filters.smoothing.linearisation_error import linearised_badly
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array

@@ -32,7 +32,7 @@ from filters.smoothing.indeterminate import (
     without_gaps,
 )
 from toolkit.errors import EstimatorError
-from toolkit.models.factors import L, kind_of
+from toolkit.models.factors import L, key_list, kind_of
 
 MOST_RECOVERIES = 20
 # How many landmarks with a marginal on them are eliminated in one clique: with fewer, copying from clique to clique
@@ -174,13 +174,13 @@ class FixedLagTree:
         new = set(values.keys())
         known = [key for key in (*self._landmark_stamps_ns, *self._state_stamps_ns) if key not in new]
         factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
-        self._add(factors, values, slots, _key_list(known))
+        self._add(factors, values, slots, key_list(known))
         # QR eliminates singular systems without an error; solving raises it here, before anything is marginalised.
         self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
         still_there = [key for key in leaving if self._isam.valueExists(key)]
         if still_there:
-            self._isam.marginalizeLeaves(_key_list(still_there))
+            self._isam.marginalizeLeaves(key_list(still_there))
         self._forget(leaving)
 
     def _add(
@@ -191,7 +191,7 @@ class FixedLagTree:
         eliminated_anew: gtsam.KeyList,
     ) -> None:
         """Add factors and values, and remove some factors."""
-        slots, fixed = list(dropped_slots), _key_list(self._fixed)
+        slots, fixed = list(dropped_slots), key_list(self._fixed)
         result = self._isam.update(factors, values, slots, self._order(), fixed, eliminated_anew)
         self._tie_slots = list(result.getNewFactorsIndices())[-len(self._newest) :]
 
@@ -298,10 +298,3 @@ def _without_ties(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorG
 
 def _oldest_beside_newest(stamps_ns: list[int]) -> list[int]:
     return [*stamps_ns[1:-1], *stamps_ns[:1], *stamps_ns[1:][-1:]]
-
-
-def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
-    listed = gtsam.KeyList()
-    for key in keys:
-        listed.push_back(key)
-    return listed

@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterable, Set
 
 import gtsam
 
+from toolkit.models.factors import key_list
+
 
 class FrozenVariables:
     """Tracks which variables no recent frame has factors on; their linearisation points stay fixed.
@@ -104,14 +106,6 @@ class RetiredVariables:
     def with_linearisation_points(self, of_tree: gtsam.Values) -> gtsam.Values:
         """Return the linearisation points of a tree's variables and of those that left it."""
         return _joined(of_tree, self._linearised_at)
-
-
-def key_list(keys: Iterable[int]) -> gtsam.KeyList:
-    """Return keys in the form that GTSAM's updates take."""
-    listed = gtsam.KeyList()
-    for key in keys:
-        listed.push_back(key)
-    return listed
 
 
 def _joined(first: gtsam.Values, second: gtsam.Values) -> gtsam.Values:

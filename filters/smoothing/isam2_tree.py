@@ -6,16 +6,25 @@ marginal of the newest state stands in the root. But a landmark eliminated first
 and each new sighting re-eliminates all states since then. A landmark that has long been in view is therefore eliminated
 last, beside the newest state, where a sighting of it changes the root alone. A dummy variable follows the newest state,
 for the condition number of the cliques (``indeterminate``).
+
+GTSAM's Python binding passes a CustomFactor a copy of *all* values at each call, which grows with the graph until it
+takes most of the time. Such a factor is therefore linearised at the values of its own keys, and the tree holds that
+linearisation, which follows its states to first order (LinearContainerFactor). When one of its states is relinearised,
+so is the factor, as iSAM2 does with every other factor (algorithm 5), with the same residual and the same noise.
+
+States are relinearised by thresholds, landmarks by their image. The effect of a metre on an image falls with the square
+of the depth: a threshold in metres that is small enough for near landmarks would relinearise far ones in every frame.
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import CachedLinearisation, with_linearisations
-from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables, key_list
+from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
@@ -25,10 +34,11 @@ from filters.smoothing.indeterminate import (
     weak_prior,
     without_gaps,
 )
-from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
 from toolkit.errors import EstimatorError
-from toolkit.geometry import Array
-from toolkit.models.factors import kind_of, python_factors
+from toolkit.geometry import Array, BoolArray, se3_inverse, transform
+from toolkit.measurements import StereoRig
+from toolkit.models import stereo
+from toolkit.models.factors import key_list, kind_of, python_factors
 from toolkit.models.state import MotionModel
 
 # The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings
@@ -43,6 +53,42 @@ RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
 # After rounding has made Cholesky factorisation fail, it is tried again this many frames with vision later.
 QR_FRAMES = 20
 MOST_RECOVERIES = 20
+# How far states may move from their linearisation points: rad; m/s, or the unit of a rate; m/s^2 and rad/s for a bias;
+# and multiples of the baseline, which is the length scale of stereo: the image of a point 20 baselines away is then
+# off by a tenth of a pixel. A change of velocity or accelerometer bias common to all states affects residuals only by
+# the rotation between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1 baselines and
+# 0.01 for the rest made a flight of two minutes five times less accurate.
+ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
+POSITION_THRESHOLD_BASELINES = 0.3
+# In sigmas of a sighting.
+LANDMARK_BEYOND_SIGMA = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class CachedLinearisation:
+    """A Python factor and the values (of its keys) at which it was last linearised."""
+
+    factor: gtsam.CustomFactor
+    linearised_at: gtsam.Values
+
+    @cached_property
+    def keys(self) -> tuple[int, ...]:
+        """Return the keys of the factor; GTSAM builds a new list at each call."""
+        return tuple(self.factor.keys())
+
+    def container(self) -> gtsam.LinearContainerFactor:
+        """Return the linearisation as a factor."""
+        return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
+
+
+def with_linearisations(
+    factors: gtsam.NonlinearFactorGraph, cached: dict[int, CachedLinearisation]
+) -> gtsam.NonlinearFactorGraph:
+    """Return a copy of the graph with factors replaced by their linearisations."""
+    graph = gtsam.NonlinearFactorGraph(factors)
+    for place, factor in cached.items():
+        graph.replace(place, factor.container())
+    return graph
 
 
 class Isam2Tree:
@@ -371,3 +417,33 @@ class Isam2Tree:
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)
         return gtsam.ISAM2(params)
+
+
+def state_thresholds(motion: MotionModel, baseline_m: float) -> dict[str, Array]:
+    """Return how far a state's variables may move from their linearisation points, (6,) or (3,) by kind.
+
+    In GTSAM's tangent spaces.
+    """
+    pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * baseline_m], 3)
+    at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
+    return {kind: at_most[kind][-size:] for kind, size in motion.variable_sizes.items()}
+
+
+def any_moved_beyond(at_most: Mapping[str, Array], steps: gtsam.VectorValues, keys: list[int]) -> bool:
+    """Say whether a state variable is beyond its threshold, given its step from the linearisation point."""
+    if not keys:
+        return False
+    return bool((np.abs(steps.vector(keys)) >= np.concatenate([at_most[kind_of(key)] for key in keys])).any())
+
+
+def linearised_badly(now: Array, linearised_at: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
+    """Say for which points (N, 3) m in the world the linearised image in a pose (4, 4) is off by too much.
+
+    With image h, depth z and a point moved by dp, ``h(p) + h'(p) dp - h(p + dp)`` is ``(h(p + dp) - h(p)) dz / z``.
+    """
+    T_imu_world = se3_inverse(T_world_imu)
+    before_px, before_m = stereo.images(transform(T_imu_world, linearised_at), rig)
+    now_px, now_m = stereo.images(transform(T_imu_world, now), rig)
+    off_px = (now_px - before_px) * ((now_m - before_m) / before_m)[:, None]
+    off_sigma = np.linalg.norm(off_px @ rig.whitener.T, axis=1)
+    return np.asarray((off_sigma > LANDMARK_BEYOND_SIGMA) | (before_m <= 0.0) | (now_m <= 0.0))

@@ -12,14 +12,16 @@ import pytest
 
 from filters import isam2
 from filters.isam2 import Isam2
-from filters.smoothing import isam2_tree, linearisation_error
-from filters.smoothing.cached_linearisation import (
+from filters.smoothing import isam2_tree
+from filters.smoothing.frozen_variables import FrozenVariables
+from filters.smoothing.isam2_tree import (
+    FROZEN_AFTER_FRAMES,
+    MOST_RECOVERIES,
+    QR_FRAMES,
     CachedLinearisation,
-    python_factors,
+    Isam2Tree,
     with_linearisations,
 )
-from filters.smoothing.frozen_variables import FrozenVariables
-from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, QR_FRAMES, Isam2Tree
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from toolkit.errors import EstimatorError
@@ -28,7 +30,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measurements import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
-from toolkit.models.factors import B, L, V, X, kind_of
+from toolkit.models.factors import B, L, V, X, kind_of, python_factors
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
@@ -246,8 +248,8 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     With thresholds that any motion passes: what is not frozen is linearised anew in every frame.
     """
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES"):
-        monkeypatch.setattr(linearisation_error, name, 1e-9)
-    monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", 0.0)
+        monkeypatch.setattr(isam2_tree, name, 1e-9)
+    monkeypatch.setattr(isam2_tree, "LANDMARK_BEYOND_SIGMA", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
     estimator, points = isam2_of(sequence), []
     for packet in sequence.packets():
@@ -282,7 +284,7 @@ def places_and_renewals(sequence: Sequence) -> Iterator[tuple[set[int], set[tupl
 
 def test_recent_states_are_linearised_anew_together_and_python_factors_with_them(monkeypatch):
     """One that moves alone would leave the others' factors with Jacobians of elsewhere; frozen ones stay."""
-    monkeypatch.setattr(linearisation_error, "POSITION_THRESHOLD_BASELINES", 0.015)
+    monkeypatch.setattr(isam2_tree, "POSITION_THRESHOLD_BASELINES", 0.015)
     events = 0
     for moved, kept, renewed in places_and_renewals(simulate(replace(DRIVE, duration_s=6.0), 0)):
         assert all(not moved.isdisjoint(keys) for keys in renewed)
@@ -298,9 +300,9 @@ def test_recent_states_are_linearised_anew_together_and_python_factors_with_them
 def nothing_linearised_anew(monkeypatch):
     """Then what leaves the tree is linearised as what stays, and answers may differ by rounding alone."""
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "VELOCITY_THRESHOLD"):
-        monkeypatch.setattr(linearisation_error, name, 1e9)
-    monkeypatch.setattr(linearisation_error, "BIAS_THRESHOLD", (1e9, 1e9))
-    monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", np.inf)
+        monkeypatch.setattr(isam2_tree, name, 1e9)
+    monkeypatch.setattr(isam2_tree, "BIAS_THRESHOLD", (1e9, 1e9))
+    monkeypatch.setattr(isam2_tree, "LANDMARK_BEYOND_SIGMA", np.inf)
 
 
 def stepped(sequence: Sequence, monkeypatch, retired_after: int) -> tuple[Isam2, list[Estimate]]:
@@ -398,19 +400,19 @@ def test_what_a_recovery_takes_back_leaves_again_with_the_next_frame(monkeypatch
 
 
 def test_one_state_beyond_the_threshold_of_its_kind_is_enough():
-    at_most, steps = linearisation_error.state_thresholds(MOTION, 0.1), gtsam.VectorValues()
+    at_most, steps = isam2_tree.state_thresholds(MOTION, 0.1), gtsam.VectorValues()
     for kind, key in zip("xvb", (X(3), V(3), B(3)), strict=True):
         assert at_most[kind].size == MOTION.variable_sizes[kind]
         steps.insert(key, 0.9 * at_most[kind])
     keys = [X(3), V(3), B(3)]
-    assert not linearisation_error.any_moved_beyond(at_most, steps, keys)
-    assert not linearisation_error.any_moved_beyond(at_most, steps, [])
+    assert not isam2_tree.any_moved_beyond(at_most, steps, keys)
+    assert not isam2_tree.any_moved_beyond(at_most, steps, [])
     for kind, key in zip("xvb", keys, strict=True):
         for row in range(at_most[kind].size):
             off = gtsam.VectorValues(steps)
             off.update(step_of(key, at_most[kind] * np.where(np.arange(at_most[kind].size) == row, -1.1, 0.9)))
-            assert linearisation_error.any_moved_beyond(at_most, off, keys)
-            assert not linearisation_error.any_moved_beyond(at_most, off, [other for other in keys if other != key])
+            assert isam2_tree.any_moved_beyond(at_most, off, keys)
+            assert not isam2_tree.any_moved_beyond(at_most, off, [other for other in keys if other != key])
 
 
 def step_of(key: int, step: np.ndarray) -> gtsam.VectorValues:
@@ -429,8 +431,8 @@ def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share
     linear, there = stereo.predict(before, pose, rig), stereo.predict(now, pose, rig)
     reported_px = linear.uv_px + (linear.d_uv_d_point @ (now - before)[..., None])[..., 0]
     off = np.linalg.norm((reported_px - there.uv_px) @ rig.whitener.T, axis=1)
-    badly = linearisation_error.linearised_badly(now, before, pose, rig)
-    np.testing.assert_array_equal(badly, off > linearisation_error.LANDMARK_BEYOND_SIGMA)
+    badly = isam2_tree.linearised_badly(now, before, pose, rig)
+    np.testing.assert_array_equal(badly, off > isam2_tree.LANDMARK_BEYOND_SIGMA)
     assert 20 < badly.sum() < 180
 
 

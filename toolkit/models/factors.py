@@ -36,6 +36,14 @@ def landmark_keys(track_ids: Iterable[int]) -> list[int]:
     return [_FIRST_LANDMARK + track_id for track_id in track_ids]
 
 
+def key_list(keys: Iterable[int]) -> gtsam.KeyList:
+    """Return keys in the form that updates of GTSAM's trees take."""
+    listed = gtsam.KeyList()
+    for key in keys:
+        listed.push_back(key)
+    return listed
+
+
 def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array]:
     """Return the points (3,) of landmarks, by track: rows of one array, read at once.
 
