@@ -10,8 +10,9 @@ A package of another distribution is found by the entry-point group ``toolkit.me
 """
 
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, Protocol, cast
+from types import ModuleType
 
 import numpy as np
 
@@ -45,70 +46,88 @@ ENTRY_POINT_GROUP = "toolkit.metrics"
 _ON_REQUEST = "computed on request"
 
 
-class MetricFile(Protocol):
-    """What a metric file defines."""
+@dataclass(frozen=True)
+class _MetricFile:
+    """What a metric file defines, and where it is."""
 
-    METRICS: tuple[Metric, ...]
-    ORDER: int
+    module: ModuleType
+    path: str
+    metrics: tuple[Metric, ...]
+    order: float
+    causal_only: str
+    group: str
+    on_request: str
 
-    def score(self, evaluation: Evaluation) -> Scores:
-        """Return a value, or None and the reason, for each key of METRICS.
+    @property
+    def keys(self) -> list[str]:
+        return [metric.key for metric in self.metrics]
 
-        Raises Unavailable where none of them can be computed.
-        """
+    @classmethod
+    def loaded(cls, found: FoundModule) -> "_MetricFile":
+        """Import a metric file; raises ExtensionError if it does not define what a metric file must."""
+        try:
+            file = found.load()
+        except ExtensionError as error:
+            raise ExtensionError(f"{found.path}: {error}") from error
+        metrics, order, score = (getattr(file, name, None) for name in ("METRICS", "ORDER", "score"))
+        records = isinstance(metrics, tuple) and all(isinstance(metric, Metric) for metric in metrics)
+        if not (records and isinstance(metrics, tuple) and isinstance(order, int | float) and callable(score)):
+            raise ExtensionError(
+                f"{found.path}: a metric file defines METRICS, a tuple of Metric records, ORDER, a number, and "
+                "score(evaluation)"
+            )
+        others = (str(getattr(file, name, "")) for name in ("CAUSAL_ONLY", "GROUP", "ON_REQUEST"))
+        return cls(file, str(found.path), metrics, order, *others)
 
-
-class _Found(NamedTuple):
-    """The metric files by their ORDER, and for others the reason why they cannot be used, by name."""
-
-    files: tuple[MetricFile, ...]
-    missing: dict[str, str]
+    def scored(self, evaluation: Evaluation, requested: Collection[str]) -> Scores:
+        """Score the file; where it cannot be computed at all, each of its keys gets the reason."""
+        try:
+            if self.on_request and self.on_request not in requested:
+                raise Unavailable(_how_to_request(self.on_request))
+            if evaluation.output != "causal" and self.causal_only:
+                raise Unavailable(self.causal_only)
+            scores = self.module.score(evaluation)
+        except Unavailable as lacking:
+            return Scores.none(self.keys, str(lacking))
+        if not isinstance(scores, Scores) or list(scores.values) != self.keys:
+            given = list(scores.values) if isinstance(scores, Scores) else type(scores).__name__
+            raise ExtensionError(f"{self.path}: score must return Scores of {self.keys}, and returned {given}")
+        return scores
 
 
 @cache
-def _found() -> _Found:
+def _found() -> tuple[tuple[_MetricFile, ...], dict[str, str]]:
     """Import every metric file of this package and of the announced ones.
 
-    Raises ExtensionError, naming the file, if one is no metric file or declares a key of another file.
+    Return them by their ORDER, and for others by name why they cannot be used. Raises ExtensionError, naming the file,
+    if one is no metric file or declares a key of another file.
     """
-    files: list[MetricFile] = []
+    files: list[_MetricFile] = []
     missing: dict[str, str] = {}
     for module in (*_own_modules(), *announced(ENTRY_POINT_GROUP)):
         try:
-            files.append(_loaded(module))
+            files.append(_MetricFile.loaded(module))
         except MissingDependency as dependency:
             missing[module.name] = str(dependency)
-    keys = [metric.key for file in files for metric in file.METRICS]
+    keys = [key for file in files for key in file.keys]
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
-        here = [str(getattr(one, "__file__", one)) for one in files if any(m.key in twice for m in one.METRICS)]
+        here = [file.path for file in files if set(twice) & set(file.keys)]
         raise ExtensionError(f"{' and '.join(here)}: both declare {', '.join(twice)}; rename it in one of them")
-    return _Found(tuple(sorted(files, key=lambda file: file.ORDER)), missing)
-
-
-def _loaded(found: FoundModule) -> MetricFile:
-    """Import a metric file; raises ExtensionError if it does not define what a metric file must."""
-    try:
-        file = found.load()
-    except ExtensionError as error:
-        raise ExtensionError(f"{found.path}: {error}") from error
-    metrics, order, score = (getattr(file, name, None) for name in ("METRICS", "ORDER", "score"))
-    records = isinstance(metrics, tuple) and all(isinstance(metric, Metric) for metric in metrics)
-    if not (records and isinstance(order, int | float) and callable(score)):
-        raise ExtensionError(
-            f"{found.path}: a metric file defines METRICS, a tuple of Metric records, ORDER, a number, and "
-            "score(evaluation)"
-        )
-    return cast(MetricFile, file)
+    return tuple(sorted(files, key=lambda file: file.order)), missing
 
 
 def _own_modules() -> list[FoundModule]:
     return sorted(modules_in(__name__, __path__), key=lambda module: module.module)
 
 
+def _files() -> tuple[_MetricFile, ...]:
+    return _found()[0]
+
+
 def known_metrics() -> tuple[Metric, ...]:
     """Return every metric there is, in the order of tables and files."""
-    return tuple(metric for file in _found().files for metric in file.METRICS)
+    return tuple(metric for file in _files() for metric in file.metrics)
 
 
 def describe() -> dict[str, str]:
@@ -118,13 +137,13 @@ def describe() -> dict[str, str]:
 
 def unavailable() -> dict[str, str]:
     """Return the metric files that cannot be imported here, by name, with the missing dependency."""
-    return dict(_found().missing)
+    return dict(_found()[1])
 
 
 def contract_keys() -> tuple[str, ...]:
     """Return the keys that every ``vislam.metrics/1`` document has, in its order."""
-    files = sorted((cast(MetricFile, module.load()) for module in _own_modules()), key=lambda file: file.ORDER)
-    return tuple(metric.key for file in files for metric in file.METRICS if metric.in_contract)
+    files = sorted(map(_MetricFile.loaded, _own_modules()), key=lambda file: file.order)
+    return tuple(metric.key for file in files for metric in file.metrics if metric.in_contract)
 
 
 def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
@@ -132,11 +151,10 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
 
     They come in the given order. Raises UnknownNameError for a name that no metric has, with the nearest one.
     """
-    files = _found().files
-    known = [metric for file in files for metric in file.METRICS]
-    by_name = {metric.column: (metric,) for metric in known} | {metric.name: (metric,) for metric in known}
-    by_name |= {metric.key: (metric,) for metric in known}
-    by_name |= {file.GROUP: file.METRICS for file in files if hasattr(file, "GROUP")}
+    known = known_metrics()
+    by_name: dict[str, tuple[Metric, ...]] = {metric.column: (metric,) for metric in known}
+    by_name |= {metric.name: (metric,) for metric in known} | {metric.key: (metric,) for metric in known}
+    by_name |= {file.group: file.metrics for file in _files() if file.group}
     chosen = tuple(names)
     for name in chosen:
         if name not in by_name:
@@ -151,8 +169,7 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
 def requests_of(names: Iterable[str]) -> tuple[str, ...]:
     """Return the settings ``metrics.<name>`` without which the metrics of some keys or names are not computed."""
     selected = set(metrics_called(names))
-    switches = (_on_request(file) for file in _found().files if selected.intersection(file.METRICS))
-    return tuple(sorted({switch for switch in switches if switch}))
+    return tuple(sorted({file.on_request for file in _files() if selected.intersection(file.metrics)} - {""}))
 
 
 def score_run(run: Run, output: Output, sequence: Sequence, requested: Collection[str] = ()) -> Scores:
@@ -163,57 +180,28 @@ def score_run(run: Run, output: Output, sequence: Sequence, requested: Collectio
     ExtensionError where a file scores other keys than it declares; an error inside a metric is a defect and passes
     through.
     """
-    evaluation = Evaluation(run, output, sequence)
-    values: dict[str, float | None] = {}
-    notes: dict[str, str] = {}
-    with np.errstate(all="ignore"):  # a diverged run may overflow; the value is then None with its reason, below
-        for file in _found().files:
-            scores = _score_file(file, evaluation, requested)
-            if not isinstance(scores, Scores) or list(scores.values) != _keys(file):
-                given = list(scores.values) if isinstance(scores, Scores) else type(scores).__name__
-                where = getattr(file, "__file__", file)
-                raise ExtensionError(f"{where}: score must return Scores of {_keys(file)}, and returned {given}")
-            values |= scores.values
-            notes |= scores.notes
-    return Scores(values, notes)
+    evaluation, scores = Evaluation(run, output, sequence), Scores({})
+    with np.errstate(all="ignore"):  # a diverged run may overflow; the value is then None with its reason
+        for file in _files():
+            scores |= file.scored(evaluation, requested)
+    return scores
 
 
 def repeated(causal: Scores) -> Scores:
     """Return the scores of a final output that equals the causal one: without metrics of causal outputs alone."""
     final = causal
-    for file in _found().files:
-        if reason := _causal_only(file):
-            final = final.without(_keys(file), reason)
+    for file in _files():
+        if file.causal_only:
+            final = final.without(file.keys, file.causal_only)
     return final
 
 
 def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
     """Return the scores without metrics on request, except the ``requested`` ones."""
-    for file in _found().files:
-        if (switch := _on_request(file)) and switch not in requested:
-            scores = scores.without(_keys(file), _how_to_request(switch))
+    for file in _files():
+        if file.on_request and file.on_request not in requested:
+            scores = scores.without(file.keys, _how_to_request(file.on_request))
     return scores
-
-
-def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[str]) -> Scores:
-    """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
-    try:
-        if (switch := _on_request(file)) and switch not in requested:
-            raise Unavailable(_how_to_request(switch))
-        if evaluation.output != "causal" and (reason := _causal_only(file)):
-            raise Unavailable(reason)
-        return file.score(evaluation)
-    except Unavailable as lacking:
-        return Scores.none(_keys(file), str(lacking))
-
-
-def _keys(file: MetricFile) -> list[str]:
-    return [metric.key for metric in file.METRICS]
-
-
-def _causal_only(file: MetricFile) -> str:
-    """Return why a file's metrics belong to the causal output alone; "" if they do not."""
-    return str(getattr(file, "CAUSAL_ONLY", ""))
 
 
 def is_on_request(reason: str) -> bool:
@@ -223,8 +211,3 @@ def is_on_request(reason: str) -> bool:
 
 def _how_to_request(switch: str) -> str:
     return f"{_ON_REQUEST}: --set metrics.{switch}=true"
-
-
-def _on_request(file: MetricFile) -> str:
-    """Return the switch without which a file's metrics are not computed; "" if they always are."""
-    return str(getattr(file, "ON_REQUEST", ""))

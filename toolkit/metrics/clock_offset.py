@@ -14,7 +14,7 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, skew
 from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics.parts.against_truth import AgainstTruth, fit_se3, lengths, rmse
+from toolkit.metrics.parts.against_truth import AgainstTruth, Matched, fit_se3, lengths, rmse
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 45
@@ -66,6 +66,15 @@ class _Fit(NamedTuple):
     after_m: float
 
 
+class _Rate(NamedTuple):
+    """The rate error of the estimate's clock, its standard error, and the RMS distances with it and without it (m)."""
+
+    value: float
+    error: float
+    after_m: float
+    before_m: float
+
+
 class _Linearised(NamedTuple):
     """Of n pairs the aligned positions less the true ones (n, 3) m, and their Jacobian (n, 3, 7).
 
@@ -93,104 +102,80 @@ def score(evaluation: AgainstTruth) -> Scores:
     return scores.remarked([OFFSET], remark)
 
 
-def _fit(evaluation: AgainstTruth) -> _Fit:
-    """Fit the offset by Gauss-Newton; raises Unavailable where it is not determined."""
-    pairs = evaluation.compared
+def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
+    """Return the times (n,) s of pairs, and which are no farther from their neighbours than the usual step allows.
+
+    Raises Unavailable where there are too few.
+    """
     t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
-    true, estimated = pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3]
-    usable = _beside_no_gap(t_s)
+    wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
+    usable = ~(np.append(wide, False) | np.insert(wide, 0, False))
     if usable.sum() < _FEWEST_PAIRS:
         raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
-    from scipy.interpolate import (
-        CubicSpline,
-    )  # slow to import, and most processes do not need it
+    return t_s, usable
 
-    path = CubicSpline(t_s, true)
-    offset_s = 0.0
+
+def _fit(evaluation: AgainstTruth) -> _Fit:
+    """Fit the offset by Gauss-Newton; raises Unavailable where it is not determined."""
+    from scipy.interpolate import CubicSpline  # slow to import, and most processes do not need it
+
+    true, estimated = evaluation.compared.positions
+    t_s, usable = _usable(evaluation.compared)
+    path, offset_s = CubicSpline(t_s, true), 0.0
     for _ in range(_ITERATIONS):
         # A pair that a step moved beyond the ends stays out, so that the fit does not oscillate with it.
         usable &= (t_s + offset_s >= t_s[0]) & (t_s + offset_s <= t_s[-1])
         if usable.sum() < _FEWEST_PAIRS:
             raise Unavailable("no offset within the recording makes the positions fit")
-        at = _linearised(path, t_s[usable] + offset_s, estimated[usable])
-        step_s = _offset_s(*at)
+        at, constant = _linearised(path, t_s[usable] + offset_s, estimated[usable]), np.ones((usable.sum(), 1))
+        step_s = float(_clock_step(*at, constant)[0])
         offset_s += step_s
         if abs(step_s) < _SETTLED_S:
             before_m = rmse(lengths(_linearised(path, t_s[usable], estimated[usable]).error_m))
-            return _Fit(offset_s, jackknife_error(_offset_s, *at), before_m, rmse(lengths(at.error_m)))
+            error_s = jackknife_error(lambda *some: float(_clock_step(*some)[0]), *at, constant)
+            return _Fit(offset_s, error_s, before_m, rmse(lengths(at.error_m)))
     raise Unavailable("the fit of the offset did not converge")
-
-
-class _Rate(NamedTuple):
-    """The rate error of the estimate's clock, its standard error, and the RMS distances with it and without it (m)."""
-
-    value: float
-    error: float
-    after_m: float
-    before_m: float
 
 
 def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:
     """Return the rate error of the estimate's clock; None if it is not determined, or an offset fits nearly as well."""
-    pairs = evaluation.compared
-    t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
-    usable = _beside_no_gap(t_s)
-    if usable.sum() < _FEWEST_PAIRS:
-        return None
-    true, estimated = pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3]
     try:
-        slower, since_s, at = _from_the_middle(t_s, true, estimated, usable)
+        slower, since_s, at = _from_the_middle(evaluation.compared)
     except Unavailable:
         return None
-    error = jackknife_error(lambda *parts: float(_clock(*parts)[1]), at.error_m, at.jacobian, since_s)
-    before_m, after_m = (
-        rmse(lengths(evaluation.se3_alignment.apply(pairs.estimate)[:, :3, 3] - true)),
-        rmse(lengths(at.error_m)),
-    )
+    error = jackknife_error(lambda *some: float(_clock_step(*some)[1]), *at, since_s)
+    true, estimated = evaluation.compared.truth, evaluation.compared.estimate
+    before_m = rmse(lengths(evaluation.se3_alignment.apply(estimated)[:, :3, 3] - true[:, :3, 3]))
+    after_m = rmse(lengths(at.error_m))
     best_m = before_m if fit is None else min(before_m, fit.after_m)
     if abs(slower) < max(_LEAST_RATE, _SIGMAS * error) or _TIMES_BETTER * after_m > best_m:
         return None
     return _Rate(1.0 / (1.0 + slower), error, after_m, before_m)
 
 
-def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArray) -> tuple[float, Array, _Linearised]:
-    """Return by how much slower the estimate's clock runs, the time since the middle (m,) s, and the errors of pairs.
+def _from_the_middle(pairs: Matched) -> tuple[float, Array, _Linearised]:
+    """Return by how much slower the estimate's clock runs, the factors (m, 2) of offset and rate, and errors of pairs.
 
-    Gauss-Newton for offset and rate, over more and more of the pairs (n,); raises Unavailable if it does not converge.
+    Gauss-Newton over more and more of the pairs; raises Unavailable if it does not converge.
     """
     from scipy.interpolate import CubicSpline  # as above
 
-    path, since_s = CubicSpline(t_s, true), t_s - 0.5 * t_s[-1]
+    true, estimated = pairs.positions
+    t_s, usable = _usable(pairs)
+    path, since_s = CubicSpline(t_s, true), np.column_stack([np.ones(len(t_s)), t_s - 0.5 * t_s[-1]])
     clock = np.zeros(2)
     for share in _SHARES:
         for _ in range(_ITERATIONS):
-            at_s = t_s + clock[0] + clock[1] * since_s
-            rows = usable & (np.abs(since_s) <= 0.5 * share * t_s[-1]) & (at_s >= t_s[0]) & (at_s <= t_s[-1])
+            at_s = t_s + clock[0] + clock[1] * since_s[:, 1]
+            rows = usable & (np.abs(since_s[:, 1]) <= 0.5 * share * t_s[-1]) & (at_s >= t_s[0]) & (at_s <= t_s[-1])
             if rows.sum() < _FEWEST_PAIRS or abs(clock[1]) > _MOST_RATE:
                 break
             at = _linearised(path, at_s[rows], estimated[rows])
-            step = _clock(at.error_m, at.jacobian, since_s[rows])
+            step = _clock_step(*at, since_s[rows])
             clock += step
             if share == 1.0 and abs(step[0]) < _SETTLED_S and abs(clock[0]) < _MOST_RATE * t_s[-1]:
                 return float(clock[1]), since_s[rows], at
     raise Unavailable("the fit of the rate did not converge")
-
-
-def _clock(error_m: Array, jacobian: Array, since_s: Array) -> Array:
-    """Return the steps (2,) of offset (s) and rate that best explain errors (n, 3), together with any alignment."""
-    velocity, aligning = jacobian[:, :, 0], jacobian[:, :, 1:].reshape(-1, 6)
-    moved = np.stack([velocity.ravel(), (since_s[:, None] * velocity).ravel()], axis=1)
-    left = moved - aligning @ np.linalg.lstsq(aligning, moved, rcond=None)[0]
-    squared = left.T @ left
-    if np.linalg.det(squared) <= _LEAST_LEFT**2 * np.prod(np.sum(moved**2, axis=0)):
-        raise Unavailable("the velocity hardly changes, so that a rate in time looks like a displacement")
-    return np.asarray(np.linalg.solve(squared, left.T @ error_m.ravel()))
-
-
-def _beside_no_gap(t_s: Array) -> BoolArray:
-    """Say which stamps (n,) s are no farther from their neighbours than the usual step allows."""
-    wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
-    return ~(np.append(wide, False) | np.insert(wide, 0, False))
 
 
 def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Linearised:
@@ -203,10 +188,15 @@ def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Li
     return _Linearised(aligned - true, np.concatenate([velocity[:, :, None], turned, moved], axis=2))
 
 
-def _offset_s(error_m: Array, jacobian: Array) -> float:
-    """Return the step of the offset that best explains errors (n, 3), together with any rotation and displacement."""
-    velocity, aligning = jacobian[:, :, 0].ravel(), jacobian[:, :, 1:].reshape(-1, 6)
-    left = velocity - aligning @ np.linalg.lstsq(aligning, velocity, rcond=None)[0]
-    if left @ left <= _LEAST_LEFT**2 * (velocity @ velocity):
+def _clock_step(error_m: Array, jacobian: Array, since_s: Array) -> Array:
+    """Return the step (c,) of the clock that best explains errors (n, 3), together with any rotation and displacement.
+
+    The clock's time is off by ``since_s`` (n, c) times its parameters: 1 for an offset, the time itself for a rate.
+    """
+    velocity, aligning = jacobian[:, :, 0], jacobian[:, :, 1:].reshape(-1, 6)
+    moved = (velocity[:, :, None] * since_s[:, None]).reshape(-1, since_s.shape[1])
+    left = moved - aligning @ np.linalg.lstsq(aligning, moved, rcond=None)[0]
+    squared = left.T @ left
+    if np.linalg.det(squared) <= _LEAST_LEFT**2 * np.prod(np.sum(moved**2, axis=0)):
         raise Unavailable("the velocity hardly changes, so that a shift in time looks like one in space")
-    return float(left @ error_m.ravel() / (left @ left))
+    return np.asarray(np.linalg.solve(squared, left.T @ error_m.ravel()))
