@@ -44,12 +44,7 @@ MOST_ANGLE_DEG = 60.0
 
 
 def disagreement(evidence: Evidence) -> Symptom | Undecided | None:
-    """Tracks that do not follow the measured motion after all repairs: the calibration or the samples are wrong.
-
-    This is the final check of the calibration. It reports what no other fault explains, and what a repair has left.
-
-    Compare the median one-step residual with what the noise explains, and the sizes of the motions.
-    """
+    """Report tracks that do not follow the measured motion after all repairs."""
     if evidence.intervals is None:
         return evidence.blind
     found = evidence.agreement
@@ -165,15 +160,11 @@ class Span(NamedTuple):
 
 
 def conflict(evidence: Evidence) -> Symptom | Undecided | None:
-    """Seconds during which vision and the measured motion disagree: many moving objects, or samples that are wrong.
+    """Report the times at which vision and samples differ for seconds, and by how much; nothing is repaired.
 
-    Most of the points in view may belong to traffic, wheels may slip, or an IMU may be shaken. As long as that lasts,
-    vision and the samples give different motions, and the data do not show which one is right. Nothing is repaired.
-
-    The deviation of the samples from the camera's own motion is averaged over stretches of time and compared with the
-    scatter of such means in the rest of the recording, which includes noise, slip and other usual errors.
-
-    Report the times at which samples and camera differ for seconds, and by how much.
+    Most of the points in view may belong to traffic, wheels may slip, or an IMU may be shaken. The deviation of the
+    samples from the camera's own motion is averaged over stretches of time and compared with the scatter of such
+    means in the rest of the recording.
     """
     if evidence.intervals is None:
         return evidence.blind
@@ -355,12 +346,10 @@ LEAST_STRETCHES_ASIDE = 2
 
 
 def scale_change(evidence: Evidence) -> Symptom | Undecided | None:
-    """Odometry or depths whose scale changes during the recording: a tyre loses air, a gear or a focus is changed.
+    """Report a step of odometry's scale: a tyre loses air, a gear or a focus is changed.
 
-    The ratio of the measured velocity to the camera's is computed in ten stretches of the recording. A step between two
-    stretches is reported where the scatter within the parts before and after does not explain it.
-
-    Find the step of the scale that is largest in its standard errors, and report it if it is beyond the limit.
+    The ratio of the measured velocity to the camera's is computed in ten stretches. A step between two of them is
+    reported where the scatter within the parts before and after does not explain it.
     """
     if evidence.intervals is None:
         return evidence.blind
@@ -430,13 +419,10 @@ LARGEST_HIDDEN_GRAVITY = 0.05
 
 
 def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
-    """An accelerometer that reads another gravity from some time on: its range or scale was changed, or it was knocked.
+    """Report an accelerometer that reads another gravity from some time on: another range, or a knock.
 
     The camera's velocity less the integrated specific force changes by gravity. The size of its slope over a few
-    seconds is the gravity that the accelerometer reads there, to a few thousandths with good tracks. The gyro's drift
-    changes only its direction, which is not used.
-
-    Compare the gravity that is read before and after three times.
+    seconds is the gravity that is read there; the gyro's drift changes only its direction, which is not used.
     """
     sequence = evidence.sequence
     if sequence.motion_kind != "imu":
@@ -525,13 +511,11 @@ LEAST_AROUND = 10
 
 
 def image_jump(evidence: Evidence) -> Symptom | Undecided | None:
-    """An image that is displaced from some time on: a knock of the camera, another crop, a stabiliser.
+    """Report the times at which the image is displaced for good: a knock of the camera, another crop.
 
-    For one interval the camera seems to rotate by an angle that the gyro did not measure. A slip of the tracks causes
-    the same, but does not last. With odometry the direction of the camera's velocity must change by the same angle from
-    then on. With an IMU, whose gyro has little noise, a single such interval is enough.
-
-    Report the times at which the camera's axes rotate and stay rotated.
+    For one interval the camera seems to rotate by an angle that the gyro did not measure. A slip of the tracks
+    causes the same, but does not last: with odometry the camera's velocity must be rotated by that angle from then
+    on.
     """
     if evidence.intervals is None:
         return evidence.blind

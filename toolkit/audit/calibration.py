@@ -186,12 +186,10 @@ MOST_STRETCHED = 1.5
 
 
 def intrinsics(evidence: Evidence) -> Symptom | None:
-    """Intrinsics that do not fit the pixels: a principal point outside the sightings, a focal length that no lens has.
+    """Report intrinsics that contradict the sightings: the principal point, a focal length that no lens has.
 
-    Suspects are found from the range of the sightings. They are reported only where ordinary values let the tracks
-    follow one rigid motion of the camera better. The motion samples are not used.
-
-    Report the intrinsics that contradict the sightings; the true ones are not in the data, so there is no repair.
+    Suspects are reported only where ordinary values let the tracks follow one rigid motion of the camera better.
+    The true values are not in the data, so there is no repair.
     """
     sequence = evidence.sequence
     uv_px = sequence.observations.uv_px
@@ -303,17 +301,12 @@ class _Reading(NamedTuple):
 
 
 def gyro_bias(evidence: Evidence) -> Symptom | Undecided | None:
-    """A constant bias of the gyro: reported and left to the estimators, unless the recording's prior excludes it.
+    """Report a constant bias of the gyro; it is left to the estimators, unless the recording's prior excludes it.
 
-    With odometry and a standstill, the bias is the median rate while the vehicle stands. With an IMU it is one of the
-    unknowns of the self-calibration, accurate to 0.002 rad/s. Otherwise the gyro is compared with the rotation that the
-    tracks show from frame to frame, which is accurate to 0.5 degrees a second only.
-
-    An estimator with a prior of 0 +- 0.0005 rad/s diverges at a bias of 0.05 rad/s, so the covariance of such a prior
-    is widened by the difference. With odometry and without a prior, estimators start from a bias of zero; a bias that
-    is too large for that is subtracted.
-
-    Count the axes with a significant bias; it is left to the estimators where they can start with it.
+    It is the median rate at a standstill of odometry, or an unknown of the self-calibration with an IMU (0.002
+    rad/s), or else the difference from the camera's rotation (0.5 degrees a second). An estimator whose prior
+    excludes the bias diverges, so the covariance of such a prior is widened. With odometry and without a prior,
+    estimators start from zero; a bias that is too large for that is subtracted.
     """
     reading = _standstill(evidence.sequence) or _fitted_bias(evidence) or _against_camera(evidence)
     if reading is None:
@@ -427,13 +420,11 @@ class _Bounds(NamedTuple):
 
 
 def gyro_scale(evidence: Evidence) -> Symptom | Undecided | None:
-    """An axis of the gyro whose rates are larger or smaller than the camera's: a channel with a wrong scale.
+    """Report the axes of the gyro whose rates are a multiple of the camera's: a channel with a wrong scale.
 
-    Noise of the camera's rates makes the slope of the gyro's rates on the camera's too small. Noise of the gyro's rates
-    makes the inverse of the slope of the camera's rates on the gyro's too large. The scale lies between the two
-    (Frisch, "Statistical confluence analysis", 1934). Where both are above 1, or both below, noise does not explain it.
-
-    Report the axes whose rates are a multiple of the camera's.
+    Noise of the camera's rates makes the slope of the gyro's rates on them too small, noise of the gyro makes the
+    inverse of the opposite slope too large (Frisch, "Statistical confluence analysis", 1934). Where both are above
+    1, or both below, noise does not explain it.
     """
     intervals = evidence.intervals
     if intervals is None:
@@ -564,15 +555,11 @@ LARGEST_RAD = 0.05
 
 
 def miscalibration(evidence: Evidence) -> Symptom | Undecided | None:
-    """Small errors of the calibration: the rotation of the camera, a focal length, the principal point, a sensor's
-    scale.
+    """Report small errors of the calibration that bend a trajectory: rotation, K, a sensor's scale.
 
-    They are too small to show in single frames and large enough to bend every trajectory. From frame to frame, a camera
-    rotated by an angle cannot be distinguished from a principal point that is off by the focal length times that angle.
-    Points followed over a second distinguish most of the errors (`parts.self_calibration`). With odometry, whose slip
-    lasts as long, the rotation estimated from frame to frame is judged as well.
-
-    Report the errors that the self-calibration, the direction of the motion, or ratios of rates and forces show.
+    From frame to frame, a rotated camera cannot be distinguished from a principal point that is off. Points
+    followed over a second distinguish most errors (`self_calibration`). With odometry, whose slip lasts as long,
+    the rotation from frame to frame is judged as well.
     """
     intervals = evidence.intervals
     if intervals is None:
@@ -719,13 +706,10 @@ SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD = 0.005, 0.003
 
 
 def steady_difference(evidence: Evidence) -> Symptom | None:
-    """A constant difference of vision and odometry beyond chance, and within what slip causes in sound recordings.
+    """Report a constant difference of vision and odometry beyond chance, within what slip causes.
 
-    Tyres, slip and pitch give odometry a scale and a direction of its own. Where these differ from vision's by as much
-    as in sound drives, the data do not show whether the calibration or the wheels are wrong. The difference is
-    significant all the same, and no estimator's covariance accounts for it.
-
-    Report differences of scale and direction that are beyond chance and below the limits of a fault.
+    The data do not show whether the calibration or the wheels are wrong. The difference is significant all the
+    same, and no estimator's covariance accounts for it.
     """
     found = evidence.velocity_fit
     if found is None:

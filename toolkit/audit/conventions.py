@@ -56,16 +56,12 @@ _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0
 
 
 def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
-    """An extrinsic whose direction and camera axes its file format leaves open.
+    """Take the one of four readings of an extrinsic, which its format leaves open, that the tracks follow.
 
-    The same 4 x 4 matrix can take coordinates from the IMU to the camera or from the camera to the IMU, and the
-    camera's axes can be x right, y down, z forward (optical) or x forward, y left, z up (regular). Points triangulated
-    in one frame, moved by the motion samples through each of the four readings and projected into the next frame, have
-    the smallest residuals under the right one. Medians over each interval are compared, which wrong matches hardly
-    affect. Two readings under which the camera looks in nearly the same direction, as an extrinsic in regular axes and
-    its inverse, differ in the position of the camera; the camera's own velocity in turns then decides between them.
-
-    Find which of the four readings of the extrinsic the tracks follow, and take it.
+    The matrix can be that of the IMU to the camera or its inverse, with camera axes x right, y down, z forward
+    (optical) or x forward, y left, z up (regular). Points moved by the motion samples through the right one have
+    the smallest residuals in the next frame. Two readings under which the camera looks the same way differ in its
+    position; its own velocity in turns then decides.
     """
     sequence = evidence.sequence
     if EXTRINSIC_UNCERTAIN not in sequence.provenance.facts:
@@ -174,20 +170,13 @@ class ExtrinsicConvention(NamedTuple):
 
 
 def mixed_axes(evidence: Evidence) -> Symptom | Undecided | None:
-    """Motion samples and extrinsic with different conventions of axes, or an extrinsic in the inverse direction.
+    """Find the extrinsic under which samples and camera agree, and take it where it is not the given one.
 
-    The camera's own motion, transformed by the extrinsic, must equal the measured motion. Three axes have 24
-    right-handed conventions. If the body's axes follow another one, the whole extrinsic is rotated; if the camera's do,
-    the camera is rotated at its position. All of these and the inverse of the extrinsic are compared. The one that
-    explains the samples best is taken if it is not the given one and is better beyond doubt. Turns of the vehicle
-    decide between two possible positions of the camera, or the finding says that they do not. Medians are subtracted,
-    so a gyro bias has no effect.
-
-    A convention is taken only if the rotations alone do not contradict it, among all 48 ways to exchange and negate
-    three channels. Where they do, channels of the samples are wrong and not the extrinsic, and nothing is repaired.
-    Velocities alone decide nothing, because cars slip sideways, which changes the signs of the small components.
-
-    Find the extrinsic under which samples and camera agree; take it where it is not the given one.
+    Three axes have 24 right-handed conventions. If the body's axes follow another one, the whole extrinsic is
+    rotated; if the camera's do, the camera is rotated at its position. All of these and the inverse are compared;
+    turns decide between two possible positions. A convention is taken only if the rotations alone do not contradict
+    it, among all 48 ways to exchange and negate three channels: otherwise channels of the samples are wrong, and
+    nothing is repaired. Velocities alone decide nothing, because slip changes the signs of small components.
     """
     if evidence.intervals is None:
         return evidence.blind
@@ -337,15 +326,11 @@ def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
 
 
 def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
-    """An extrinsic whose translation is that of its inverse.
+    """Compare the extrinsic's translation with that of its inverse; take the latter where it is far more likely.
 
-    A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like a
-    rigid transform, it puts the camera at p = -R_imu_cam t instead of t. Turns distinguish the two, because the
-    camera's velocity differs from the IMU's by w x p. The regression of `alignment` over the whole recording
-    estimates the position, with the scale and the rotation of the camera as further unknowns. Where it lies between p
-    and t decides.
-
-    Compare the translation as given with that of the inverse; replace it where the latter is far more likely.
+    A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like
+    a rigid transform, it puts the camera at p = -R_imu_cam t. Turns distinguish p and t, because the camera's
+    velocity differs from the IMU's by w x p.
     """
     if evidence.intervals is None:
         return evidence.blind
@@ -406,13 +391,11 @@ class _Changes(NamedTuple):
 
 
 def accelerometer_axes(evidence: Evidence) -> Symptom | None:
-    """An accelerometer whose channels are exchanged or have the wrong sign, while gyro and camera agree.
+    """Report the order and signs of the accelerometer's channels that fit the camera's motion, if not the given.
 
-    In the axes of one frame, by the gyro, the change of the camera's velocity less the specific force is gravity, which
-    is constant. All 48 ways to exchange and negate three channels are tried; the right one leaves the smallest
-    variation. A motion that turns about one axis only and hardly accelerates distinguishes few of them.
-
-    Report the order and the signs of the channels that fit the camera's motion, if they are not the given ones.
+    In the axes of one frame, by the gyro, the change of the camera's velocity less the specific force is gravity,
+    which is constant. Of all 48 ways to exchange and negate three channels the right one leaves the smallest
+    variation.
     """
     if evidence.intervals is None or evidence.sequence.motion_kind != "imu":
         return None

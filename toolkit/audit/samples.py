@@ -33,10 +33,7 @@ CHANNELS = {"twist": ("velocity", "rate of rotation"), "imu": ("accelerometer", 
 
 
 def not_finite(evidence: Evidence) -> Symptom | None:
-    """Sightings and motion samples that hold NaN or infinity; a column without a finite value is named.
-
-    Count the rows with a value that is not finite, and drop them; a missing right image is not a fault.
-    """
+    """Count the rows with a value that is not finite, and drop them; a missing right image is no fault."""
     sequence = evidence.sequence
     sightings: BoolArray = is_measured(sequence.observations.uv_px)
     samples: BoolArray = np.asarray(np.isfinite(sequence.motion.values).all(axis=1))
@@ -93,13 +90,11 @@ BEYOND_MEDIAN = 1e3
 
 
 def implausible(evidence: Evidence) -> Symptom | None:
-    """Single values that no sensor gives, by a flipped bit or a failed parse; one of them can ruin a whole run.
+    """Drop single values that no sensor gives, by a flipped bit or a failed parse.
 
-    A twist that differs from both neighbours by more than a vehicle's velocity can change is not a motion of the
-    vehicle, even if its value is possible. With an IMU, a single sample that differs from its neighbours, while those
-    do not differ from theirs, is not a motion either: a knock shows in several samples, or happens again.
-
-    Count sightings and motion samples beyond anything physical; drop them.
+    A twist that differs from both neighbours by more than a vehicle's velocity can change is not a motion. With an
+    IMU, a single sample that differs from its neighbours, while those do not differ from theirs, is not a motion
+    either: a knock shows in several samples, or happens again.
     """
     sequence = evidence.sequence
     sightings: BoolArray = np.asarray((np.abs(sequence.observations.uv_px) > MOST_PX).any(axis=1))
@@ -188,15 +183,12 @@ IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
 
 def stuck_samples(evidence: Evidence) -> Symptom | None:
-    """An accelerometer, a gyro or odometry that repeats one value: the driver hangs or the sensor is not connected.
+    """Count the samples that repeat the one before in a long run, and drop them: the driver hangs.
 
-    Real samples have noise: three axes are not equal many times in a row, nor is one axis for a second. Odometry can
-    repeat a value without a fault, zeros while the vehicle stands or whole counts of an encoder on a straight line. Its
-    repetitions are a fault where it moves and turns at once, or where its velocities or rates are zero throughout while
-    the camera moves. The number of equal samples in a row that is beyond chance follows from how often two neighbours
-    are equal in the rest of the recording.
-
-    Count the samples that repeat the one before in a long run; drop them.
+    Real samples have noise: three axes are not equal many times in a row, nor is one axis for a second. Odometry
+    repeats values without a fault (at standstill, whole counts on a straight line); its repetitions are a fault
+    where it moves and turns at once, beyond chance, or where its velocities or rates are zero throughout while the
+    camera moves.
     """
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or not sequence.motion.t_ns.size:
@@ -317,13 +309,7 @@ UNITS = ("m/s^2", "m/s^2", "m/s^2", "rad/s", "rad/s", "rad/s")
 
 
 def saturated_samples(evidence: Evidence) -> Symptom | None:
-    """An accelerometer or a gyro at the end of its range: larger values are cut off and lost.
-
-    Samples that are cut off accumulate at the largest value of an axis, while those of a sensor within its range become
-    fewer towards it. Nothing is repaired, because the true values are unknown.
-
-    Report the axes whose samples accumulate at an end of the range, with their number and value.
-    """
+    """Report the axes of an IMU whose samples accumulate at an end of the range, where values are cut off."""
     if evidence.sequence.motion_kind != "imu":
         return None
     values = evidence.sequence.motion.values
@@ -373,13 +359,11 @@ class _Coarse(NamedTuple):
 
 
 def coarse_samples(evidence: Evidence) -> Symptom | None:
-    """Motion samples that come in steps, because a converter has few bits or a log few digits.
+    """Report samples that come in steps, because a converter has few bits or a log few digits.
 
-    Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals", 1948).
-    While a vehicle moves uniformly they stay the same for seconds, so they are not white noise. Rounded values repeat,
-    and different ones are at least a step apart; without rounding, noise makes nearly all values different.
-
-    Report the steps of the samples where the rounding is more than MOST_ROUNDING of the stated noise.
+    Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals",
+    1948), which stay the same for seconds in uniform motion. Rounded values repeat, and different ones are at least
+    a step apart.
     """
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or sequence.motion.t_ns.size < LEAST_COARSE_SAMPLES:
@@ -437,14 +421,11 @@ _SENSORS = {"accel": (slice(0, 3), "m/s^2"), "gyro": (slice(3, 6), "rad/s")}
 
 
 def overstated_noise(evidence: Evidence) -> Symptom | None:
-    """An IMU whose stated noise is far more than its samples can have: estimators then hardly use the sensor.
+    """Report an IMU whose stated noise is far more than its samples can have.
 
-    White noise of density s gives samples, dt apart, a standard deviation of s / sqrt(dt), and a random walk of density
-    w changes them by w sqrt(T) within a time T. Motion adds to both. Samples that scatter or change by much less
-    contradict the stated noise. A stated noise that is too small shows in residuals and is not judged here. Source:
-    Woodman, "An introduction to inertial navigation" (2007), section 4.
-
-    Compare the scatter of an IMU's samples, and their change over time, with those of the stated noise.
+    White noise of density s gives samples, dt apart, a standard deviation of s / sqrt(dt), and a random walk of
+    density w changes them by w sqrt(T) within a time T. Motion adds to both. Source: Woodman, "An introduction to
+    inertial navigation" (2007), section 4.
     """
     motion, noise = evidence.sequence.motion, evidence.sequence.noise
     if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)):
@@ -502,14 +483,7 @@ _OTHER_WAY = [3, 4, 5, 0, 1, 2]
 
 
 def exchanged_samples(evidence: Evidence) -> Symptom | None:
-    """Velocities and rates of rotation in each other's columns; with an IMU, specific forces and rates.
-
-    In SI units the speed of a vehicle exceeds its rate of rotation by far, and specific force is gravity on average.
-    Where the sizes of the samples contradict the camera's motion and gravity by far, and agree once the columns are
-    exchanged, the columns were exchanged.
-
-    Exchange linear and angular columns where this alone makes both agree with camera and gravity.
-    """
+    """Exchange linear and angular columns where this alone makes both agree with camera and gravity."""
     sequence = evidence.sequence
     if evidence.intervals is None or not _sizes_are_off(evidence):
         return None
@@ -586,15 +560,12 @@ class _WrongUnit(NamedTuple):
 
 
 def units(evidence: Evidence) -> Symptom | Undecided | None:
-    """Times, lengths, speeds, rates of rotation and accelerations in other units than SI.
+    """Convert times, lengths, speeds, rates and accelerations that are not in SI, where the unit is certain.
 
-    Two sources of one motion have a ratio that does not depend on axes: of the speeds of samples and camera, of their
-    rates of rotation, of the speeds of truth and samples, of specific force and gravity. A ratio far from one that is a
-    unit's factor names the unit; other ratios are not judged here. A ratio that speeds and rates have in common is that
-    of the stamps, because the camera's motion is divided by time. The baseline and the extrinsic are judged by lengths
-    that no rig has.
-
-    Count the quantities in another unit; convert them where the unit is certain.
+    Two sources of one motion have a ratio that does not depend on axes: of the speeds of samples and camera, of
+    their rates of rotation, of the speeds of truth and samples, of specific force and gravity. A ratio that is a
+    unit's factor names the unit. One that speeds and rates have in common is that of the stamps, because the
+    camera's motion is divided by time. Baseline and extrinsic are judged by lengths that no rig has.
     """
     found: list[_WrongUnit] = []
     now = evidence

@@ -67,14 +67,11 @@ class _Step(NamedTuple):
 
 
 def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
-    """A clock that is set during the recording: stamps of frames and samples jump together, and the vehicle does not.
+    """Report the times at which the clock was set, and keep the longest stretch between them.
 
-    If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, it has
-    moved by one usual step. The distance that the camera moves in that interval, by the tracks and in units of the
-    intervals around it, decides between the two. A clock that goes back by more than a step shows in its stamps
-    (`time_order`).
-
-    Report the times at which the clock was set; keep the longest stretch between them.
+    If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, by
+    one usual step. The distance that the camera moves in that interval, in units of the intervals around it,
+    decides. A clock that goes back by more than a step shows in its stamps (`time_order`).
     """
     sequence = evidence.sequence
     steps = list(_steps_alike(sequence))
@@ -193,11 +190,10 @@ MOST_LATE = 0.5
 
 
 def time_order(evidence: Evidence) -> Symptom | None:
-    """Stamps of frames or motion samples that repeat, run backwards, jump back, or are no time.
+    """Count the stamps that are not after all stamps before them; sort them and keep the first of equal ones.
 
-    Count the stamps that are not after all stamps before them; sort them and keep the first of equal ones.
-
-    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is kept.
+    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is
+    kept.
     """
     sequence = evidence.sequence
     frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
@@ -317,10 +313,7 @@ LEAST_FRAMES = 2
 
 
 def outside_motion(evidence: Evidence) -> Symptom | None:
-    """Frames before the first or after the last motion sample.
-
-    Count the frames outside the time of the motion samples and cut them off.
-    """
+    """Count the frames before the first or after the last motion sample and cut them off."""
     sequence = evidence.sequence
     frames_t_ns, motion_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
     if motion_t_ns.size == 0:
@@ -353,13 +346,10 @@ MOTION_GAP_S = 1.5
 
 
 def time_gap(evidence: Evidence) -> Symptom | None:
-    """Gaps in time: in the motion samples, where the motion is not measured, and in the frames.
+    """Find gaps in the motion samples and keep the longest stretch between them; else in the frames.
 
-    A gap in the frames alone is reported as information, because the motion samples cover it. A long gap in the motion
-    samples is a fault: no measurement says how the vehicle moved, and no noise model covers interpolation over it. The
-    longest stretch without such a gap is kept. The relative pose of the other stretches was not measured.
-
-    Find gaps in the motion samples and keep the longest stretch between them; else find gaps in the frames.
+    No measurement says how the vehicle moved in a long gap, and no noise model covers interpolation over it. A gap
+    in the frames alone is information, because the motion samples cover it.
     """
     sequence = evidence.sequence
     holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
@@ -412,10 +402,7 @@ MOST_STEP_S, MOST_RATIO = 2.0, 20.0
 
 
 def sparse_motion(evidence: Evidence) -> Symptom | None:
-    """Motion samples that come more rarely than frames: the motion between two of them was not measured.
-
-    Compare the usual step of the samples with that of the frames; the limit is the ratio that makes a gap.
-    """
+    """Report motion samples that come more rarely than frames, by the ratio that makes a gap."""
     sequence = evidence.sequence
     if sequence.motion.t_ns.size < 2 or sequence.frame_count < 2 or not is_comparable(sequence):
         return None
@@ -448,15 +435,11 @@ LEAST_STRETCHES = 5
 
 
 def motion_gap(evidence: Evidence) -> Symptom | None:
-    """Short gaps in the motion samples: interpolated, with the noise that interpolation has in the rest of the
-    recording.
+    """Fill short gaps in the motion samples, with the noise that interpolation has elsewhere.
 
-    A gap shorter than `time_gap` reports is filled on straight lines between the samples at its ends. The recording
-    itself shows the error of that: stretches of the same length that were measured are interpolated in the same way,
-    and the noise in the gap is raised until it covers the integral of their error. The uncertainty of the state after a
-    gap is then right if the motion in it is like that of the rest.
-
-    Count the gaps between the first frame and the last; fill them and raise the noise there.
+    A gap shorter than `time_gap` reports is filled on straight lines. Stretches of the same length that were
+    measured are interpolated in the same way, and the noise in the gap is raised until it covers the integral of
+    their error.
     """
     sequence = evidence.sequence
     if not is_comparable(sequence):
@@ -563,13 +546,10 @@ BESIDE = (-2, -1, 1, 2)
 
 
 def uneven_stamps(evidence: Evidence) -> Symptom | None:
-    """Frames with uneven stamps of evenly taken images: transfer times, a busy computer, every other stamp late.
+    """Report frames with uneven stamps of evenly taken images: transfer times, a busy computer.
 
     The motion of a camera from one image to the next is proportional to the time between them. An interval that is
-    longer by its stamps must show more motion than the intervals around it. Where it shows as much as these, the stamps
-    are not the times of the images. Only the tracks are used.
-
-    Regress the variation of the camera's motion on that of the frames' steps.
+    longer by its stamps must show more motion than the intervals around it, by the tracks alone.
     """
     sequence, camera = evidence.sequence, evidence.camera_motion
     if evidence.spoilt_by or not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
@@ -632,15 +612,12 @@ LAG_SIGMAS = 5.0
 
 
 def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
-    """Twist samples that describe another interval than their pairing says.
+    """Estimate which interval a twist describes, and pair the samples by the nearest of start, mean and end.
 
-    With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is 0
-    where the sample at the start describes the interval, 1 where that at the end does, and 1/2 for their mean. Least
-    squares are biased towards 1/2 on noisy samples, because a mean of two has half the variance. The change of the
-    neighbouring camera rotations is therefore used as an instrument: it follows the change of the samples and is
-    independent of their noise.
-
-    Estimate the lag of the angular velocities; pair the samples by the nearest of start, mean and end.
+    With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
+    0 where the sample at the start describes the interval, 1 where that at the end does. Least squares are biased
+    towards 1/2 on noisy samples, because a mean of two has half the variance; the change of the neighbouring camera
+    rotations is an instrument that is independent of their noise.
     """
     sequence, intervals = evidence.sequence, evidence.intervals
     if not isinstance(sequence.motion, TwistSamples):
@@ -719,18 +696,11 @@ CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 
 
 def time_offset(evidence: Evidence) -> Symptom | Undecided | None:
-    """Frames stamped by another clock than the motion samples, or with a constant delay of the camera.
-
-    The camera's rotation over an interval, from its tracks alone, equals the mean of the gyro over that interval,
-    shifted by the offset (`parts.clocks`).
+    """Find the offset of the frames' stamps by rotations (`clocks`), and shift the frames by it.
 
     For twists stamped at the frames, `twist_lag` sets the pairing, and only an offset that no pairing explains is
-    reported here. For twists stamped between the frames, the frames are shifted to where the samples, as they are
-    paired, fit. Frames are not shifted by an offset that only half of the recording has, or that grows: that is a
-    change of the clock. They are not shifted either where the velocities of the twists then fit worse: the rates of
-    rotation alone are late.
-
-    Find the offset of the frames' stamps; shift the frames by it.
+    reported. Frames are not shifted by an offset that only half of the recording has, or that grows (a change of
+    the clock), nor where the velocities of the twists then fit worse: the rates of rotation alone are late.
     """
     sequence, intervals = evidence.sequence, evidence.intervals
     if intervals is None:
@@ -890,14 +860,11 @@ LARGEST_CHANGE_S = 0.1
 
 
 def clock_change(evidence: Evidence) -> Symptom | Undecided | None:
-    """Clocks of frames and motion samples that run at different rates, or one of which was set during the recording.
+    """Compare the offsets of camera and samples in both halves of the recording.
 
-    With clocks of one rate, the offset between camera and samples is the same in both halves of the recording, whatever
-    interval a sample describes. If it changes, no constant shift is right. With an IMU the change is an unknown of the
-    self-calibration, whose other unknowns both halves share. With odometry, and where no calibration is found, it is
-    the difference of the offsets that the rotations have in both halves.
-
-    Compare the offsets of both halves.
+    With clocks of one rate they are equal, whatever interval a sample describes; if they change, no constant shift
+    is right. With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by
+    rotations.
     """
     intervals = evidence.intervals
     if intervals is None:

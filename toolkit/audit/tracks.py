@@ -21,10 +21,7 @@ from toolkit.sequence import NO_FEATURES, ONE_ROW_FOR_BOTH, Observations, Sequen
 
 
 def no_sightings(evidence: Evidence) -> Symptom | None:
-    """A recording without any sighting that does not state that it was made without a camera.
-
-    Count the frames if none has a sighting, unless the recording states that it has none.
-    """
+    """Count the frames if none has a sighting, unless the recording states that it has no camera."""
     sequence = evidence.sequence
     if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
         return None
@@ -37,13 +34,9 @@ def no_sightings(evidence: Evidence) -> Symptom | None:
 
 
 def unknown_rows(evidence: Evidence) -> Undecided | None:
-    """Rows of the left and the right image that may differ, in a file that has one for both.
+    """Report that the rows of both images cannot be compared where the file has one row for both.
 
-    In a pair that is not rectified, the rows of the right image differ from those of the left one. Files with both rows
-    are refused at reading where these differ, and the front end matches images along rows only. In a file with a single
-    row for both there is nothing to compare, and the effect of wrong rows looks like a wrong principal point.
-
-    Report that the rows cannot be compared where the recording has one row for both images.
+    In a pair that is not rectified they differ, and the effect looks like a wrong principal point.
     """
     sequence = evidence.sequence
     if ONE_ROW_FOR_BOTH not in sequence.provenance.facts or is_left_only(sequence.observations.uv_px).all():
@@ -54,12 +47,10 @@ def unknown_rows(evidence: Evidence) -> Undecided | None:
 
 
 def returning_tracks(evidence: Evidence) -> Symptom | None:
-    """Track ids that are absent for some frames and then return.
+    """Count the track ids that are absent for some frames and return; each return starts a new track.
 
-    If the tracker recognised the point, an estimator that uses the id closes a loop without knowing it. If the tracker
-    used the id again for another point, an estimator takes two points for one.
-
-    Count the returns; each starts a new track.
+    If the tracker recognised the point, an estimator that uses the id closes a loop without knowing it; if it used
+    the id again for another point, an estimator takes two points for one.
     """
     observations = evidence.sequence.observations
     order = by_track(observations)
@@ -96,13 +87,11 @@ TURNING_PX, DRIVING_MPS = 2.0, 1.0
 
 
 def stale_frames(evidence: Evidence) -> Symptom | None:
-    """Frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves.
+    """Count the frames that repeat the pixels before them while the vehicle moves; repeated tracks end there.
 
-    From such a frame on, each track follows a different scene point: its steps before and after agree with the motion,
-    while the step into the stale frame is zero. A standing camera also repeats pixels, which is no fault. Therefore the
-    image must move just before and just after or, at the ends of a recording, the samples must show motion.
-
-    Count the stale frames; every repeated track ends there and a new one starts at the next frame.
+    From such a frame on, each track follows a different scene point. A standing camera also repeats pixels, which
+    is no fault: the image must move just before and just after or, at the ends of a recording, the samples must
+    show motion.
     """
     sequence = evidence.sequence
     pairs = neighbours(sequence.observations)
@@ -185,13 +174,10 @@ MOST_ROUNDING = 0.5
 
 
 def coarse_pixels(evidence: Evidence) -> Symptom | None:
-    """Sightings that were rounded to whole pixels, to a simple part of one, or to half-precision numbers.
+    """Report sightings rounded to whole pixels, a simple part of one, or to half-precision numbers.
 
     Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals",
-    1948). The depths of far points suffer most, because a disparity of a few pixels has few steps. Half-precision
-    numbers have steps of half a pixel above 512 px, and of a whole one above 1024 px.
-
-    Report the steps of the coordinates, and what they add to the stated noise.
+    1948). Half-precision numbers have steps of half a pixel above 512 px, and of a whole one above 1024 px.
     """
     rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
     seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
@@ -259,23 +245,13 @@ NAMES = ("uL", "uR", "v")
 
 
 def swapped_coordinates(evidence: Evidence) -> Symptom | None:
-    """Image coordinates in the wrong columns: left and right images exchanged, or rows and columns.
+    """Find coordinates in the wrong columns: left and right images exchanged, or rows and columns.
 
-    A point in front of a rectified pair is farther left in the right image, so in a sound recording nearly every
-    disparity uL - uR is positive. Where many are not, the five other orders of the three coordinates are tried; the
-    right order is the one under which the tracks follow the measured motion. Where rows and columns of both images are
-    exchanged, uL and uR hold the rows of the two images, which differ by noise alone. The depth is then lost, and there
-    is no repair.
-
-    Rows and columns may be exchanged in some of the tracks only. The camera's own motion, estimated from the other
-    tracks, predicts on which part of its epipolar line a point of unknown depth is seen next (Hartley & Zisserman,
-    "Multiple View Geometry in Computer Vision", section 9.2). A track with exchanged rows and columns follows this line
-    once they are exchanged back.
-
-    A right image that is missing may stand as one value in uR, while uL and v are sound. No two tracks have the same uR
-    to the last digit but by chance, or by rounding, and then many values are as frequent.
-
-    Find the order of the coordinates under which tracks and motion agree; exchange them where it is certain.
+    A point in front of a rectified pair is farther left in the right image, so nearly every disparity uL - uR is
+    positive. Where many are not, the five other orders of the coordinates are tried; the right one is that under
+    which the tracks follow the measured motion. Where rows and columns are exchanged, uL and uR hold rows, which
+    differ by noise alone: the depth is lost, and there is no repair. In some of the tracks only, the camera's own
+    motion by the others shows the exchange.
     """
     sequence = evidence.sequence
     if (partly := _filled_right(sequence) or _rows_in_some_tracks(evidence)) is not None:
@@ -506,13 +482,10 @@ LEAST_SEEN_AGAIN = 0.5
 
 
 def doubled_disparity(evidence: Evidence) -> Symptom | None:
-    """Tracks whose disparity doubles from their first sighting to their second, and stays doubled.
+    """Find tracks whose disparity doubles from the first sighting to the second, and halve it from there on.
 
-    A tracker that adds the disparity to an initial guess which already contains it doubles the disparity of every newly
-    detected track. Such points appear at half of their depth, so the camera seems to move at half of its speed. No
-    motion causes this: it would have to halve the depths of near and far points alike in one interval, and then stop.
-
-    Count the doubled tracks; halve the disparity of every sighting of theirs but the first.
+    A tracker that adds the disparity to an initial guess which already contains it does this to every new track. No
+    motion does: it would have to halve the depths of near and far points alike in one interval, and then stop.
     """
     observations = evidence.sequence.observations
     begun = _beginnings(observations)
@@ -601,10 +574,7 @@ def _halved(observations: Observations, tracks: IntArray) -> Observations:
 
 
 def no_disparity(evidence: Evidence) -> Symptom | None:
-    """Stereo sightings whose disparity is zero or negative: a point at infinity, or behind the camera.
-
-    Count the sightings with uL - uR <= 0 and drop them; their tracks continue.
-    """
+    """Count the sightings with uL - uR <= 0 and drop them; their tracks continue."""
     observations = evidence.sequence.observations
     bad = disparity_px(observations.uv_px) <= 0.0
     count = int(bad.sum())
@@ -619,10 +589,7 @@ def no_disparity(evidence: Evidence) -> Symptom | None:
 
 
 def left_only(evidence: Evidence) -> Symptom | None:
-    """Sightings by the left image alone: they are used as they are, and reported as information.
-
-    Count the sightings without the right image; warn where there are no others, so that no point has a depth.
-    """
+    """Count the sightings without the right image; warn where there are no others: no point has a depth."""
     uv_px = evidence.sequence.observations.uv_px
     count = int(is_left_only(uv_px).sum())
     if count == 0:
@@ -643,10 +610,7 @@ LEAST_THIN_S = 0.5
 
 
 def thin_vision(evidence: Evidence) -> Symptom | None:
-    """Times at which the tracks are too few to determine the camera's motion: darkness, a bare wall, a lost tracker.
-
-    Report the spans in which the camera's own motion is not determined.
-    """
+    """Report the times at which the tracks are too few to determine the camera's motion."""
     sequence = evidence.sequence
     if evidence.spoilt_by or not len(sequence.observations) or not is_comparable(sequence):
         return None
@@ -704,21 +668,14 @@ SAME_RATIO = (0.9, 1.1)
 
 
 def track_scatter(evidence: Evidence) -> Symptom | Undecided | None:
-    """Tracks whose scatter contradicts the stated noise of a sighting: mismatches, or a wrong stated noise.
+    """Compare the scatter of the tracks about the camera's own motion with the stated noise.
 
-    A point triangulated in one frame, moved by the camera's own best motion and projected into the next, has a residual
-    of covariance J R J^T + R there, where R is the covariance of a sighting. The motion samples are not used. If R is
-    right, the squared Mahalanobis distances have the upper quartile of the chi-square distribution with three degrees
-    of freedom, which a few gross errors do not change. Every estimator uses R.
-
-    Where R is assumed and a real tracker is more accurate, mismatches do not raise the upper quartile. They are found
-    by their number of gross residuals.
-
-    A scatter far below the stated noise contradicts it too, unless errors are correlated from frame to frame, because
-    an error that lasts along a track is not in its steps. If the errors are independent (``correlated_tracks``), the
-    conclusion is certain.
-
-    Compare the scatter of the tracks about the camera's own motion with the stated noise.
+    A point triangulated in one frame, moved by the camera's best motion and projected into the next, has a residual
+    of covariance J R J^T + R, where R is that of a sighting. If R is right, the squared Mahalanobis distances have
+    the upper quartile of the chi-square distribution with three degrees of freedom, which a few gross errors do not
+    change. Where R is assumed and too large, mismatches are found by their number. A scatter far below the stated
+    noise contradicts it too, with certainty only if errors are independent from frame to frame
+    (`correlated_tracks`).
     """
     if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return evidence.blind
@@ -820,14 +777,11 @@ def _far_share(chi2: Array) -> float:
 
 
 def correlated_tracks(evidence: Evidence) -> Symptom | None:
-    """Tracks with correlated errors: the tracked corner drifts, or a stereo match is wrong along the whole track.
+    """Report the correlation of neighbouring one-step residuals where errors are not independent.
 
-    Three sightings of a track give two one-step residuals about the camera's own motion. If the errors of sightings are
-    independent, the error of the second sighting is in both residuals with opposite signs, and their correlation is
-    -1/2. If the errors are a random walk, the residuals are independent and the correlation is 0. A wrong disparity
-    gives a wrong depth and residuals of the same sign.
-
-    Report the correlation of neighbouring one-step residuals where it is not that of independent errors.
+    If the errors of sightings are independent, the error of the second of three is in both residuals with opposite
+    signs, and their correlation is -1/2. If the errors are a random walk it is 0; a wrong depth gives residuals of
+    one sign.
     """
     if evidence.spoilt_by:
         return None

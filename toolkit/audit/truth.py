@@ -137,14 +137,10 @@ STANDARD_MPS2 = 9.81
 
 
 def gravity_direction(evidence: Evidence) -> Symptom | Undecided | None:
-    """Gravity in another direction of the truth's world than IMU and truth show, for example z down for z up.
+    """Compare the direction of gravity in the truth's world with that of the samples.
 
-    The mean of the specific force over a recording, rotated into the world by the truth, is the mean acceleration less
-    gravity. An estimator that starts at the truth with gravity upside down accelerates at twice its size. The truth is
-    used where its rates of rotation agree with the gyro's. Without a truth there is nothing to compare: the first frame
-    is levelled by the samples.
-
-    Compare the given direction of gravity with that of the samples.
+    The mean of the specific force, rotated into the world by the truth, is the mean acceleration less gravity. The
+    truth is used where its rates of rotation agree with the gyro's.
     """
     sequence, truth = evidence.sequence, evidence.sequence.truth
     if not isinstance(sequence.motion, ImuSamples) or truth is None or evidence.spoilt_by:
@@ -207,12 +203,10 @@ LARGEST_S = 0.05
 
 
 def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
-    """A truth stamped by a clock that runs faster or slower than the frames', so that the clocks differ more and more.
+    """Report a truth stamped by a clock that runs faster or slower than the frames'.
 
-    The rate is estimated from the rotations of camera and truth, like an offset (`truth_mismatch`). Positions are not
-    used: at constant speed a fast clock looks like a wrong scale of the truth.
-
-    Report the rate of the truth's clock relative to that of the frames.
+    The rate is estimated from the rotations of camera and truth. Positions are not used: at constant speed a fast
+    clock looks like a wrong scale of the truth.
     """
     if evidence.spoilt_by or evidence.sequence.truth is None:
         return None
@@ -269,14 +263,12 @@ _AXES = "write the truth in the axes it is read in: the world's, z upwards, and 
 
 
 def truth_mismatch(evidence: Evidence) -> Symptom | Undecided | None:
-    """A truth whose motion differs from the camera's: it is of another motion, or vision's scale is wrong.
+    """Compare the camera's own motion with the truth's, in direction and in size.
 
-    Displacements and rotations of the camera over windows of time, chained from frame to frame, are compared with those
-    of the truth. Vision's steps have another length where the baseline or the focal length is wrong, or the truth is in
-    another unit. They have another direction where the truth is of another recording, runs backwards or is in other
-    axes. If the rotations agree at shifted times, the truth's clock has an offset.
-
-    Compare the camera's own motion with the truth's, in direction and in size.
+    Displacements and rotations over windows are compared. Vision's steps have another length where the baseline or
+    the focal length is wrong, or the truth is in another unit, and another direction where the truth is of another
+    recording, runs backwards or is in other axes. If the rotations agree at shifted times, the truth's clock has an
+    offset.
     """
     truth = evidence.sequence.truth
     if truth is None or truth.t_ns.size < 2 or evidence.spoilt_by or not is_comparable(evidence.sequence):
