@@ -75,7 +75,7 @@ def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
     """
     sequence = evidence.sequence
     steps = list(_steps_alike(sequence))
-    jumps = [step for step in steps if step.is_jump]
+    jumps = [(step, step.gone) for step in steps if step.gone is not None and step.is_jump]
     if not jumps:
         open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
         summary = f"the stamps of frames and samples jump together by {', '.join(open_s)}"
@@ -83,17 +83,14 @@ def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
     usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     jumps_text = [
         f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
-        f"{usual_s * step.gone.value:.3f} +- {usual_s * step.gone.error:.3f} s passed)"
-        for step in jumps
-        if step.gone is not None
+        f"{usual_s * gone.value:.3f} +- {usual_s * gone.error:.3f} s passed)"
+        for step, gone in jumps
     ]
-    remedy = _longest_stretch(sequence, jumps)
-    return Symptom(
-        count=len(jumps),
-        detail=f"the clock of frames and samples is set {', '.join(jumps_text)}",
-        treatment=f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames",
-        remedy=remedy,
-    )
+    frames, samples = (np.array(rows) for rows in zip(*((step.frame, step.sample) for step, _ in jumps), strict=True))
+    parts = _part_of(sequence.frames_t_ns, frames), _part_of(sequence.motion.t_ns, samples)
+    remedy = _longest_part(sequence, *parts)
+    detail = f"the clock of frames and samples is set {', '.join(jumps_text)}"
+    return Symptom(len(jumps), detail, _kept(remedy, sequence), remedy)
 
 
 def _at_s(sequence: Sequence, step: _Step) -> float:
@@ -173,18 +170,9 @@ def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
     return Scalar(size[here] / expected, scatter / expected * float(np.sqrt(1.0 + 1.0 / beside.size)))
 
 
-def _longest_stretch(sequence: Sequence, jumps: list[_Step]) -> Sequence:
-    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
-    frame_part = np.searchsorted([jump.frame for jump in jumps], np.arange(sequence.frame_count), side="left")
-    sample_part = np.searchsorted([jump.sample for jump in jumps], np.arange(sequence.motion.t_ns.size), side="left")
-    part = int(np.argmax(np.bincount(frame_part)))
-    return keep_samples(keep_frames(sequence, np.flatnonzero(frame_part == part)), sample_part == part)
-
-
 # A forward step of so many usual ones means that earlier stamps were out of order; after a jump, all steps are smaller.
 # So many stamps must follow a jump, so that a single stamp out of order at the end is not taken for one.
 LEAP, FEWEST_AFTER = 1.9, 3
-
 # If more than this share of the stamps is late, the whole order is wrong, and sorting is no repair.
 MOST_LATE = 0.5
 
@@ -192,49 +180,31 @@ MOST_LATE = 0.5
 def time_order(evidence: Evidence) -> Symptom | None:
     """Count the stamps that are not after all stamps before them; sort them and keep the first of equal ones.
 
-    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is
-    kept.
+    After a clock jumped back, sorting would interleave two times, so only the longest stretch between jumps is kept.
     """
     sequence = evidence.sequence
-    frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
-    if frames + samples == 0:
+    streams = (sequence.frames_t_ns, sequence.motion.t_ns)
+    frames, samples = map(_late, streams)
+    count = frames + samples
+    if count == 0:
         return None
     detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
-    if max(map(_share_equal, _streams(sequence))) > MOST_LATE:
+    steps_ns = [np.diff(t_ns) for t_ns in streams if t_ns.size > 1]
+    if any((step_ns == 0).mean() > MOST_LATE for step_ns in steps_ns):
         why = "most are equal to the one before them, as stamps are that were rounded: write them with all their digits"
-        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
-    if max(map(_share_back, _streams(sequence))) > MOST_LATE:
+        return Symptom(count, detail, why, remedy=None)
+    runs_back = any((step_ns <= 0).mean() > MOST_LATE for step_ns in steps_ns)
+    jumps = [_jumps(t_ns) for t_ns in streams]
+    if any(rows.size for rows in jumps) and not runs_back:
+        longest_s = max(_jump_s(t_ns, row) for t_ns, rows in zip(streams, jumps, strict=True) for row in rows)
+        detail += f": the clock jumps back by {longest_s:.2f} s and goes on from there"
+        remedy = _sorted(_longest_part(sequence, *map(_part_of, streams, jumps)))
+        return Symptom(count, detail, _kept(remedy, sequence), remedy)
+    if runs_back or max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
         why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
-        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
-    jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
-    if jumps_s:
-        detail += f": the clock jumps back by {max(jumps_s):.2f} s and goes on from there"
-        remedy = _between_jumps(sequence)
-        treatment = f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames"
-        return Symptom(count=frames + samples, detail=detail, treatment=treatment, remedy=remedy)
-    if max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
-        why = "time runs backwards or stands still; sorting would play the recording backwards: correct the stamps"
-        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
-    return Symptom(
-        count=frames + samples,
-        detail=detail,
-        treatment="sorted by time; of equal stamps the first is kept; stamps that are no time are dropped",
-        remedy=_sorted(sequence),
-    )
-
-
-def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
-    return sequence.frames_t_ns, sequence.motion.t_ns
-
-
-def _share_back(t_ns: IntArray) -> float:
-    """Return the share of the steps that are negative or zero."""
-    return float(np.mean(np.diff(t_ns) <= 0)) if t_ns.size > 1 else 0.0
-
-
-def _share_equal(t_ns: IntArray) -> float:
-    """Return the share of the stamps that repeat the one before them."""
-    return float(np.mean(np.diff(t_ns) == 0)) if t_ns.size > 1 else 0.0
+        return Symptom(count, detail, why, remedy=None)
+    why = "sorted by time; of equal stamps the first is kept; stamps that are no time are dropped"
+    return Symptom(count, detail, why, _sorted(sequence))
 
 
 def _sorted(sequence: Sequence) -> Sequence:
@@ -259,11 +229,10 @@ def _jumps(t_ns: IntArray) -> IntArray:
     return np.array([row for row in backwards.tolist() if _goes_on(t_ns, row, usual_ns)], dtype=np.int64)
 
 
-def _jump_lengths_s(t_ns: IntArray) -> list[float]:
-    """Return the length (s) of each jump, from the expected next stamp back to the actual one."""
+def _jump_s(t_ns: IntArray, row: int) -> float:
+    """Return the length (s) of a jump after a row, from the expected next stamp back to the actual one."""
     step_ns = np.diff(t_ns)
-    due_ns = np.median(np.abs(step_ns)) if step_ns.size else 0.0
-    return [float(due_ns - step_ns[row]) / NS_PER_S for row in _jumps(t_ns).tolist()]
+    return float(np.median(np.abs(step_ns)) - step_ns[row]) / NS_PER_S
 
 
 def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
@@ -275,24 +244,26 @@ def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
     return bool(np.diff(t_ns[row + 1 : end + 1]).max(initial=0) < LEAP * usual_ns)
 
 
-def _between_jumps(sequence: Sequence) -> Sequence:
-    """Return the longest stretch, in frames, between two jumps, with its samples; of equal ones the first."""
-    frames_t_ns, samples_t_ns = _streams(sequence)
-    frame_part = _parts(frames_t_ns)
-    sample_part = _parts(samples_t_ns)
+def _part_of(t_ns: IntArray, jumps: IntArray) -> IntArray:
+    """Return for each stamp (N,) the number of jumps, each after a row, before it."""
+    return np.searchsorted(jumps, np.arange(t_ns.size), side="left")
+
+
+def _longest_part(sequence: Sequence, frame_part: IntArray, sample_part: IntArray) -> Sequence:
+    """Return the longest part, in frames, between two jumps, with its samples; of equal ones the first.
+
+    Where the samples have another number of jumps than the frames, their longest part is taken.
+    """
     part = int(np.argmax(np.bincount(frame_part)))
     kept = keep_frames(sequence, np.flatnonzero(frame_part == part))
-    if sample_part.max(initial=0):
-        of_part = part if sample_part.max() == frame_part.max() else int(np.argmax(np.bincount(sample_part)))
-        kept = keep_samples(kept, sample_part == of_part)
-    return _sorted(kept)
+    if not sample_part.max(initial=0):
+        return kept
+    of_part = part if sample_part.max() == frame_part.max() else int(np.argmax(np.bincount(sample_part)))
+    return keep_samples(kept, sample_part == of_part)
 
 
-def _parts(t_ns: IntArray) -> IntArray:
-    """Return for each stamp (N,) the number of jumps before it."""
-    part = np.zeros(t_ns.size, dtype=np.int64)
-    part[_jumps(t_ns) + 1] = 1
-    return np.cumsum(part)
+def _kept(part: Sequence, whole: Sequence) -> str:
+    return f"the longest stretch without a jump is kept: {part.frame_count} of {whole.frame_count} frames"
 
 
 def _late(t_ns: IntArray) -> int:
