@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.geometry import IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.report.comparison_text import audit_text
 from toolkit.sequence import Sequence
@@ -64,7 +64,91 @@ def mirrored(sequence: Sequence, dose: float, seed: int) -> Sequence:
     return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
 
 
+def with_values(change: Callable[[Array], Array]) -> Callable[..., Sequence]:
+    """Return what changes the values (S, 6) of the motion samples."""
+
+    def planted(sequence: Sequence, dose: float, seed: int) -> Sequence:
+        values = change(sequence.motion.values.copy())
+        return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
+
+    return planted
+
+
+def normalised(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    rig, seen = sequence.rig, sequence.observations
+    uv_px = (seen.uv_px - [rig.cx_px, rig.cx_px, rig.cy_px]) / rig.fx_px
+    return replace(sequence, observations=replace(seen, uv_px=uv_px))
+
+
+def one_camera(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Write the left image's columns for both."""
+    seen = sequence.observations
+    return replace(sequence, observations=replace(seen, uv_px=seen.uv_px[:, [0, 0, 2]]))
+
+
+def unlike_rows(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    return replace(sequence, rig=replace(sequence.rig, fy_px=dose * sequence.rig.fy_px))
+
+
+def frames_of_another_clock(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    return replace(sequence, frames_t_ns=(sequence.frames_t_ns * dose).astype(np.int64))
+
+
+def rounded_to_seconds(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    t_ns = np.asarray(np.round(sequence.frames_t_ns / 1e9) * 1e9, dtype=np.int64)
+    return replace(sequence, frames_t_ns=t_ns)
+
+
+def backwards(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Uneven steps make some of the stamps look like jumps of a clock that goes on."""
+    rng = np.random.default_rng(seed)
+    t_ns = sequence.frames_t_ns + rng.integers(0, 8_000_000, sequence.frame_count)
+    return replace(sequence, frames_t_ns=t_ns[::-1])
+
+
+def _halfway(values: Array) -> Array:
+    values[len(values) // 2 :, 3:] *= 180.0 / np.pi
+    return values
+
+
+ONLY_LINEAR, NAN_Y = np.repeat([1.0, 0.0], 3), np.array([0.0, np.nan, 0.0, 0.0, 0.0, 0.0])
+
 CASES = [
+    Case(
+        with_values(lambda v: v[:, [0, 1, 2, 3, 5, 4]]),
+        1.0,
+        "mixed-axes",
+        "blocks",
+        "extrinsic's x, z, y, so no",
+        TWIST,
+    ),
+    Case(
+        with_values(lambda v: v[:, [0, 1, 2, 5, 4, 3]]),
+        2.0,
+        "mixed-axes",
+        "blocks",
+        "extrinsic's z, y, x, so no",
+        TWIST,
+    ),
+    Case(with_values(lambda v: v[:, [1, 0, 2, 3, 4, 5]]), 3.0, "mixed-axes", "blocks", "the velocities do not", TWIST),
+    Case(with_values(_halfway), 4.0, "units", "blocks", "deg/s in a part of the recording", TWIST),
+    Case(
+        with_values(lambda v: v * (1.0 - 2.0 * ONLY_LINEAR)), 5.0, "disagreement", "blocks", "velocity points 1", TWIST
+    ),
+    Case(with_values(lambda v: 0.0 * v), 6.0, "stuck-samples", "blocks", "velocities are zero while the camera", TWIST),
+    Case(with_values(lambda v: v * ONLY_LINEAR), 7.0, "stuck-samples", "blocks", "rates of rotation are zero", TWIST),
+    Case(with_values(lambda v: v + NAN_Y), 8.0, "not-finite", "blocks", "y in all of them"),
+    Case(faults.linear_unit, 3.281, "units", "repaired", "it is in ft/s", TWIST),
+    Case(faults.linear_unit, 3.43, "disagreement", "blocks", "times the camera's", TWIST),  # between km/h and ft/s
+    Case(faults.linear_unit, 1.944, "disagreement", "blocks", "as if in knots", TWIST),
+    Case(faults.angular_unit, 30.0 / np.pi, "disagreement", "blocks", "as if in turns a minute", TWIST),
+    Case(normalised, 1.0, "intrinsics", "blocks", "normalised image coordinates"),
+    Case(one_camera, 1.0, "swapped-coordinates", "blocks", "one camera's columns stand for both"),
+    Case(unlike_rows, 0.1, "intrinsics", "blocks", "beside fx_px", IMU),
+    Case(unlike_rows, 2.0, "intrinsics", "blocks", "beside fx_px", IMU),
+    Case(frames_of_another_clock, 1e-3, "outside-motion", "blocks", "stamp both by one clock", TWIST),
+    Case(rounded_to_seconds, 1.0, "time-order", "blocks", "as stamps are that were rounded"),
+    Case(backwards, 1.0, "time-order", "blocks", "time runs backwards"),
     Case(faults.swapped_images, 1.0, "swapped-coordinates", "repaired", "left and right are exchanged"),
     Case(faults.swapped_images, 0.4, "swapped-coordinates", "repaired", "whole tracks"),
     Case(faults.swapped_coordinates, 0.1, "swapped-coordinates", "repaired", "only if u and v are exchanged"),
@@ -76,6 +160,7 @@ CASES = [
     Case(faults.zero_intrinsics, 0.0, "intrinsics", "blocks", "fx_px = 0 "),
     Case(faults.transposed_intrinsics, 0.0, "intrinsics", "blocks", "(cx_px, cy_px) = (0, 0)"),
     Case(half_as_large, 0.5, "intrinsics", "blocks", "looks like that of images of 0.5"),
+    Case(stamps_in, 10.0, "units", "blocks", "the stamps run", TWIST),
     Case(stamps_in, 1000.0, "units", "blocks", "they are not in seconds"),
     Case(stamps_in, 0.001, "units", "blocks", "they are not in seconds"),
     Case(samples_stamped_in, 1000.0, "sparse-motion", "blocks", "check both"),

@@ -15,6 +15,8 @@ from toolkit.datasets import load_sequence
 from toolkit.geometry import se3
 from toolkit.models.camera_motion import camera_motion
 from toolkit.motion_samples import TwistSamples
+from toolkit.sequence import Sequence
+from toolkit.simulation import faults
 
 DATA = Path(os.environ.get("VISLAM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 
@@ -23,12 +25,16 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real recordings a
 KITTI_UTIAS = sorted(path.name for path in (DATA / "utias").glob("*_KLT.mat"))
 
 
-@cache
-def audited(name: str) -> Audit:
+def recording(name: str) -> Path:
     path = DATA / name
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    return audit(load_sequence(str(path)))
+    return path
+
+
+@cache
+def audited(name: str) -> Audit:
+    return audit(load_sequence(str(recording(name))))
 
 
 def counts(outcome: Audit) -> dict[str, int]:
@@ -70,14 +76,10 @@ def test_the_utias_drives_have_sound_calibrations_and_fresh_frames(name: str) ->
 
 
 @pytest.mark.parametrize("name", KITTI_UTIAS)
-def test_the_first_tracks_of_the_utias_drives_have_twice_their_disparity_but_in_one(name: str) -> None:
+def test_with_their_doubled_disparities_halved_the_camera_moves_as_fast_as_the_twists_say(name: str) -> None:
+    """The first ten intervals, where the repaired tracks are most or all there are; unrepaired it is half as fast."""
     found = counts(audited(f"utias/{name}")).get("doubled-disparity", 0)
     assert found == 0 if "26_drive_0009" in name else 24 <= found <= 89
-
-
-@pytest.mark.parametrize("name", KITTI_UTIAS)
-def test_with_the_disparities_halved_the_camera_moves_as_fast_as_the_twists_say(name: str) -> None:
-    """The first ten intervals, where the repaired tracks are most or all there are; unrepaired it is half as fast."""
     sequence = audited(f"utias/{name}").sequence
     camera = camera_motion(sequence)
     speeds = np.linalg.norm(camera.v_mps[:10][camera.known[:10]], axis=1)
@@ -103,7 +105,7 @@ def test_the_camera_moves_to_where_kitti_mounts_it(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ucsd/03.npz", "ucsd/0022.npz", "ucsd/0027.npz"])
-@pytest.mark.parametrize("first", [0, 250, 500])
+@pytest.mark.parametrize("first", [0, 500])
 def test_no_25_s_of_a_drive_put_a_camera_elsewhere_that_is_where_it_should_be(name: str, first: int) -> None:
     """Turns that are few or wide leave it open; to the wrong place it goes from neither, nor from the inverse's."""
     whole = audited(name).sequence
@@ -141,3 +143,65 @@ def test_a_recording_of_a_thousand_frames_is_audited_in_a_second() -> None:
     start_s = time.process_time()
     audit(sequence)
     assert time.process_time() - start_s < 40.0 * yardstick_s
+
+
+GORE = "openvins_sim/udel_gore_rect_s0"
+
+
+def part(name: str, begin: int, end: int) -> Sequence:
+    """Return the frames of a recording from one to another, with the samples around them."""
+    frames = keep_frames(load_sequence(str(recording(name))), np.arange(begin, end))
+    around_ns = np.array([-200_000_000, 200_000_000]) + frames.frames_t_ns[[0, -1]]
+    t_ns = frames.motion.t_ns
+    return keep_samples(frames, (t_ns >= around_ns[0]) & (t_ns <= around_ns[1]))
+
+
+def warnings_of(outcome: Audit) -> dict[str, str]:
+    return {finding.fault: finding.detail for finding in outcome.findings if finding.warning or finding.blocking}
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "end"),
+    [
+        (GORE, 900, 1200),  # shaken: its scale was 8 % off where force was taken for constant between frames
+        (GORE, 240, 360),  # the same, for a conflict of 0.5 m/s^2
+        ("utias/2011_09_26_drive_0009_sync_KLT.mat", 387, 435),  # comes to a stand
+        ("utias/2011_09_26_drive_0035_sync_KLT.mat", 32, 65),  # 3 s of slip
+        ("utias/2011_09_26_drive_0005_sync_KLT.mat", 115, 153),
+    ],
+)
+def test_a_part_of_a_sound_recording_warns_of_nothing(name: str, begin: int, end: int) -> None:
+    assert warnings_of(audit(part(name, begin, end))) == {}
+
+
+def test_the_indoor_recording_whose_gyro_is_late_keeps_its_stamps() -> None:
+    """Its truth's rotations are the gyro's of 0.15 s later, and its velocities are not: ekf was a seventh worse off."""
+    indoors = part("utias/dataset3.mat", 633, 1266)
+    found = audit(indoors)
+    assert "the gyro alone is shifted" in warnings_of(found)["time-offset"]
+    np.testing.assert_array_equal(found.sequence.frames_t_ns, indoors.frames_t_ns)
+
+
+def test_a_disparity_that_is_off_is_reported_on_a_shaken_imu() -> None:
+    reported = warnings_of(audit(faults.stretched_disparity(part(GORE, 900, 1200), 1.1)))
+    assert "% shorter than the IMU's" in reported["vision-scale"]
+
+
+@pytest.mark.parametrize(
+    ("plant", "dose", "expected"),
+    [
+        (faults.shifted_right, -1.0, "the right image's columns are -0.98"),
+        (faults.rolled_right, 0.01, "rolled about its optical axis by +0.0099"),
+    ],
+)
+def test_a_right_image_whose_windows_want_different_calibrations_is_reported(
+    plant: faults.Fault, dose: float, expected: str
+) -> None:
+    """Windows part by what the image bends: with that scatter for an error the shift hid behind a baseline."""
+    assert expected in warnings_of(audit(plant(part(GORE, 0, 250), dose, 0)))["miscalibration"]
+
+
+def test_twists_whose_axes_are_turned_at_first_are_reported_of_that_part() -> None:
+    """The first 8 s of 03: velocities and rates of rotation alike are turned by 0.07 rad, and not from 15 s on."""
+    reported = warnings_of(audit(part("ucsd/03.npz", 0, 80)))
+    assert "as if it were turned by 0.07" in reported["miscalibration"]

@@ -1,0 +1,166 @@
+"""Where vision and the measured motion part, from some time on or throughout: told there and of that size, only."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Audit, audit
+from toolkit.audit.agreement import Deviation, accelerometer_change, sustained
+from toolkit.audit.calibration import steady_difference
+from toolkit.audit.fault import Evidence, Symptom
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+LENGTH_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+
+
+@cache
+def recording(scenario: str, seed: int = 1, duration_s: float | None = None, varied: bool = False) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s or LENGTH_S[scenario], varied=varied), seed)
+
+
+def details(outcome: Audit) -> dict[str, str]:
+    return {finding.fault: finding.detail for finding in outcome.findings}
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_a_sound_recording_warns_of_nothing(scenario: str, seed: int) -> None:
+    findings = audit(recording(scenario, seed, 8.0)).findings
+    assert not any(finding.warning or finding.blocking for finding in findings)
+    assert [finding.fault for finding in findings] == ["correlated-tracks"] * ("realistic" in scenario)
+
+
+def test_a_conflict_is_reported_at_its_time_and_of_its_size() -> None:
+    sound = recording("drive", 3)
+    disturbed = faults.disturbed_motion(sound, 3.0, 3)
+    off = np.flatnonzero(np.any(disturbed.motion.values != sound.motion.values, axis=1))
+    begin_s, end_s = (disturbed.motion.t_ns[off[[0, -1]]] - sound.frames_t_ns[0]) / 1e9
+    (found,) = (finding for finding in audit(disturbed).findings if finding.fault == "conflict")
+    match = re.search(r"at (\d+)-(\d+) s \(by ([\d.]+) m/s", found.detail)
+    assert match is not None
+    # Whole seconds, and a quarter of the stretch of 2 s at either end.
+    assert [float(match[1]), float(match[2])] == pytest.approx([begin_s, end_s], abs=1.0)
+    assert float(match[3]) == pytest.approx(3.0, abs=0.15)
+    assert found.warning and not found.blocking and not found.repaired
+
+
+def test_what_scatters_all_along_is_no_conflict_and_what_stands_out_or_stays_is() -> None:
+    rng, t_s, noise = np.random.default_rng(0), 0.1 * np.arange(600), np.full(3, 0.06)
+    white = rng.normal(0.0, 0.05, (600, 3))
+    wander = white + np.repeat(rng.normal(0.0, 0.5, (30, 3)), 20, axis=0)  # lasts 2 s each, as slip does
+
+    def spans(value: np.ndarray, begin: int, end: int, by: float) -> list[tuple[float, float]]:
+        step = by * ((np.arange(600) >= begin) & (np.arange(600) < end))[:, None] * [1.0, 0.0, 0.0]
+        found = sustained(Deviation("velocity", "m/s", t_s, value + step, noise, False), 10.0, 0.2)
+        return [(span.begin_s, span.end_s) for span in found]
+
+    assert spans(wander, 0, 0, 0.0) == []
+    assert spans(wander, 300, 350, 9.0)[0] == pytest.approx((30.0, 35.0), abs=1.0)
+    assert spans(white, 300, 600, 1.0)[0][0] == pytest.approx(30.0, abs=1.0)
+
+
+@pytest.mark.parametrize("every", [4, 5])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_frames_without_a_sighting_now_and_then_leave_too_little_to_compare_and_no_warning_of_numpy(every: int) -> None:
+    """No stretch of intervals is long enough for the specific force between its holes."""
+    sequence = recording("drive-imu", 0, 8.0)
+    seen = sequence.observations.frame % every != 0
+    assert "conflict" not in details(audit(replace(sequence, observations=sequence.observations.select(seen))))
+
+
+def test_odometry_that_is_faster_from_the_middle_on_is_reported_with_its_error() -> None:
+    reported = details(audit(faults.changed_speed(recording("drive"), 1.08)))["scale-change"]
+    found = re.search(r"from about (\d+) s on .* is ([\d.]+) \+- ([\d.]+) % higher", reported)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(6.0, abs=1.2)  # a tenth of the recording
+    assert float(found[2]) == pytest.approx(8.0, abs=3.0 * float(found[3]))
+    assert "scale-change" not in details(audit(faults.changed_speed(recording("drive"), 1.04)))  # sound drives have it
+
+
+def test_a_scale_that_wanders_hides_a_step_and_the_audit_says_how_large_a_one() -> None:
+    clean = recording("drive")
+    t_s = (clean.motion.t_ns - clean.motion.t_ns[0]) / 1e9
+    wanders = 1.0 + 0.04 * np.sin(2.0 * np.pi * t_s / 7.0)[:, None] * (np.arange(6) < 3)
+    reported = audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, wanders * clean.motion.values)))
+    found = re.search(r"a step by less than (\d+) % would not show", reported.undecided["scale-change"])
+    assert found is not None and 8 <= int(found[1]) <= 20
+    assert "scale-change" not in audit(clean).undecided
+
+
+@pytest.mark.parametrize("scenario", LENGTH_S)
+def test_an_image_that_jumps_and_stays_is_reported_at_its_time(scenario: str) -> None:
+    faulty = faults.jumped_image(recording(scenario), 15.0)
+    found = re.search(r"at ([\d.]+) s \(by ([\d.]+) rad\)", details(audit(faulty))["image-jump"])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(LENGTH_S[scenario] / 2.0, abs=0.2)
+    # A shift is a rotation in the middle of the image only, and close points take some of it for a translation.
+    assert float(found[2]) == pytest.approx(np.sqrt(2.0) * 15.0 / faulty.rig.fx_px, rel=0.35)
+
+
+def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
+    clean = recording("drive")
+    values = clean.motion.values.copy()
+    values[60, 5] += 0.4
+    assert "image-jump" not in details(audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))))
+
+
+@pytest.mark.parametrize("dose", [0.97, 1.06])
+@pytest.mark.parametrize(("scenario", "duration_s"), [("drive-imu", 12.0), ("flight", 8.0), ("flight-realistic", 8.0)])
+def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
+    scenario: str, duration_s: float, dose: float
+) -> None:
+    sound = recording(scenario, 1, duration_s, varied=True)
+    assert not isinstance(accelerometer_change(Evidence(sound)), Symptom)
+    found = accelerometer_change(Evidence(faults.changed_speed(sound, dose, 1)))
+    assert isinstance(found, Symptom) and found.warns and not found.harmful
+    match = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
+    assert match is not None and match[4] == ("more" if dose > 1.0 else "less")
+    assert float(match[1]) == pytest.approx(0.5 * duration_s, abs=1.0)
+    # Half of what drifting tracks make of it, and three standard errors as they are rounded.
+    assert float(match[2]) == pytest.approx(9.81 * abs(dose - 1.0), abs=0.08 + 3.0 * float(match[3]) + 0.02)
+
+
+@pytest.mark.parametrize(
+    ("fault", "dose", "percent"),
+    [
+        (faults.wrong_focal_length, 1.02, 2.0),
+        (faults.baseline_unit, 1.02, 2.0),
+        (faults.linear_unit, 1.02, -2.0),
+        (faults.wrong_focal_length, 0.97, -3.0),
+    ],
+)
+def test_two_percent_of_scale_are_reported_with_their_error(fault: faults.Fault, dose: float, percent: float) -> None:
+    found = steady_difference(Evidence(fault(recording("drive", 41, 25.0), dose, 41)))
+    assert isinstance(found, Symptom) and not found.harmful
+    match = re.search(r"steps are ([\d.]+) \+- ([\d.]+) % (longer|shorter)", found.detail)
+    assert match is not None and match[3] == ("longer" if percent > 0.0 else "shorter")
+    # The tracks' noise makes vision's steps up to half a percent longer.
+    assert float(match[1]) == pytest.approx(abs(percent), abs=0.6)
+    assert float(match[2]) < 0.6
+
+
+def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction() -> None:
+    found = steady_difference(Evidence(faults.shifted_centre(recording("drive", 43, 25.0), 12.0, 43)))
+    assert isinstance(found, Symptom)
+    match = re.search(r"equivalent to (\d+) px of the principal point", found.detail)
+    assert match is not None and float(match[1]) == pytest.approx(12.0, abs=2.5)
+
+
+@pytest.mark.parametrize("scenario", ["drive", "drive-realistic"])
+@pytest.mark.parametrize("seed", range(50, 54))
+def test_a_sound_drive_has_no_steady_difference(scenario: str, seed: int) -> None:
+    sound = recording(scenario, seed, 8.0 + (seed % 4) * 4.0, seed % 2 == 1)
+    assert steady_difference(Evidence(sound)) is None
+
+
+def test_vision_that_is_too_long_beside_odometry_is_a_fault_reported_once_with_its_error() -> None:
+    (reported,) = details(audit(faults.stretched_disparity(recording("drive", 4), 1.06))).values()
+    match = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", reported)
+    assert match is not None
+    # 1 - 1 / 1.06 is 5.7 %; the tracks' noise makes half a percent of bias.
+    assert float(match[1]) == pytest.approx(5.7, abs=1.0)
+    assert float(match[2]) < 0.6

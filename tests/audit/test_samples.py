@@ -1,0 +1,245 @@
+"""Faults of the motion samples: found where they are planted, with their size, and not where a sensor has its ways."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Finding, audit
+from toolkit.audit.calibration import gyro_scale
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.samples import coarse_samples, exchanged_samples, implausible, overstated_noise, stuck_samples
+from toolkit.audit.samples import saturated_samples as saturated
+from toolkit.geometry import Array
+from toolkit.measurements import ImuNoise, TwistNoise
+from toolkit.models.noise import white_sigma
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+KINDS = ("drive", "drive-imu", "flight")
+
+
+@cache
+def recording(scenario: str, seed: int = 3, duration_s: float = 8.0) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=seed % 2 == 1), seed)
+
+
+def with_values(sequence: Sequence, change: Callable[[Array], Array]) -> Sequence:
+    values = change(sequence.motion.values.copy())
+    return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
+
+
+def found(sequence: Sequence, fault: str) -> Finding:
+    (finding,) = (finding for finding in audit(sequence).findings if finding.fault == fault)
+    return finding
+
+
+@pytest.mark.parametrize("scenario", ["flight", "drive-imu"])
+def test_a_driver_that_hangs_is_a_gap_that_is_bridged(scenario: str) -> None:
+    hung = faults.stuck_motion(recording(scenario), 0.5, seed=4)
+    repeats = int((hung.motion.values[1:] == hung.motion.values[:-1]).all(axis=1).sum())
+    outcome = audit(hung)
+    reported = {finding.fault: finding for finding in outcome.findings}
+    assert (reported["stuck-samples"].count, reported["stuck-samples"].repaired) == (repeats, True)
+    assert reported["motion-gap"].count == 1
+    bridges = outcome.sequence.bridges
+    assert bridges is not None
+    assert (bridges.end_t_ns - bridges.begin_t_ns) / 1e9 == pytest.approx([0.5], abs=0.05)
+    assert (bridges.noise_scale > 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "named"),
+    [
+        (slice(None), slice(3, 6), "the gyro repeats one value for 8"),
+        (slice(400, None), [2], "the accelerometer z repeats one value for"),
+        (slice(400, None), [4], "the gyro y repeats one value for"),
+    ],
+)
+def test_a_sensor_or_an_axis_that_is_not_connected_blocks_and_is_named(
+    rows: slice, columns: slice | list[int], named: str
+) -> None:
+    def silent(values: Array) -> Array:
+        values[rows, columns] = 0.0
+        return values
+
+    reported = found(with_values(recording("flight"), silent), "stuck-samples")
+    assert reported.blocking and not reported.repaired
+    assert named in reported.detail
+
+
+def test_samples_at_the_end_of_a_range_warn_with_axis_value_and_count() -> None:
+    sound = recording("flight")
+    limit = float(np.quantile(sound.motion.values[:, 4], 0.9))
+    cut = int((sound.motion.values[:, 4] >= limit).sum())
+    most = np.where(np.arange(6) == 4, limit, np.inf)
+    reported = found(with_values(sound, lambda values: np.minimum(values, most)), "saturated-samples")
+    assert reported.warning and not reported.blocking
+    assert f"gyro y at {limit:.3g} rad/s ({cut} samples)" in reported.detail
+    assert "gyro x" not in reported.detail and "accelerometer" not in reported.detail
+
+
+@pytest.mark.parametrize("step", [1e-4, 0.05])
+def test_a_coarse_sensor_or_one_read_twice_is_neither_stuck_nor_at_its_end(step: float) -> None:
+    coarse = with_values(recording("flight"), lambda values: np.round(values / step) * step)
+    assert stuck_samples(Evidence(coarse)) is None
+    assert saturated(Evidence(coarse)) is None
+    twice = with_values(recording("flight"), lambda values: values[np.arange(len(values)) // 2 * 2])
+    assert stuck_samples(Evidence(twice)) is None
+
+
+@pytest.mark.parametrize("dose_s", [0.35, 0.8])
+def test_odometry_that_hangs_is_bridged(dose_s: float) -> None:
+    hung = faults.stuck_motion(recording("drive"), dose_s, 1)
+    repeats = (hung.motion.values[1:] == hung.motion.values[:-1]).all(axis=1)
+    symptom = stuck_samples(Evidence(hung))
+    assert isinstance(symptom, Symptom) and symptom.remedy is not None
+    assert symptom.count == repeats.sum()
+
+
+@pytest.mark.parametrize("still", [np.zeros(6), np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])])
+def test_wheels_that_stand_or_roll_straight_ahead_do_not_hang(still: Array) -> None:
+    def counted(values: Array) -> Array:
+        values[20:40] = still
+        return values
+
+    assert stuck_samples(Evidence(with_values(recording("drive"), counted))) is None
+
+
+def test_odometry_that_repeats_itself_now_and_then_does_not_hang() -> None:
+    """What is common in the rest of a recording is no fault where it lasts a little longer."""
+    sound, rng = recording("drive", 2), np.random.default_rng(2)
+    kept = np.maximum.accumulate(np.where(rng.uniform(size=len(sound.motion.t_ns)) < 0.6, np.arange(80 + 1), 0))
+    held = with_values(sound, lambda values: values[kept])
+    assert (held.motion.values[3:] == held.motion.values[:-3]).all(axis=1).any()  # four in a row are there
+    assert stuck_samples(Evidence(held)) is None
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("scenario", KINDS)
+def test_a_sample_that_leaves_its_neighbours_and_comes_back_is_dropped_alone(scenario: str, seed: int) -> None:
+    sound = recording(scenario, seed)
+    assert implausible(Evidence(sound)) is None
+    row = 10 + 13 * seed
+    for size in (4.0, -5.0, 80.0):
+        for k in range(6):
+            leap = size * (np.arange(len(sound.motion.t_ns)) == row)[:, None] * np.eye(6)[k]
+            symptom = implausible(Evidence(with_values(sound, lambda values, leap=leap: values + leap)))  # type: ignore[misc]
+            assert isinstance(symptom, Symptom) and symptom.count == 1 and symptom.remedy is not None
+            assert np.setdiff1d(sound.motion.t_ns, symptom.remedy.motion.t_ns).tolist() == [sound.motion.t_ns[row]]
+
+
+def test_a_knock_that_lasts_knocks_that_are_usual_and_hard_braking_are_motion() -> None:
+    def knocked(values: Array) -> Array:
+        values[400:403, 2] += [4.0, 8.0, 4.0]
+        return values
+
+    def walking(values: Array) -> Array:
+        values[50::60, 2] += 8.0  # a leg that strikes the ground every 0.3 s
+        return values
+
+    def braking(values: Array) -> Array:
+        values[60:, :3] *= 0.02
+        return values
+
+    for scenario, change in (("flight", knocked), ("flight", walking), ("drive", braking)):
+        assert implausible(Evidence(with_values(recording(scenario), change))) is None
+
+
+def test_steps_count_from_half_of_the_stated_noise_on() -> None:
+    """A gyro of 200 samples a second and a density of 1.7e-4 rad/s/sqrt(Hz): 0.0024 rad/s a sample."""
+    sigma = 1.7e-4 * np.sqrt(200.0)
+    for share, expected in ((0.01, False), (0.4, False), (0.6, True)):
+        step = np.where(np.arange(6) < 3, 1e-12, share * sigma * np.sqrt(12.0))
+        rounded = with_values(recording("flight"), lambda values, step=step: step * np.round(values / step))  # type: ignore[misc]
+        assert (coarse_samples(Evidence(rounded)) is not None) == expected
+    unused = with_values(recording("drive"), lambda values: values * [1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+    assert coarse_samples(Evidence(unused)) is None
+
+
+def exchanged(sequence: Sequence) -> Sequence:
+    return with_values(sequence, lambda values: values[:, [3, 4, 5, 0, 1, 2]])
+
+
+@pytest.mark.parametrize("scenario", KINDS)
+def test_exchanged_halves_are_found_and_set_right(scenario: str) -> None:
+    sound = recording(scenario)
+    outcome = audit(exchanged(sound))
+    assert [(f.fault, f.repaired) for f in outcome.findings] == [("exchanged-samples", True)]
+    np.testing.assert_array_equal(outcome.sequence.motion.values, sound.motion.values)
+
+
+def test_noise_that_was_estimated_from_the_samples_is_exchanged_with_them() -> None:
+    """A loader that knows no noise takes the scatter of what it read."""
+    swapped = exchanged(recording("drive", 1, 6.0))
+    root_dt = np.sqrt(np.median(np.diff(swapped.motion.t_ns)) / 1e9)
+    linear, angular = (white_sigma(half) * root_dt for half in np.split(swapped.motion.values, 2, axis=1))
+    assert isinstance(swapped.noise, TwistNoise)
+    estimated = replace(swapped.noise, velocity_noise_density=linear, gyro_noise_density=angular)
+    noise = audit(replace(swapped, noise=estimated)).sequence.noise
+    assert isinstance(noise, TwistNoise)
+    np.testing.assert_array_equal(noise.velocity_noise_density, angular)
+    np.testing.assert_array_equal(noise.gyro_noise_density, linear)
+
+
+@pytest.mark.parametrize("dose", [1.0, 3.6, 0.102])
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_sound_samples_and_other_units_are_not_exchanged(scenario: str, dose: float) -> None:
+    for sequence in (faults.linear_unit(recording(scenario), dose), faults.angular_unit(recording(scenario), dose)):
+        assert exchanged_samples(Evidence(sequence)) is None
+
+
+@pytest.mark.parametrize("dose", [0.85, 1.2])
+@pytest.mark.parametrize("scenario", KINDS)
+def test_the_sensitivity_of_an_axis_of_the_gyro_is_reported(scenario: str, dose: float) -> None:
+    sound = recording(scenario, 51, 15.0 if scenario == "drive" else 12.0)
+    assert not isinstance(gyro_scale(Evidence(sound)), Symptom)
+    symptom = gyro_scale(Evidence(faults.gyro_axis_scale(sound, dose)))
+    assert isinstance(symptom, Symptom) and symptom.warns and symptom.count == 1
+    match = re.search(r"turns (\S+) \+- (\S+) times as fast as the camera about", symptom.detail)
+    assert match is not None
+    # A bound is off by the noise of the rates beside their scatter, a percent at most here.
+    assert float(match[1]) == pytest.approx(dose, abs=4.0 * float(match[2]) + 0.01)
+
+
+def test_noise_of_gyro_or_camera_is_no_sensitivity_and_what_does_not_count_is_undecided() -> None:
+    sound, rng = recording("drive", 51, 15.0), np.random.default_rng(3)
+    noise = rng.normal(0.0, [0, 0, 0, 0.05, 0.05, 0.05], sound.motion.values.shape)
+    for faulty in (with_values(sound, lambda values: values + noise), faults.few_tracks(sound, 12.0)):
+        assert not isinstance(gyro_scale(Evidence(faulty)), Symptom)
+    beyond_chance = gyro_scale(Evidence(faults.gyro_axis_scale(recording("flight", 51), 0.96)))
+    assert isinstance(beyond_chance, Undecided)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("accel_noise_density", 1e3), ("gyro_noise_density", 1e3), ("accel_random_walk", 1e4)]
+)
+def test_a_thousand_times_the_noise_of_an_imu_is_reported_by_its_name(name: str, factor: float) -> None:
+    """A walk must be larger still: the motion of a flight hides it."""
+    flight = recording("flight")
+    noise = flight.noise
+    assert isinstance(noise, ImuNoise)
+    reported = overstated_noise(
+        Evidence(replace(flight, noise=replace(noise, **{name: factor * getattr(noise, name)})))
+    )
+    assert reported is not None and reported.warns
+    assert name in reported.detail
+    assert overstated_noise(Evidence(replace(flight, noise=noise.scaled(10.0)))) is None  # room for vibration
+
+
+ORDERS = [((0, 1, 2), (-1.0, -1.0, -1.0)), ((0, 1, 2), (1.0, 1.0, -1.0)), ((1, 0, 2), (1.0, 1.0, 1.0))]
+
+
+@pytest.mark.parametrize("order, signs", ORDERS, ids=["gravity's sign", "one sign", "exchanged"])
+@pytest.mark.parametrize("scenario", ["flight", "drive-imu"])
+def test_an_accelerometer_in_other_axes_than_the_gyro_is_named(
+    scenario: str, order: tuple[int, ...], signs: tuple[float, ...]
+) -> None:
+    turned = with_values(recording(scenario, 3, 12.0), lambda v: np.hstack([v[:, list(order)] * signs, v[:, 3:]]))
+    reported = found(turned, "accelerometer-axes")
+    assert reported.blocking
+    named = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+    assert f"the accelerometer's x, y, z are the gyro's {named}" in reported.detail
