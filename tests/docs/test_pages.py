@@ -339,6 +339,12 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in _anchors(linked), target
 
 
+@by_page
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    named = re.findall(r"`((?:toolkit|filters|tests|notebooks|docs)/[\w/.]+)`", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (PROJECT / name).exists()] == []
+
+
 def _anchors(page: Path) -> set[str]:
     """Return what GitHub calls the headings of a page."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
