@@ -20,7 +20,7 @@ from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
-from toolkit.report.figures import over_seeds as figures
+from toolkit.report.figures import bands as figures
 from toolkit.report.messages import note_lines, paired_lines
 from toolkit.report.scores import Seeds, seeds_document
 
@@ -227,7 +227,7 @@ def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment() -> 
 
 
 def test_both_figures_are_drawn(over: Comparison, tmp_path: Path) -> None:
-    drawn = list(figures.draw(over))
+    drawn = list(figures.draw_over_seeds(over))
     assert [figure.name for figure in drawn] == ["errors_over_seeds", "nees_over_seeds"]
     for figure in drawn:
         figure.figure.savefig(tmp_path / f"{figure.name}.png")

@@ -1,24 +1,70 @@
-"""Figures show the data: the same colours everywhere, equal scale from above, no point squashing the rest."""
+"""Figures show the data: one look, equal scale from above, nothing that squashes the rest, figures fit for a paper."""
 
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.inset import InsetIndicator
 
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
-from toolkit.geometry import about_z, se3
-from toolkit.report.curves import error_curves, errors_to, onto_truth, truth_during
-from toolkit.report.figures import against_bound, errors_over_time, frame_times, reprojection, top_view
-from toolkit.report.figures.style import colour_of, width_of
+from toolkit.geometry import about_z, interpolate_poses, se3
+from toolkit.metrics import Scores
+from toolkit.registry import defaults, discover
+from toolkit.report import figures
+from toolkit.report.curves import (
+    COLOURS,
+    Components,
+    components,
+    error_curves,
+    errors_to,
+    look_numbers,
+    onto_truth,
+    truth_during,
+)
+from toolkit.report.figures import FigureChoice, FigureFormat, bands, drawn, from_above, over_time, reprojection, save
+from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
+from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
+from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
 from toolkit.simulation import DRIVE, simulate
 
 ComparisonOf = Callable[..., Comparison]
+Draw = Callable[[Comparison], Iterator[NamedFigure]]
+CHOICES: tuple[FigureChoice, ...] = ("few", "all", "none")
+BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+
+OFFSET_M = np.array([0.3, -0.2, 0.1])
+SIGMA_DEG, SIGMA_M = np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.4])
+
+
+@pytest.fixture(scope="module")
+def offset(sequence: Sequence, comparison: Comparison, comparison_of: ComparisonOf) -> Comparison:
+    """The truth with every pose set off along its own axes and turned about its vertical, with stated covariances."""
+    truth, t_ns = sequence.truth, sequence.frames_t_ns
+    assert truth is not None
+    poses = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns)
+    wrong = poses @ se3(about_z(np.radians(0.5)), OFFSET_M)
+    cov = np.tile(np.diag(np.concatenate([np.radians(SIGMA_DEG), SIGMA_M]) ** 2), (t_ns.size, 1, 1))
+    trajectory = Trajectory(t_ns, wrong, cov=cov)
+    steady = comparison.runs[0]
+    run = replace(steady, estimator="offset", causal=trajectory, final=trajectory)
+    return comparison_of(sequence, (run, steady))
+
+
+@pytest.fixture(scope="module")
+def fourteen(comparison: Comparison) -> Comparison:
+    """One run under fourteen names; it need not be scored so many times."""
+    one = comparison.outcomes[0]
+    names = [f"estimator-{n}" for n in range(14)]
+    again = (replace(one, estimator=name, run=replace(comparison.runs[0], estimator=name)) for name in names)
+    return replace(comparison, outcomes=tuple(again))
 
 
 def map_of(figure: Figure) -> Axes:
@@ -26,12 +72,10 @@ def map_of(figure: Figure) -> Axes:
     return next(axes for axes in figure.axes if axes.get_xlabel() == "x [m]")
 
 
-def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparison) -> None:
-    drawn = {name: figure for name, _, figure in (*top_view.draw_all(comparison), *top_view.draw_each(comparison))}
-    assert list(drawn) == ["top_all", "top_steady", "top_astray", "top_late"]
-    for figure in drawn.values():
-        assert map_of(figure).get_aspect() == 1.0
-        assert "[m]" in map_of(figure).get_xlabel()
+def test_top_views_have_equal_scale(comparison: Comparison) -> None:
+    shown = {one.name: one.figure for one in (*from_above.draw_all(comparison), *from_above.draw_each(comparison))}
+    assert list(shown) == ["top_all", "top_steady", "top_astray", "top_late"]
+    assert all(map_of(figure).get_aspect() == 1.0 for figure in shown.values())
 
 
 def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, comparison_of: ComparisonOf) -> None:
@@ -39,14 +83,9 @@ def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, compar
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
     spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
-    ((_, _, figure),) = top_view.draw_all(comparison_of(comparison.sequence, (spoiled,)))
+    ((_, _, figure),) = from_above.draw_all(comparison_of(comparison.sequence, (spoiled,)))
     low, high = map_of(figure).get_xlim()
     assert high - low < 500.0
-
-
-def test_every_estimator_has_its_own_colour(comparison: Comparison) -> None:
-    colours = [colour_of(comparison, run.estimator) for run in comparison.runs]
-    assert len(set(colours)) == len(colours)
 
 
 def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Comparison) -> None:
@@ -62,17 +101,12 @@ def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Co
     assert np.abs(errors.heading_deg).max() < 1e-9
 
 
-def test_equal_lines_do_not_hide_each_other(comparison: Comparison) -> None:
-    widths = [width_of(comparison, run.estimator) for run in comparison.runs]
-    assert all(above < below for below, above in itertools.pairwise(widths))
-
-
 def test_estimators_that_agree_to_rounding_look_so(without_truth: Comparison, comparison_of: ComparisonOf) -> None:
     late = without_truth.runs[1]
     assert late.final is not None
     rounded = replace(late.final, T_world_imu=late.final.T_world_imu * (1.0 + 1e-15))
     twins = (replace(late, estimator="twin", final=rounded), late)
-    (drawn,) = errors_over_time.draw(comparison_of(without_truth.sequence, twins))
+    (drawn,) = over_time.draw_errors(comparison_of(without_truth.sequence, twins))
     position, heading = drawn.figure.axes
     assert position.get_ylim()[1] >= 1e-3
     assert heading.get_ylim()[1] >= 1e-2
@@ -85,20 +119,20 @@ def test_one_slow_step_at_the_end_does_not_bend_the_running_median(
     step_s = np.full(steady.timings.step_s.size, 1e-3)
     step_s[[0, -1]] = 1.0
     slow = replace(steady, timings=replace(steady.timings, step_s=step_s))
-    (drawn,) = frame_times.draw(comparison_of(comparison.sequence, (slow,)))
+    (drawn,) = over_time.draw_frame_times(comparison_of(comparison.sequence, (slow,)))
     dots, median = drawn.figure.axes[0].get_lines()
     assert np.max(dots.get_ydata()) == pytest.approx(1e3)
     assert np.max(median.get_ydata()) == pytest.approx(1.0)
 
 
 def test_without_truth_the_figure_says_it_shows_differences(without_truth: Comparison) -> None:
-    (drawn,) = errors_over_time.draw(without_truth)
+    (drawn,) = over_time.draw_errors(without_truth)
     assert "no truth" in drawn.caption
     assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
 
 
 def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
-    (drawn,) = errors_over_time.draw(comparison)
+    (drawn,) = over_time.draw_errors(comparison)
     curves = error_curves(comparison)
     assert curves is not None
     good_m = max(errors.position_m.max() for row, errors in curves.of_rows if row.status == "ok")
@@ -112,7 +146,7 @@ def test_a_heading_far_from_the_others_leaves_its_panel_and_is_named(
 ) -> None:
     runs = [run for run in comparison.runs if run.status == "ok"]
     turned = replace(runs[0], estimator="turned", final=None, causal=turning(runs[0].trajectory("causal"), 30.0))
-    (drawn,) = errors_over_time.draw(comparison_of(comparison.sequence, (*runs, turned)))
+    (drawn,) = over_time.draw_errors(comparison_of(comparison.sequence, (*runs, turned)))
     heading = drawn.figure.axes[1]
     assert heading.get_ylim()[1] < 15.0
     assert "turned" in heading.get_title(loc="right")
@@ -127,7 +161,9 @@ def turning(trajectory: Trajectory | None, most_deg: float) -> Trajectory:
     return replace(trajectory, T_world_imu=poses)
 
 
-@pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw_all])
+@pytest.mark.parametrize(
+    "draw", [reprojection.draw, over_time.draw_frame_times, over_time.draw_errors, from_above.draw_all]
+)
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)
@@ -137,9 +173,9 @@ def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: ob
 def test_the_bound_is_drawn_where_it_was_requested(comparison_of: ComparisonOf, run_estimator) -> None:
     sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
     usual = comparison_of(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
-    assert list(against_bound.draw(usual)) == []
+    assert list(over_time.draw_bound(usual)) == []
     requested = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
-    (drawn,) = against_bound.draw(requested)
+    (drawn,) = over_time.draw_bound(requested)
     position = drawn.figure.axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
     assert "thin: stated" in [text.get_text() for text in drawn.figure.legends[0].get_texts()]
@@ -148,6 +184,190 @@ def test_the_bound_is_drawn_where_it_was_requested(comparison_of: ComparisonOf, 
     assert lines["bound causal"][0] == pytest.approx(np.sqrt(np.trace(sequence.prior.cov[3:6, 3:6])), rel=1e-6)
 
 
-def test_a_recording_without_a_bound_has_no_such_figure(without_truth: Comparison) -> None:
-    requested = replace(without_truth, settings=Settings(metrics=Metrics(bound=True)))
-    assert list(against_bound.draw(requested)) == []
+def of_offset(offset: Comparison) -> Components:
+    (row,) = (row for row in offset.lines if row.estimator == "offset")
+    found = components(offset, row)
+    assert found is not None
+    return found
+
+
+def test_components_are_estimate_minus_truth_in_the_worlds_axes(offset: Comparison, sequence: Sequence) -> None:
+    found, truth = of_offset(offset), sequence.truth
+    assert truth is not None
+    poses = interpolate_poses(truth.t_ns, truth.T_world_imu, found.t_ns)
+    # Positions of 100 m: some 1e-16 of that.
+    np.testing.assert_allclose(found.error[:, 3:], poses[:, :3, :3] @ OFFSET_M, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found.error[:, :3], axis=1), 0.5, atol=1e-10)
+
+
+def test_stated_deviations_turn_with_the_body(offset: Comparison, sequence: Sequence) -> None:
+    found, truth = of_offset(offset), sequence.truth
+    assert truth is not None
+    assert found.sigma is not None
+    estimate = offset.runs[0].final
+    assert estimate is not None
+    turn = estimate.T_world_imu[:, :3, :3]
+    np.testing.assert_allclose(found.sigma[:, 3:] ** 2, (turn**2) @ SIGMA_M**2, rtol=1e-9)
+    np.testing.assert_allclose((found.sigma[:, :3] ** 2).sum(axis=1), (SIGMA_DEG**2).sum(), rtol=1e-9)
+
+
+def all_components(comparison: Comparison) -> list[NamedFigure]:
+    telling = over_time.draw_telling_components(comparison)
+    return [*telling, *over_time.draw_other_components(comparison)]
+
+
+def test_the_least_and_the_most_consistent_estimator_are_drawn_by_component_first(
+    comparison: Comparison, rescored: Callable[..., Comparison]
+) -> None:
+    nees = {"steady": 0.01, "astray": 5.0, "late": 1.1}
+    scored = rescored(
+        comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": nees.get(row.estimator)}, {})
+    )
+    names = [figure.name for figure in all_components(scored)]
+    assert names[:2] == ["components_steady", "components_late"]
+    assert len({*names}) == len(names)
+
+
+def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comparison) -> None:
+    one = next(figure for figure in all_components(offset) if figure.name == "components_offset")
+    found, axes = of_offset(offset), one.figure.axes[0]
+    assert found.sigma is not None
+    lower, upper, error = (np.asarray(line.get_ydata()) for line in axes.get_lines()[:3])
+    np.testing.assert_allclose(upper, 3.0 * found.sigma[:, 3])
+    np.testing.assert_allclose(lower, -upper)
+    np.testing.assert_allclose(error, found.error[:, 3])
+    assert axes.get_ylim()[1] > np.abs(error).max()
+
+
+def test_the_share_in_the_band_is_the_metrics(offset: Comparison) -> None:
+    (one,) = bands.draw_nees(offset)
+    (row,) = (row for row in offset.lines if row.estimator == "offset")
+    share = row.value("nees_pose_in_band_percent")
+    assert share is not None
+    assert one.figure.axes[0].get_title(loc="right") == f"{share:.0f} % in band"
+
+
+def test_a_panel_whose_values_leave_the_figure_says_how_large_they_become() -> None:
+    t_s, ones = np.arange(4.0), np.ones(4)
+    inside = bands.Normalised(t_s, np.array([1.0, 9e3, 1.0, np.nan]), 0.5 * ones, 2.0 * ones)
+    beyond = inside._replace(value=np.array([1.0, 1.0, 7.2e5, np.nan]))
+    drawn = [bands.Drawn(name, "#000000", "final", series) for name, series in (("in", inside), ("out", beyond))]
+    figure = bands.figure_with_bands(["in", "out"], drawn, "NEES", "a drive")
+    assert [axes.get_title(loc="right") for axes in figure.axes] == ["67 % in band", "67 % in band, up to 7e+05"]
+
+
+def test_without_truth_there_is_no_nees_and_without_innovations_no_nis(without_truth: Comparison) -> None:
+    assert list(bands.draw_nees(without_truth)) == []
+    assert list(bands.draw_nis(without_truth)) == []
+
+
+def test_all_panels_of_a_map_share_a_scale_of_colours(comparison: Comparison) -> None:
+    (one,) = from_above.draw_trajectories(comparison)
+    titles = [axes.get_title(loc="left") for axes in one.figure.axes]
+    assert titles[:3] == ["steady", "astray (diverged)", "late"]
+    assert one.figure.axes[3].get_ylabel() == "position error [m]"
+    assert list(from_above.draw_trajectories(replace(comparison, outcomes=comparison.outcomes[3:]))) == []
+
+
+def straight(offset_m: float, widening_m: float = 0.0) -> PathFromAbove:
+    t_ns = np.arange(101)
+    return PathFromAbove(t_ns, np.stack([t_ns.astype(float), offset_m + widening_m * t_ns / 100.0], axis=1))
+
+
+def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None:
+    view = View(np.array([0.0, -50.0]), np.array([100.0, 50.0]))
+    tracks = [straight(0.0), straight(0.01, widening_m=0.5), straight(30.0)]
+    closer = where_tracks_coincide(tracks, view, np.arange(101))
+    assert closer is not None
+    # At the end of the two; the third is far from both and not in it.
+    assert closer.low[0] < 100.0 < closer.high[0]
+    assert closer.low[1] < 0.0
+    assert 0.51 < closer.high[1] < 2.0
+
+
+@pytest.mark.parametrize("turn_rad", [-0.5, 1.0])
+def test_lines_to_the_closer_look_end_at_the_corners_that_face_the_map(
+    sequence: Sequence, comparison: Comparison, comparison_of: ComparisonOf, turn_rad: float
+) -> None:
+    truth = sequence.truth
+    assert truth is not None
+    turned = replace(truth, T_world_imu=se3(about_z(turn_rad), np.zeros(3)) @ truth.T_world_imu)
+    (one,) = from_above.draw_all(comparison_of(replace(sequence, truth=turned), comparison.runs))
+    FigureCanvasAgg(one.figure).draw()
+    _, the_map, panel = one.figure.axes
+    (square,) = (artist for artist in the_map.get_children() if isinstance(artist, InsetIndicator))
+    lines = [line for line in square.connectors or () if line.get_visible()]
+    ends = np.array([line.get_path().vertices[0] for line in lines])
+    box = panel.get_window_extent()
+    beside = box.y1 > the_map.get_window_extent().y0
+    assert beside == (turn_rad > 0.0)
+    facing = [(box.x0, box.y0), (box.x0, box.y1)] if beside else [(box.x0, box.y1), (box.x1, box.y1)]
+    np.testing.assert_allclose(ends, facing, atol=0.5)
+    # A panel takes the place that its equal scale leaves it when it is drawn: before the lines to it.
+    assert panel.get_zorder() < the_map.get_zorder()
+
+
+def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
+    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
+    (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight(0.0), nowhere], [straight(0.0)]))
+    np.testing.assert_array_equal(both, one)
+    assert np.isfinite(view_of([nowhere], NOWHERE)).all()
+
+
+def test_lines_that_are_apart_need_no_closer_look() -> None:
+    view = View(np.array([0.0, -50.0]), np.array([100.0, 50.0]))
+    assert where_tracks_coincide([straight(0.0), straight(20.0)], view, np.arange(101)) is None
+    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
+    assert where_tracks_coincide([straight(0.0), nowhere], view, np.arange(101)) is None
+
+
+@pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])
+def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Comparison, draw: Draw) -> None:
+    (one,) = draw(fourteen)
+    figure = one.figure
+    figure.draw_without_rendering()
+    found = [*figure.legends, *(legend for axes in figure.axes if (legend := axes.get_legend()) is not None)]
+    (legend,) = found
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes if axes.axison)
+    labels = {text.get_text().partition(":")[0] for text in legend.get_texts()}
+    assert labels >= set(fourteen.estimators)
+
+
+def test_few_figures_come_first_and_all_when_requested(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+    def named(name: str) -> Callable[[Comparison], Iterator[NamedFigure]]:
+        return lambda _: iter([NamedFigure(name, "", Figure())])
+
+    monkeypatch.setattr(figures, "_FEW", (named("one"),))
+    monkeypatch.setattr(figures, "_MORE", (named("another"),))
+    names = {choice: [figure.name for figure in drawn(comparison, choice)] for choice in CHOICES}
+    assert names == {"few": ["one"], "all": ["one", "another"], "none": []}
+
+
+@pytest.mark.parametrize("kind", BEGINS)
+def test_a_figure_is_of_its_format_and_the_same_every_time(tmp_path, kind: FigureFormat) -> None:
+    for name in ("one", "two"):
+        figure = new_figure(2.0)
+        figure.add_subplot().plot([0, 1], [1, 0], label="a line")
+        (tmp_path / name).mkdir()
+        assert save([NamedFigure("line", "A line.", figure)], tmp_path / name, kind) == {f"line.{kind}": "A line."}
+    one, two = ((tmp_path / name / f"line.{kind}").read_bytes() for name in ("one", "two"))
+    assert one.startswith(BEGINS[kind])
+    assert one == two
+
+
+def test_all_estimators_are_distinguished_and_both_outputs_keep_one_colour() -> None:
+    names = [*discover(), "one of my own"]
+    comparison = cast(Any, SimpleNamespace(estimators=names))
+    for output in ("causal", "final"):
+        looks = [str(stroke_of(comparison, name, output)) for name in names]
+        assert len(set(looks)) == len(names)
+    lines = {str(stroke_of(comparison, name, output)["linestyle"]) for name in names for output in ("causal", "final")}
+    assert len(lines) == 6
+
+
+def test_an_estimator_has_one_look_whatever_it_is_compared_with() -> None:
+    together = look_numbers([*discover(), "one of my own"])
+    for name in together:
+        assert look_numbers([name])[name] == together[name]
+    assert len({together[name] % COLOURS for name in (*defaults(), "one of my own")}) == len(defaults()) + 1

@@ -18,7 +18,7 @@ from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.metrics import cost, score_run
 from toolkit.report.comparison_text import report_text
-from toolkit.report.figures import errors_over_time, frame_times
+from toolkit.report.figures import over_time
 from toolkit.report.records import read_metrics
 from toolkit.report.run_directory import MadeBy, write_run
 from toolkit.sequence import Sequence
@@ -188,7 +188,7 @@ def test_without_truth_the_others_are_not_measured_against_it(without_truth: Com
     (read,) = reference_runs({NAME: Trajectory(steady.causal.t_ns, steady.causal.T_world_imu)}, without_truth.sequence)
     other = outcome_of(read, without_truth.sequence, seed=without_truth.seeds[0])
     mixed = replace(without_truth, outcomes=(*without_truth.outcomes, other))
-    (drawn,) = errors_over_time.draw(mixed)
+    (drawn,) = over_time.draw_errors(mixed)
     assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
-    (times,) = frame_times.draw(mixed)
+    (times,) = over_time.draw_frame_times(mixed)
     assert len(times.figure.axes[0].get_lines()) == 2 * len(without_truth.runs)

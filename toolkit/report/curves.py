@@ -1,4 +1,4 @@
-"""The series that figures and report.json draw over time: errors, and errors by component.
+"""What figures, report.json and the page draw alike: errors over time, whole and by component, and colours.
 
 Errors over time are drawn from the common start, which shows drift, or after a fit to the truth. Pairs and fits are
 those of the metrics. With an IMU the vertical is measured and only heading and position are fitted (the fit of
@@ -6,8 +6,8 @@ ate_yaw_m); from twists alone an estimator does not know the vertical, and a who
 ate_se3_m).
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,12 +27,28 @@ from toolkit.metrics.parts.against_truth import (
 from toolkit.metrics.parts.consistency import POSE_DOF, body_errors, starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION
+from toolkit.registry import defaults, discover, ladder
 from toolkit.sequence import Sequence, Truth
 
+T = TypeVar("T")
+# How many colours there are; a look of a higher number has the colours over again, in other dashes.
+COLOURS = 7
 _MICROSECONDS = 6
 _HALF_WINDOW = 7
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
+_LINES = "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
 _FROM_START = "All start from the same pose and nothing is fitted, so that the error is what has drifted since."
+
+
+def available(compute: Callable[[Evaluation], T], run: Run, output: Output, sequence: Sequence) -> T | None:
+    """Return what is computed of an output, None where it is unavailable; a diverged run may overflow meanwhile."""
+    if run.trajectory(output) is None:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return compute(Evaluation(run, output, sequence))
+    except Unavailable:
+        return None
 
 
 class Errors(NamedTuple):
@@ -76,22 +92,17 @@ def truth_during(sequence: Sequence) -> Truth | None:
 def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
     """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
     fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
-    try:
-        return fit(*Evaluation(run, output, sequence).compared.positions)
-    except Unavailable:
-        return NOT_ALIGNED
+    return available(lambda of: fit(*of.compared.positions), run, output, sequence) or NOT_ALIGNED
 
 
 def from_start(run: Run, output: Output, sequence: Sequence) -> Alignment:
     """Return what places a run's first pose on the truth; nothing where its start is in the truth's world already."""
     if run.timings is not None and starts_in_the_truths_world(sequence):
         return NOT_ALIGNED
-    evaluation = Evaluation(run, output, sequence)
-    try:
-        pairs = evaluation.compared
-    except Unavailable:
-        return NOT_ALIGNED
-    return place_first(pairs.truth[0], pairs.estimate[0], evaluation.level)
+    placed = available(
+        lambda of: place_first(of.compared.truth[0], of.compared.estimate[0], of.level), run, output, sequence
+    )
+    return placed or NOT_ALIGNED
 
 
 def fit_name(sequence: Sequence) -> str:
@@ -144,20 +155,6 @@ def shown_output(run: Run) -> Output:
     return "final" if run.final is not None else "causal"
 
 
-class _Reference(NamedTuple):
-    """The reference of the curves, the alignment of a row to it in code and words, and the name of the difference.
-
-    ``trajectory`` is the estimate that replaces the truth where there is none.
-    """
-
-    truth: Truth
-    align: Callable[[Row], Alignment]
-    what: str
-    placing: str
-    caption: str
-    trajectory: Trajectory | None = None
-
-
 class ErrorCurves(NamedTuple):
     """The rows with their errors, the name of these ("error", or "difference from" a run), how placed, the caption."""
 
@@ -172,49 +169,37 @@ def error_curves(comparison: Comparison, *, fitted: bool = False) -> ErrorCurves
 
     Errors are those from the common start, or ``fitted`` after a fit to the truth.
     """
-    reference = _from_truth(comparison, fitted=fitted) or _from_estimate(comparison)
-    if reference is None:
+    sequence, reference = comparison.sequence, truth_during(comparison.sequence)
+    estimate = reference_estimate(comparison) if reference is None else None
+    align: Callable[[Run, Output, Sequence], Alignment] = _not_aligned
+    if reference is not None:
+        align, placing, fit = from_start, "from the common start", _FROM_START
+        if fitted:
+            align, placing, fit = onto_truth, f"aligned by {fit_name(sequence)}", alignment_text(sequence)
+        what, caption = "error", f"{fit} {_LINES}"
+    elif estimate is not None:
+        reference = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
+        placing, what = "not aligned", f"difference from {estimate.name}"
+        caption = (
+            f"There is no truth: position and heading difference from {estimate.name}, not aligned. "
+            "A difference says that two estimators disagree, not which of them is right."
+        )
+    else:
         return None
     curves: list[tuple[Row, Errors]] = []
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
-        if trajectory is None or trajectory is reference.trajectory:
+        repeated = row.output == "causal" and row.run.final_is_causal
+        if trajectory is None or repeated or (estimate is not None and trajectory is estimate.trajectory):
             continue
-        if row.output == "causal" and row.run.final_is_causal:
-            continue
-        errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
+        errors = errors_to(reference, trajectory, align(row.run, row.output, sequence), sequence)
         if errors is not None:
             curves.append((row, errors))
-    return ErrorCurves(curves, reference.what, reference.placing, reference.caption) if curves else None
+    return ErrorCurves(curves, what, placing, caption) if curves else None
 
 
-def _from_truth(comparison: Comparison, *, fitted: bool) -> _Reference | None:
-    sequence = comparison.sequence
-    truth = truth_during(sequence)
-    if truth is None:
-        return None
-    caption = (
-        f"{alignment_text(sequence) if fitted else _FROM_START} "
-        "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
-    )
-    place, placing = (
-        (onto_truth, f"aligned by {fit_name(sequence)}") if fitted else (from_start, "from the common start")
-    )
-    return _Reference(truth, lambda row: place(row.run, row.output, sequence), "error", placing, caption)
-
-
-def _from_estimate(comparison: Comparison) -> _Reference | None:
-    estimate = reference_estimate(comparison)
-    if estimate is None:
-        return None
-    caption = (
-        f"There is no truth: position and heading difference from {estimate.name}, not aligned. "
-        "A difference says that two estimators disagree, not which of them is right."
-    )
-    as_truth = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
-    return _Reference(
-        as_truth, lambda _: NOT_ALIGNED, f"difference from {estimate.name}", "not aligned", caption, estimate.trajectory
-    )
+def _not_aligned(_run: Run, _output: Output, _sequence: Sequence) -> Alignment:
+    return NOT_ALIGNED
 
 
 class Components(NamedTuple):
@@ -239,9 +224,8 @@ def components(comparison: Comparison, row: Row) -> Components | None:
         return None
     if comparison.sequence.truth is None:
         return _difference(comparison, row)
-    try:
-        errors = body_errors(Evaluation(row.run, row.output, comparison.sequence))
-    except Unavailable:
+    errors = available(body_errors, row.run, row.output, comparison.sequence)
+    if errors is None:
         return None
     covs = None if trajectory.cov is None else trajectory.cov[errors.rows]
     return _in_world_axes(errors.t_ns, errors.T_world_imu, errors.T_estimate_truth, covs)
@@ -263,19 +247,27 @@ def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: 
     if not t_ns.size:
         return None
     turn = poses[:, :3, :3]
-    rotation = -np.degrees(_turned(turn, so3_log(T_estimate_truth[:, :3, :3])))
-    error = np.hstack([rotation, -_turned(turn, T_estimate_truth[:, :3, 3])])
+    in_body = np.stack([np.degrees(so3_log(T_estimate_truth[:, :3, :3])), T_estimate_truth[:, :3, 3]], axis=1)
+    error = -np.einsum("nij,nkj->nki", turn, in_body).reshape(-1, POSE_DOF)
     if covs is None or not np.isfinite(covs[:, :POSE_DOF, :POSE_DOF]).any():
         return Components(t_ns, error, None)
     deviations = [_deviation(turn, covs[:, block, block]) for block in (ROTATION, POSITION)]
     return Components(t_ns, error, np.hstack([np.degrees(deviations[0]), deviations[1]]))
 
 
-def _turned(rotations: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
-
-
 def _deviation(rotations: Array, covs: Array) -> Array:
     """Return the standard deviations (n, 3) of covariances (n, 3, 3) in the body frame, along the world's axes."""
     variance = np.einsum("nij,njk,nik->ni", rotations, covs, rotations)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def look_numbers(compared: Iterable[str]) -> dict[str, int]:
+    """Return the number of the look of each estimator that is compared, whatever it is compared with.
+
+    Those of this installation have the first numbers: the default ones, then the ladder, then others by name. All
+    others, as a file of one's own, have dashes that none of these have, and first colours that no default one has.
+    """
+    here = list(dict.fromkeys((*defaults(), *(entry.name for entry in ladder()), *discover())))
+    own = [name for name in dict.fromkeys(compared) if name not in here]
+    first_own = -(-len(here) // COLOURS) * COLOURS + len(defaults())
+    return {name: i for i, name in enumerate(here)} | {name: first_own + i for i, name in enumerate(own)}

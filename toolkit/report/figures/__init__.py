@@ -1,6 +1,6 @@
-"""The figures of a comparison as files, PNG, PDF or SVG, one module a kind; drawn without a display.
+"""The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
-Reading order: style -> panels -> the kinds, which __init__ lists; the numbers are those of report.curves.
+Reading order: style -> over_time, bands, from_above, reprojection; the numbers are those of report.curves.
 """
 
 import warnings
@@ -15,16 +15,7 @@ from matplotlib.text import Text
 
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import (
-    against_bound,
-    consistency,
-    error_map,
-    errors_over_time,
-    frame_times,
-    over_seeds,
-    reprojection,
-    top_view,
-)
+from toolkit.report.figures import bands, from_above, over_time, reprojection
 from toolkit.report.figures.style import NamedFigure
 
 FigureFormat = Literal["png", "pdf", "svg"]
@@ -36,23 +27,23 @@ FigureChoice = Literal["few", "all", "none"]
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
 # Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
 _FEW: tuple[_Drawing, ...] = (
-    top_view.draw_all,
-    errors_over_time.draw,
-    errors_over_time.draw_telling_components,
-    consistency.draw_nees,
-    against_bound.draw,
+    from_above.draw_all,
+    over_time.draw_errors,
+    over_time.draw_telling_components,
+    bands.draw_nees,
+    over_time.draw_bound,
 )
 _MORE: tuple[_Drawing, ...] = (
     reprojection.draw,
-    consistency.draw_nis,
-    frame_times.draw,
-    error_map.draw_trajectories,
-    error_map.draw_maps,
-    errors_over_time.draw_fitted,
-    errors_over_time.draw_other_components,
-    top_view.draw_each,
+    bands.draw_nis,
+    over_time.draw_frame_times,
+    from_above.draw_trajectories,
+    from_above.draw_maps,
+    over_time.draw_fitted_errors,
+    over_time.draw_other_components,
+    from_above.draw_each,
 )
-_OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
+_OVER_SEEDS: tuple[_Drawing, ...] = (bands.draw_over_seeds,)
 
 
 def drawn(comparison: Comparison, choice: FigureChoice = "all") -> Iterator[NamedFigure]:

@@ -14,14 +14,16 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, reprojection
 from toolkit.metrics.parts.leave_one_out import CAP_PX
-from toolkit.metrics.parts.scores import Unavailable
-from toolkit.report.curves import shown_output
-from toolkit.report.figures.panels import annotate, finish, panels_of
-from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of
+from toolkit.report.curves import available, shown_output
+from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, annotate, colour_of, finish, panels_of
 
 # A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
 _SMALLEST_PX = 0.01
 _BINS = np.geomspace(_SMALLEST_PX, CAP_PX, 61)
+_KINDS: dict[str, Callable[[Evaluation], Array]] = {
+    "in-sample": reprojection.in_sample_errors,
+    "held-out": reprojection.held_out_errors,
+}
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -65,21 +67,10 @@ def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
     """Return the errors (n,) px by kind, without the kinds the run has none of."""
-    if run.trajectory(shown_output(run)) is None:
-        return {}
-    evaluation = Evaluation(run, shown_output(run), comparison.sequence)
-    kinds: dict[str, Callable[[Evaluation], Array]] = {
-        "in-sample": reprojection.in_sample_errors,
-        "held-out": reprojection.held_out_errors,
+    found = {
+        kind: available(errors_of, run, shown_output(run), comparison.sequence) for kind, errors_of in _KINDS.items()
     }
-    found = {}
-    for kind, errors_of in kinds.items():
-        try:
-            with np.errstate(all="ignore"):  # a diverged run may overflow; the metrics cap what comes of it
-                found[kind] = errors_of(evaluation)
-        except Unavailable:
-            continue
-    return {kind: error_px for kind, error_px in found.items() if error_px.size}
+    return {kind: error_px for kind, error_px in found.items() if error_px is not None and error_px.size}
 
 
 def _histogram(axes: Axes, kind: str, error_px: Array, colour: str) -> None:

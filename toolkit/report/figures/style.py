@@ -1,21 +1,24 @@
 """One look for every figure: a colour an estimator, legible for the colour-blind, quiet axes, legends beside the data.
 
+Small panels, one an estimator on the same axes, are laid out here too: fourteen lines in one panel hide each other.
 Figures are as wide as two columns of a paper and are to be set at that width: letters then have 7 to 9 points.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Literal, NamedTuple, Self, TypedDict
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullLocator
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.report.looks import COLOURS, look_numbers
+from toolkit.report.curves import COLOURS, look_numbers
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -33,6 +36,10 @@ _LINE_OF: dict[Output, tuple[Dashes, ...]] = {
     "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
+# From so many panels on there are four in a row, before that three; two or four make a square.
+_MANY = 10
+_PANEL_IN = 1.35
+_FEW_DECADES = 1.7
 
 
 class NamedFigure(NamedTuple):
@@ -146,3 +153,70 @@ def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **p
 def legend_below(figure: Figure, entries: Sequence[Entry]) -> None:
     """Put a legend under all panels, over the whole width."""
     legend(figure, entries, loc="outside lower center")
+
+
+def panels_of(
+    names: Sequence[str], x_label: str = "time [s]", panel_in: float = _PANEL_IN
+) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with an empty panel of some height a name, all on the same axes."""
+    columns = columns_for(len(names))
+    rows = -(-len(names) // columns)
+    figure = new_figure(0.85 + panel_in * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for axes in grid[len(names) :]:
+        axes.set_axis_off()
+    panels = dict(zip(names, grid, strict=False))
+    for name, axes in panels.items():
+        style_axes(axes, name, "", "")
+    # A panel with nothing below it has the numbers of the axis, too.
+    for axes in grid[: len(names)][-columns:]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(x_label, fontsize=LABEL_PT)
+    return figure, panels
+
+
+def columns_for(count: int) -> int:
+    """Return how many columns so many panels have."""
+    if count >= _MANY:
+        return 4
+    return 2 if count in (2, 4) else min(3, count)
+
+
+def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entries: Sequence[Entry]) -> None:
+    """Give the figure its title, its vertical axis and its legend, which stands in a spare panel where there is one."""
+    for axes in panels.values():
+        if not axes.has_data():
+            text = "nothing to show"
+            axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+    figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
+    figure.supylabel(what, fontsize=LABEL_PT)
+    spare = figure.axes[len(panels) :]
+    if spare:
+        legend(spare[0], entries, columns=1, loc="center left").set_in_layout(False)
+    else:
+        legend_below(figure, entries)
+
+
+def scale_by_decades(axes: Axes, low: float, high: float) -> None:
+    """Make the vertical axis, and those shared with it, logarithmic between two values, with few and plain numbers."""
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    few = np.log10(high / low) < _FEW_DECADES
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
+    if few:
+        axes.yaxis.set_major_formatter("{x:g}")
+    # Ticks between decades are many, and take longer to draw than all else.
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
+    """Write above a panel, to the right: the first of the texts for which there is room."""
+    room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
+    fitting = next((one for one in texts if len(name) + len(one) <= room), texts[-1])
+    panels[name].set_title(fitting, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+
+
+def output_entries(outputs: Collection[Output]) -> list[Entry]:
+    """Return the legend's entries for the outputs that are drawn; a filter's final output repeats its causal one."""
+    names: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
+    return [Entry.of_line(names[output], MUTED_COLOUR, line_of(output)) for output in sorted(outputs)]

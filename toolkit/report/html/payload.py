@@ -18,8 +18,8 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves
 from toolkit.report.comparison_table import usual_metrics
+from toolkit.report.curves import look_numbers
 from toolkit.report.html.highlights import highlights
-from toolkit.report.looks import look_numbers
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import ConsistencyMark, MetricOverSeeds, RunOverSeeds

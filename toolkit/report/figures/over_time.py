@@ -1,6 +1,6 @@
-"""Errors over time: position and heading of all estimators, and of one by component, with what it states.
+"""What changes over time: errors, errors by component with what is stated, the loss against the bound, time per frame.
 
-Against the truth; without truth, the differences between estimators.
+Errors are against the truth; without truth they are the differences between estimators.
 """
 
 from collections.abc import Collection, Iterator
@@ -9,18 +9,29 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array
+from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.curves import Components, ErrorCurves, Errors, components, error_curves, reference_estimate
-from toolkit.report.figures.panels import scale_by_decades
+from toolkit.report.curves import (
+    Components,
+    ErrorCurves,
+    Errors,
+    available,
+    components,
+    error_curves,
+    reference_estimate,
+    running_median,
+)
 from toolkit.report.figures.style import (
     MUTED_COLOUR,
     SMALL_PT,
     TITLE_PT,
+    TRUTH_COLOUR,
     ZERO_COLOUR,
     Entry,
     NamedFigure,
@@ -29,6 +40,8 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of,
     new_figure,
+    scale_by_decades,
+    shown_as,
     stroke_of,
     style_axes,
     width_of,
@@ -50,14 +63,14 @@ _BAND_ALPHA = 0.16
 _LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 
 
-def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
     curves = error_curves(comparison)
     if curves is not None:
         yield _figure(comparison, curves, "errors_over_time")
 
 
-def draw_fitted(comparison: Comparison) -> Iterator[NamedFigure]:
+def draw_fitted_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors after a fit to the truth, where there is one."""
     curves = error_curves(comparison, fitted=True)
     if curves is not None and comparison.sequence.truth is not None:
@@ -247,3 +260,112 @@ def _caption(comparison: Comparison, name: str) -> str:
         f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: a consistent "
         "estimator is inside nearly always, and fills it."
     )
+
+
+_OF_BOUND = (
+    "How close to the limit. Black: the Cramér-Rao bound, one standard deviation (dashed: of what was known at the "
+    "time, solid: of the whole recording). In colour, thick: the error of an estimator beyond the efficient estimate "
+    "on the same measurements; well below the bound the loss is negligible. Thin: the standard deviation it "
+    "states; below the bound it is overconfident."
+)
+_LEAST_SHARE, _STATED_WIDTH = 1e-3, 0.7
+
+
+def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure where the bound was asked for and the recording has one."""
+    if not comparison.settings.metrics.bound:
+        return
+    found = [
+        (row, one)
+        for row in comparison.lines
+        if (one := available(against_bound, row.run, row.output, comparison.sequence)) is not None
+    ]
+    if found:
+        yield _bound_figure(comparison, found)
+
+
+def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
+    figure = new_figure(4.8)
+    position, rotation = figure.subplots(2, 1, sharex=True)
+    for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
+        for row, one in found:
+            _plot_estimator(axes, comparison, row, one, block, scale)
+        _plot_bounds(axes, comparison, found, block, scale)
+    style_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
+    style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
+    figure.align_ylabels()
+    bounds = [
+        Entry.of_line(f"bound {output}", TRUTH_COLOUR, line_of(output), 2.0)
+        for output in dict.fromkeys(row.output for row, _ in found)
+    ]
+    stated = Entry.of_line("thin: stated", MUTED_COLOUR, width=_STATED_WIDTH)
+    estimators = entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
+    legend_below(figure, [*bounds, *estimators, stated])
+    return NamedFigure("against_bound", _OF_BOUND, figure)
+
+
+def _plot_estimator(
+    axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
+) -> None:
+    t_s, label = comparison.sequence.elapsed_s(one.t_ns), f"{row.estimator} {row.label}"
+    stroke = stroke_of(comparison, row.estimator, shown_as(row))
+    lost = np.linalg.norm(one.excess[:, block], axis=1)
+    axes.plot(t_s, scale * lost, linewidth=1.6, label=label, **stroke)
+    axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
+
+
+def _plot_bounds(
+    axes: Axes, comparison: Comparison, found: list[tuple[Row, AgainstBound]], block: slice, scale: float
+) -> None:
+    """Draw the bound of each kind of output, and leave room for what is a thousand times below it."""
+    least = np.inf
+    for output in dict.fromkeys(row.output for row, _ in found):
+        one = next(one for row, one in found if row.output == output)
+        sigma = scale * _sigma(one.bound, block)
+        least = min(least, float(sigma.min()))
+        t_s, line = comparison.sequence.elapsed_s(one.t_ns), line_of(output)
+        axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=_LEAST_SHARE * least)
+
+
+def _sigma(covs: Array, block: slice) -> Array:
+    """Return the root (n,) of the trace of a block of covariances (n, d, d)."""
+    return np.asarray(np.sqrt(np.trace(covs[:, block, block], axis1=1, axis2=2)))
+
+
+_MS = 1e3
+
+
+def draw_frame_times(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the time of each step by frame, on a logarithmic axis, with the finish in the legend."""
+    timed = [(run, run.timings) for run in comparison.runs if run.timings is not None and run.timings.step_s.size]
+    if not timed:
+        return
+    figure = new_figure(3.4)
+    axes = figure.add_subplot()
+    entries = []
+    for run, timings in timed:
+        step_ms = np.maximum(timings.step_s * _MS, 1e-4)
+        stroke = stroke_of(comparison, run.estimator, "final")
+        axes.plot(step_ms, ".", color=stroke["color"], markersize=2.5, alpha=0.35)
+        cpu_ms = _MS * timings.cpu_s / timings.step_s.size
+        label = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
+        if timings.finish_s > timings.step_s.sum():
+            label += f", end {timings.finish_s:.1f} s"
+        (median,) = axes.plot(running_median(step_ms), linewidth=width_of(comparison, run.estimator), **stroke)
+        entries.append(Entry(label, (median,)))
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least, so that jitter alone does not fill the axis
+    axes.set_ylim(low / widened, high * widened)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    style_axes(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
+    legend_below(figure, entries)
+    caption = (
+        "Wall-clock time of each step (dots) and its running median (lines). In the legend their mean, and the "
+        "processor time (CPU) a frame, the finish included: on a busy machine it alone is the estimator's. An "
+        "estimator that answers only at the end does its work there; that time is in the legend, too."
+    )
+    yield NamedFigure("frame_times", caption, figure)

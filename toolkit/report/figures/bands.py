@@ -1,0 +1,214 @@
+"""Errors over what they should be, in a panel an estimator: NEES and NIS in their 95 % bands, and errors over seeds.
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from toolkit.estimate import Output
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.geometry import Array
+from toolkit.metrics import Evaluation
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
+from toolkit.report.curves import available
+from toolkit.report.figures.style import (
+    BAND_COLOUR,
+    MUTED_COLOUR,
+    Entry,
+    NamedFigure,
+    annotate,
+    colour_of,
+    finish,
+    line_of,
+    output_entries,
+    panels_of,
+    scale_by_decades,
+    shown_as,
+)
+
+# Values of a NEES or NIS over its expectation beyond these are drawn at the limit, and the panel gives the largest.
+RANGE = (1e-2, 1e4)
+_OF_NEES = (
+    "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the estimator "
+    "states. In the band (grey) are 95 % of the frames of a consistent estimator; how many are stands above each "
+    "panel. Above the band an estimator is overconfident, below it timid. Errors of neighbouring frames are "
+    "correlated: a long stay outside may be chance, and only several seeds can decide."
+)
+_OF_NIS = (
+    "Innovations of each frame, squared, over what the estimator's own covariances predict behind its gate "
+    "(NIS). It needs no truth. In the band (grey) are 95 % of the frames of a consistent filter; how many are stands "
+    "above each panel. Its width is that of the run's own scatter from frame to frame: a gate makes a frame's "
+    "innovations scatter less, the error of the pose that they share more. A long stay above it means innovations "
+    "larger than the estimator expects."
+)
+
+
+class Normalised(NamedTuple):
+    """Squared errors over their expectation at times (n,) s, and the band (n,), (n,) of a consistent estimator.
+
+    NaN means unknown.
+    """
+
+    t_s: Array
+    value: Array
+    low: Array
+    high: Array
+
+    @property
+    def in_band_percent(self) -> float:
+        """Return the share of the values that are in the band."""
+        known = ~np.isnan(self.value)
+        return 100.0 * float(np.mean(((self.value >= self.low) & (self.value <= self.high))[known]))
+
+
+class Drawn(NamedTuple):
+    """What a panel of an estimator shows, in its colour and with the line of a kind of output."""
+
+    estimator: str
+    colour: str
+    output: Output
+    series: Normalised
+
+
+def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: str, title: str) -> Figure:
+    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it.
+
+    A panel whose values leave the figure says how large they become.
+    """
+    figure, panels = panels_of(panels_for)
+    shares: dict[str, list[float]] = {}
+    largest: dict[str, float] = {}
+    least = most = 1.0
+    for estimator, colour, output, series in drawn:
+        axes, shown = panels[estimator], np.clip(series.value, *RANGE)
+        axes.fill_between(series.t_s, series.low, series.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
+        axes.plot(series.t_s, shown, color=colour, linestyle=line_of(output), linewidth=1.0)
+        shares.setdefault(estimator, []).append(series.in_band_percent)
+        largest[estimator] = np.nanmax([largest.get(estimator, 0.0), *series.value])
+        least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
+    for estimator, percents in shares.items():
+        text = ", ".join(f"{percent:.0f} %" for percent in percents)
+        beyond = f", up to {largest[estimator]:.0e}" if largest[estimator] > RANGE[1] else ""
+        annotate(panels, estimator, (f"{text} in band{beyond}", f"{text}{beyond}", text))
+    scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
+    finish(
+        figure,
+        panels,
+        what,
+        title,
+        [
+            *output_entries({one.output for one in drawn}),
+            Entry("95 % band", (Patch(color=BAND_COLOUR, linewidth=0.0),)),
+        ],
+    )
+    return figure
+
+
+def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of the NEES where there is an independent truth."""
+
+    def of(evaluation: Evaluation) -> Normalised:
+        nees = nees_over_time(evaluation)
+        low, high = (np.full(nees.pose.size, side) for side in nees_band(POSE_DOF))
+        return Normalised(comparison.sequence.elapsed_s(nees.t_ns), nees.pose, low, high)
+
+    found = [(row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines]
+    yield from _of_one_run(comparison, found, "nees_over_time", "pose NEES / 6", _OF_NEES)
+
+
+def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of the NIS where any estimator reports innovations."""
+
+    def of(evaluation: Evaluation) -> Normalised:
+        nis = nis_over_time(evaluation)
+        t_s = comparison.sequence.elapsed_s(evaluation.estimate.t_ns[nis.rows])
+        return Normalised(t_s, nis.nis / nis.expected, *nis.bands())
+
+    found = [(row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines]
+    yield from _of_one_run(comparison, found, "nis_over_time", "NIS / expected", _OF_NIS)
+
+
+def _of_one_run(
+    comparison: Comparison, found: Sequence[tuple[Row, Normalised | None]], name: str, what: str, caption: str
+) -> Iterator[NamedFigure]:
+    drawn = [
+        Drawn(row.estimator, colour_of(comparison, row.estimator), shown_as(row), series)
+        for row, series in found
+        if series is not None
+    ]
+    if drawn:
+        estimators = list(dict.fromkeys(one.estimator for one in drawn))
+        yield NamedFigure(name, caption, figure_with_bands(estimators, drawn, what, f"{comparison.name}: {what}"))
+
+
+def draw_over_seeds(over: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of position errors and that of NEES, each where there is anything to draw."""
+    if any(group.position_m is not None for group in over.rows):
+        yield _errors(over)
+    if any(group.mean_nees is not None for group in over.rows):
+        yield _nees(over)
+
+
+def _errors(over: Comparison) -> NamedFigure:
+    figure, panels = panels_of(over.estimators)
+    kinds: set[Output] = set()
+    for group in over.rows:
+        errors_m = group.position_m
+        if errors_m is None or _repeats(over, group):
+            continue
+        known = np.isfinite(errors_m).any(axis=0)
+        lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
+        kind = _shown_as(over, group)
+        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], colour_of(over, group.estimator)
+        axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
+        axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
+        kinds.add(kind)
+    title = f"{over.name}, {len(over.seeds)} seeds: position error from the common start"
+    quartiles = Entry("quartiles (lines: medians)", (Patch(color=MUTED_COLOUR, alpha=0.2),))
+    finish(figure, panels, "position error [m]", title, [*output_entries(kinds), quartiles])
+    next(iter(panels.values())).set_ylim(bottom=0.0)
+    caption = (
+        f"Position error over time on {over.name}, {len(over.seeds)} seeds, from the common start: the median and, "
+        "shaded, the quartiles over the runs that are ok. Dashed: causal, what was known at the time. Solid: final."
+    )
+    return NamedFigure("errors_over_seeds", caption, figure)
+
+
+def _nees(over: Comparison) -> NamedFigure:
+    drawn = [
+        Drawn(
+            group.estimator,
+            colour_of(over, group.estimator),
+            _shown_as(over, group),
+            Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high),
+        )
+        for group in over.rows
+        if (nees := group.mean_nees) is not None and not _repeats(over, group)
+    ]
+    caption = (
+        f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
+        f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band an "
+        f"estimator is overconfident. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
+    )
+    title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
+    figure = figure_with_bands(over.estimators, drawn, "pose NEES / 6", title)
+    return NamedFigure("nees_over_seeds", caption, figure)
+
+
+def _repeats(over: Comparison, group: Row) -> bool:
+    """Say whether a group's errors are those of the estimator's other output, as a filter's final ones are."""
+    causal = next((g for g in over.rows if g.estimator == group.estimator and g.output == "causal"), None)
+    if causal in (None, group) or causal.position_m is None or group.position_m is None:
+        return False
+    return np.array_equal(causal.position_m, group.position_m, equal_nan=True)
+
+
+def _shown_as(over: Comparison, group: Row) -> Output:
+    """Return the output whose look a group has: a filter's only answer is drawn as a final one."""
+    both = any(g.estimator == group.estimator and _repeats(over, g) for g in over.rows)
+    return "final" if both else group.output
