@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import toolkit
 from toolkit.api import Result
 from toolkit.audit import faults
 from toolkit.datasets import load_sequence
+from toolkit.datasets.io.truth import load_truth
 from toolkit.errors import DataError, VislamError
 from toolkit.estimator import Estimator, Setup
 from toolkit.experiment import Comparison, Plan
@@ -67,33 +68,23 @@ def test_a_sequence_and_its_name_give_the_same(result: Result) -> None:
 
 
 @pytest.mark.usefixtures("unrendered")
-@pytest.mark.parametrize("kind", [str, Path])
-def test_a_recording_and_its_truth_are_paths_or_strings(
-    tmp_path: Path, result: Result, kind: Callable[[Path], str | Path]
-) -> None:
-    result.save(tmp_path / "run")
+def test_a_result_is_saved_and_a_recording_and_its_truth_are_paths_or_strings(tmp_path: Path, result: Result) -> None:
+    assert result.save(str(tmp_path / "run")) == tmp_path / "run"
     truth = tmp_path / "run/trajectories/truth.tum"
-    compared = toolkit.compare(kind(RECORDING), "dead-reckoning", truth=kind(truth), max_frames=FRAMES, workers=1)
-    assert compared.comparison.sequence.truth is not None
-    np.testing.assert_array_equal(compared.comparison.sequence.truth.t_ns, np.array(_stamps(truth)))
+    for recording, file in ((RECORDING, truth), (str(RECORDING), str(truth))):
+        compared = toolkit.compare(recording, "dead-reckoning", truth=file, max_frames=FRAMES, workers=1).comparison
+        assert compared.sequence.truth is not None
+        assert compared.sequence.truth.t_ns.tolist() == load_truth(truth).t_ns.tolist()
 
 
-def _stamps(tum: Path) -> list[int]:
-    lines = (line for line in tum.read_text().splitlines() if not line.startswith("#"))
-    return [int(line.split()[0].replace(".", "")) for line in lines]
-
-
-@pytest.mark.parametrize(
-    "names", ["ekf", ["ekf"], ("ekf",), iter(["ekf"])], ids=["a name", "list", "tuple", "iterator"]
-)
-def test_estimators_are_one_name_or_several(result: Result, names: str | Iterable[str]) -> None:
-    alone = toolkit.compare("drive", names, max_frames=FRAMES, workers=1)
-    assert alone.comparison.estimators == ("ekf",)
-    assert ate(alone) == ate(result)[2:]
-
-
-def test_without_names_the_default_estimators_are_compared() -> None:
+def test_estimators_are_one_name_several_or_the_default_ones(result: Result) -> None:
+    for names in ("ekf", ["ekf"], iter(["ekf"])):
+        alone = toolkit.compare("drive", names, max_frames=FRAMES, workers=1)
+        assert alone.comparison.estimators == ("ekf",)
+        assert ate(alone) == ate(result)[2:]
     assert toolkit.compare("drive", max_frames=3, workers=1).comparison.estimators == defaults() != ()
+    assert not result.comparison.changes
+    assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
 
 
 def test_an_estimator_that_is_no_file_is_compared_under_its_own_name(result: Result) -> None:
@@ -114,11 +105,6 @@ def test_faults_that_are_kept_are_not_repaired() -> None:
         for keep in ((), faults())
     ]
     assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
-
-
-def test_only_the_ladder_states_what_its_rungs_change(result: Result) -> None:
-    assert not result.comparison.changes
-    assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
 
 
 def test_a_table_has_the_columns_requested_in_their_order_by_key_or_name(result: Result) -> None:
@@ -226,14 +212,11 @@ def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> No
         return find("dead-reckoning").load()(setup)
 
     def compared(seeds: int) -> Result:
-        requested = {
-            "own": {"mine": mine},
-            "max_frames": FRAMES,
-            "seeds": seeds,
-            "workers": 1,
-            "resume": tmp_path / "run",
-        }
-        return toolkit.compare("drive", "dead-reckoning", **requested)
+        run = tmp_path / "run"
+        own = {"mine": mine}
+        return toolkit.compare(
+            "drive", "dead-reckoning", own=own, max_frames=FRAMES, seeds=seeds, workers=1, resume=run
+        )
 
     compared(2)
     kept = (tmp_path / "run" / "outcomes.jsonl").read_text().splitlines()
@@ -318,11 +301,6 @@ def test_a_sequence_whose_observations_are_not_of_its_frames_is_refused() -> Non
             toolkit.compare(_with(**columns), "dead-reckoning", workers=1)
     with pytest.raises(DataError, match="it has no -3 frames"):
         _with().truncated(-3)
-
-
-def test_a_result_is_saved_as_a_run_directory(tmp_path: Path, over: Result, unrendered: None) -> None:
-    assert over.save(str(tmp_path / "run")) == tmp_path / "run"
-    assert (tmp_path / "run/seeds.json").is_file()
 
 
 def surrounded(words: list[str], program: str | None, folder: Path) -> str:

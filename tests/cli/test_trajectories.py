@@ -95,45 +95,30 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("words", "why"),
+    ("of", "words", "why"),
     [
-        ((), "holds several trajectories; choose one with --estimator: dead-reckoning, ekf, truth"),
-        (("--estimator", "batch"), "has no trajectory of batch; there are dead-reckoning, ekf, truth"),
+        ("run", (), "holds several trajectories; choose one with --estimator: dead-reckoning, ekf, truth"),
+        ("run", ("--estimator", "batch"), "has no trajectory of batch; there are dead-reckoning, ekf, truth"),
+        ("gaps", ("--estimator", "ekf"), "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames"),
+        ("again", ("--estimator", "by tum", "--output", "causal"), "no causal trajectory of by tum, only a final one"),
+        ("seeds", (), "over seeds and holds no trajectories"),
     ],
 )
-def test_a_choice_that_is_not_there_is_reported_with_those_that_are(
-    vislam: Vislam, one_line: OneLine, run: Path, words: tuple[str, ...], why: str
+def test_what_cannot_be_exported_is_reported_with_what_can(
+    vislam: Vislam, one_line: OneLine, run: Path, again: Path, of: str, words: tuple[str, ...], why: str
 ) -> None:
-    assert vislam("export", str(run), *words, "--format", "tum", "--out", "out.tum") == 3
+    if of == "gaps":
+        path = Path(shutil.copytree(run, "gaps"), "trajectories/ekf_final.tum")
+        path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    if of == "seeds":
+        assert vislam(*QUICK, "--max-frames", "5", "--seeds", "2", "--out", "seeds") == 0
+    directory = {"run": run, "again": again}.get(of, Path(of))
+    assert vislam("export", str(directory), *words, "--format", "kitti", "--out", "out") == 3
     assert why in one_line()
-    assert not Path("out.tum").exists()
-
-
-def test_an_output_that_was_not_given_is_reported(vislam: Vislam, one_line: OneLine, again: Path) -> None:
-    words = ("--estimator", "by tum", "--output", "causal", "--format", "tum", "--out", "out.tum")
-    assert vislam("export", str(again), *words) == 3
-    assert "has no causal trajectory of by tum, only a final one" in one_line()
-
-
-def test_kitti_cannot_hold_a_trajectory_with_gaps(vislam: Vislam, one_line: OneLine, run: Path) -> None:
-    shutil.copytree(run, "gaps")
-    path = Path("gaps/trajectories/ekf_final.tum")
-    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
-    assert vislam("export", "gaps", "--estimator", "ekf", "--format", "kitti", "--out", "out") == 3
-    assert "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames" in one_line()
+    assert not Path("out").exists()
 
 
 def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) -> None:
     for words in (("truth",), ("ekf", "--output", "causal"), ("ekf", "--output", "final")):
         assert vislam("export", str(run), "--estimator", *words, "--format", "euroc", "--out", "out.csv") == 0
         assert len(read_poses(Path("out.csv"))) == 20
-
-
-def test_a_comparison_over_seeds_has_nothing_to_export(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], one_line: OneLine
-) -> None:
-    seeds = ("--estimators", "dead-reckoning", "--max-frames", "5", "--seeds", "2", "--workers", "1", "--out", "seeds")
-    assert vislam("compare", "drive", *seeds) == 0
-    capsys.readouterr()
-    assert vislam("export", "seeds", "--format", "tum", "--out", "out") == 3
-    assert "over seeds and holds no trajectories" in one_line()
