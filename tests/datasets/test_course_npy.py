@@ -17,7 +17,7 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.datasets import load_images, load_sequence
-from toolkit.datasets.io.plain_pickle import read_dict
+from toolkit.datasets.io.numpy_files import read_dict
 from toolkit.errors import DataError
 from toolkit.geometry import Array, se3, se3_inverse
 from toolkit.measurements import NS_PER_S
@@ -107,7 +107,7 @@ def test_kept_the_convention_is_reported_and_the_extrinsic_left_as_it_is(tmp_pat
     path = saved(tmp_path, course_dict(drive(), "inverted, camera axes regular"))
     audited = audit(load_sequence(str(path)), keep=frozenset({"extrinsic-convention", "mixed-axes"}))
     assert any(finding.fault == "extrinsic-convention" and finding.blocking for finding in audited.findings)
-    given = se3_inverse(read_dict(path)["extL_T_imu"].read())
+    given = se3_inverse(read_dict(path)["extL_T_imu"])
     np.testing.assert_array_equal(audited.sequence.rig.T_imu_cam, given)
 
 
@@ -136,7 +136,7 @@ def test_memory_order_and_number_type_do_not_matter(
     small["v_t"] = small["v_t"].astype(dtype if dtype != "<i2" else "<f8")
     small["features_again"] = small["features"]  # by reference in the pickle
     path = saved(tmp_path, small)
-    np.testing.assert_array_equal(read_dict(path)["features_again"].read(), small["features"])
+    np.testing.assert_array_equal(read_dict(path)["features_again"], small["features"])
     assert len(load_sequence(str(path)).observations) == len(drive().truncated(6).observations)
 
 
@@ -209,6 +209,29 @@ def test_other_content_is_refused_in_one_line(
     assert_refused(lambda: load_sequence(str(path)), path, pattern)
 
 
+@pytest.mark.parametrize(
+    ("instructions", "pattern"),
+    [
+        (b"cposix\nsystem\n(S'true'\ntR.", r"names posix\.system.*nothing of it was executed"),
+        (b"cnumpy\nndarray\n}X\x01\x00\x00\x00aK\x01sb.", "a value is given a state"),
+        (b"cnumpy\ndtype\n)\x81.", "uses NEWOBJ"),
+        (b"(iposix\nsystem\n.", "uses INST"),
+        (b"\x82\x01.", "uses EXT1"),
+        (b"Ptext\n.", "uses PERSID"),
+        (b"\x96" + (1 << 40).to_bytes(8, "little") + b".", "uses BYTEARRAY8"),
+        (b"\xff.", "uses byte 255"),
+        (b"\x8a\xff", "255 bytes are announced and 0 are left"),
+        (b"]r\xff\xff\xff\xff.", "holds no dict"),
+    ],
+)
+def test_what_no_plain_data_need_is_refused_by_name(
+    tmp_path: Path, assert_refused: Refused, instructions: bytes, pattern: str
+) -> None:
+    path = saved(tmp_path, {"v_t": 1})
+    path.write_bytes(path.read_bytes()[:128] + instructions)
+    assert_refused(lambda: load_sequence(str(path)), path, pattern)
+
+
 def test_bytes_that_are_announced_and_not_there_are_no_memory_taken(tmp_path: Path, assert_refused: Refused) -> None:
     path = saved(tmp_path, {"v_t": 1})
     header = path.read_bytes()[:128]
@@ -272,7 +295,7 @@ def test_unpacked_images_go_when_they_are_no_longer_used(with_images: Path) -> N
 
 
 def test_features_are_taken_before_images_unless_requested(with_images: Path) -> None:
-    content = {key: value.read() for key, value in read_dict(with_images).items()}
+    content = read_dict(with_images)
     with_images = saved(with_images.parent, {**content, "features": np.full((4, 2, 8), -1.0)}, with_images.name)
     assert len(load_sequence(str(with_images)).observations) == 0
     assert len(load_sequence(str(with_images), 0, Frontend(tracks="images")).observations) > 0

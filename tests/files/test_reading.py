@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from toolkit.datasets import load_references, load_sequence
-from toolkit.datasets.io.npz_archive import opened
+from toolkit.datasets.io.numpy_files import opened
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError, VislamError
 from toolkit.experiment.configuration import read_configuration

@@ -2,7 +2,7 @@
 
 The dict has ``v_t`` and ``w_t`` (T, 3), ``timestamps`` (T,) s, ``features`` (4, M, T) of uL vL uR vR with -1 where not
 seen, ``K_l``, ``K_r``, ``extL_T_imu`` and ``extR_T_imu``. It is read, never unpickled
-(:mod:`~toolkit.datasets.io.plain_pickle`). Where there are no features, or images are asked for, the tracks are made of
+(:mod:`~toolkit.datasets.io.numpy_files`). Where there are no features, or images are asked for, the tracks are made of
 ``cam_imgs_L`` and ``cam_imgs_R``.
 
 The extrinsics are called IMU to camera, and files are about that hold camera to IMU, in axes x forward, y left, z up.
@@ -25,8 +25,7 @@ from toolkit.datasets.io.fields import (
     stamps_ns,
 )
 from toolkit.datasets.io.image_pairs import facts_of, rig_of
-from toolkit.datasets.io.npz_archive import ArrayLayout, Named, corners_of, sparse_array
-from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
+from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend import (
@@ -70,7 +69,7 @@ def load(path: Path) -> Sequence:
     """
     parts = _parts(path)
     features = parts.stored.get(_FEATURES)
-    if not isinstance(features, StoredArray):
+    if not isinstance(features, np.ndarray):
         nothing = np.empty(0, dtype=np.int64)
         return _sequence(parts, _rig(parts), Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,))
     return _sequence(parts, _rig(parts), _sightings(parts, features), ())
@@ -131,8 +130,6 @@ def _parts(path: Path) -> _Parts:
 
 
 def _array(value: Any) -> Any:
-    if isinstance(value, StoredArray):
-        return value.read()
     try:
         return np.asarray(value)
     except ValueError:  # a ragged list
@@ -189,12 +186,8 @@ def _turned(fields: Fields) -> Iterator[str]:
         yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
-def _sightings(parts: _Parts, features: StoredArray) -> Observations:
-    layout = ArrayLayout(features.shape, features.fortran_order, features.dtype)
-    with features.opened() as stream:
-        sparse = sparse_array(
-            Named(parts.path, _FEATURES), layout, (4, None, parts.t_ns.size), stream, filler=_NOT_SEEN
-        )
+def _sightings(parts: _Parts, features: np.ndarray) -> Observations:
+    sparse = sparse_array(parts.path, _FEATURES, features, (4, None, parts.t_ns.size), _NOT_SEEN)
     frame, track, corners_px = corners_of(sparse)
     return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px))
 
@@ -216,7 +209,7 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
     """Write the images of both cameras to the spool, and return the pairs and the size (width, height) px."""
     path, count = _beside(parts.path), parts.t_ns.size
     stored = read_dict(path)
-    sides: list[list[StoredArray]] = []
+    sides: list[list[np.ndarray]] = []
     for key in _IMAGES:
         images = stored.get(key)
         if not isinstance(images, list):
@@ -229,7 +222,7 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
     pairs = []
     for place, (left, right) in enumerate(zip(*sides, strict=True)):
         names = (f"{side}/{place:06d}" for side in ("left", "right"))
-        kept = [spool.add_grey(name, image.read()) for name, image in zip(names, (left, right), strict=True)]
+        kept = [spool.add_grey(name, image) for name, image in zip(names, (left, right), strict=True)]
         pairs.append(StampedPair(int(parts.t_ns[place]), *kept))
         progress.advance(place + 1, count, "unpacking images")
     height, width = sides[0][0].shape
@@ -237,7 +230,7 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
 
 
 def _check_image(path: Path, key: str, image: Any) -> None:
-    is_image = isinstance(image, StoredArray) and len(image.shape) == 2 and image.dtype == np.uint8
+    is_image = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
     if not is_image or 0 in image.shape:
         raise DataError(f"{path}: {key} is no array (height, width) of uint8; save the images as grey ones")
 

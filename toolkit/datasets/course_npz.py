@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
-from toolkit.datasets.io.npz_archive import NpzArchive, array_names, corners_of, opened
+from toolkit.datasets.io.numpy_files import NpzArchive, array_names, corners_of, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import StereoRig

@@ -13,7 +13,7 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from toolkit.datasets.io.fields import check_numeric
-from toolkit.datasets.io.npz_archive import opened
+from toolkit.datasets.io.numpy_files import opened
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input, read_text_input
 from toolkit.files.writing import check_replaceable, replaced_directory

@@ -1,0 +1,401 @@
+"""NumPy's files, read without running anything in them: the arrays of an npz, and the plain data of an object npy.
+
+A pickle is a program. Of its instructions those that make plain data are carried out, and every name that it refers to
+is answered with a description of an array or a number, never with an object of a module. Sizes are checked before
+memory is taken, long arrays of a pickle are views of the mapped file, and an array that is mostly filler is streamed
+and kept sparse: the dense features of a long drive take more than a gigabyte, their sightings a few megabytes.
+Formats: numpy.lib.format, versions 1 to 3; the standard library's pickletools documents the instructions.
+"""
+
+import io
+import math
+import mmap
+import pickle
+import pickletools
+import struct
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple, NoReturn, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from toolkit.arrays import check_shape
+from toolkit.datasets.io.fields import Fields, check_numeric
+from toolkit.errors import DataError, printable
+from toolkit.files.reading import is_regular, open_input
+from toolkit.geometry import Array, IntArray
+
+MAGIC = b"\x93NUMPY"
+# Small enough for the processor's cache, large enough that the Python around it does not show.
+_CHUNK_BYTES = 1 << 18
+# A dense array of a recording is far smaller: an hour of IMU samples at 1 kHz has 200 MB.
+_MOST_BYTES = 2 << 30
+# A recording of an hour at 30 Hz, both its images as arrays of their own, takes six million.
+_MOST_OPCODES = 10_000_000
+# Longer byte strings of a pickle stay in the file.
+_LONG_BYTES = 1 << 16
+_ZIP_MAGIC, _ZIP_HEADER = b"PK\x03\x04", struct.Struct("<26xHH")
+_DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError, MemoryError)
+_DAMAGED_PICKLE = (
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError, MemoryError, RecursionError),
+    *(struct.error, pickle.UnpicklingError),
+)
+
+
+class _Layout(NamedTuple):
+    """What a header says of an array."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[np.generic]
+
+
+def _header(stream: IO[bytes], what: str) -> _Layout:
+    """Read the header of an npy, and leave the stream at its values."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        return _Layout(*read(stream))
+    except (ValueError, TypeError, SyntaxError, OverflowError) as error:
+        raise DataError(f"{what} has no valid .npy header: {_first_line(error)}; copy or save it again") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return printable(str(error).partition("\n")[0])[:200] or type(error).__name__
+
+
+# Sparse arrays ------------------------------------------------------------------------------------------------
+
+
+class SparseArray(NamedTuple):
+    """The entries of a dense array that differ from its filler: indices per axis, each (E,), and values (E,)."""
+
+    shape: tuple[int, ...]
+    indices: tuple[IntArray, ...]
+    value: Array
+
+
+def sparse_array(
+    path: Path, key: str, array: npt.NDArray[np.generic], shape: tuple[int | None, ...], filler: float
+) -> SparseArray:
+    """Return what differs from the filler in an array that may be larger than memory, as a view of a file is.
+
+    Raises DataError, naming file and key, where it holds no real numbers or has another shape (None = any).
+    """
+    check_numeric(path, key, array.dtype)
+    check_shape(f"{path}: {key}", array.shape, shape)
+    flat = array.ravel(order="K")
+    step = _CHUNK_BYTES // array.itemsize
+    order = "F" if array.flags.f_contiguous else "C"
+    chunks = (flat[at : at + step] for at in range(0, flat.size, step))
+    return _sparse(f"{path}: {key}", _Layout(array.shape, order == "F", array.dtype), chunks, filler)
+
+
+def _sparse(what: str, layout: _Layout, chunks: Iterator[npt.NDArray[Any]], filler: float) -> SparseArray:
+    """Keep what is not the filler of an array's values in the order of its memory.
+
+    NaN is not, unless the array has no filler at all: then it stands for it.
+    """
+    size, expected = 0, math.prod(layout.shape)
+    positions, kept_values = [np.empty(0, dtype=np.int64)], [np.empty(0)]
+    for values in chunks:
+        kept = np.flatnonzero(values != filler)
+        positions.append(kept + size)
+        kept_values.append(values[kept].astype(np.float64))
+        size += values.size
+    if size != expected:
+        raise DataError(f"{what} ends after {size} of {expected} values; save it again")
+    position, value = np.concatenate(positions), np.concatenate(kept_values)
+    if value.size == expected and np.isnan(value).any():
+        position, value = position[~np.isnan(value)], value[~np.isnan(value)]
+    indices = np.unravel_index(position, layout.shape, order="F" if layout.fortran_order else "C")
+    return SparseArray(layout.shape, indices, value)
+
+
+def corners_of(features: SparseArray) -> tuple[IntArray, IntArray, Array]:
+    """Return frame (N,), track (N,) and uL, vL, uR, vR (N, 4) px of features (4, M, T).
+
+    A sighting that lacks a coordinate has NaN there: both of the right image, or one, for the audit to find.
+    """
+    coordinate, track, frame = features.indices
+    tracks = max(features.shape[1], 1)
+    cell, row = np.unique(frame * tracks + track, return_inverse=True)
+    corners_px: Array = np.full((cell.size, 4), np.nan)
+    corners_px[row, coordinate] = features.value
+    return cell // tracks, cell % tracks, corners_px
+
+
+# Archives -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NpzArchive:
+    """An open archive; keys are member names without their ``.npy``."""
+
+    path: Path
+    archive: zipfile.ZipFile
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of all arrays."""
+        return [name.removesuffix(".npy") for name in self.archive.namelist() if name.endswith(".npy")]
+
+    def fields(self, *left_out: str) -> Fields:
+        """Read every array whole, but for the keys left out."""
+        return Fields(self.path, {key: self._dense(key) for key in self.keys if key not in left_out})
+
+    def sparse(self, key: str, shape: tuple[int | None, ...], filler: float) -> SparseArray:
+        """Stream one array of a shape (None = any), in either memory order; keep what differs from the filler.
+
+        Raises DataError, naming the key, where it holds no real numbers, has another shape, or ends too early.
+        """
+        what = f"{self.path}: {key}"
+        with self.archive.open(f"{key}.npy") as stream:
+            layout = _header(stream, what)
+            check_numeric(self.path, key, layout.dtype)
+            check_shape(what, layout.shape, shape)
+            return _sparse(what, layout, _chunks(stream, layout), filler)
+
+    def _dense(self, key: str) -> npt.NDArray[np.generic]:
+        what, name = f"{self.path}: {key}", f"{key}.npy"
+        with self.archive.open(name) as stream:
+            layout = _header(stream, what)
+        size, stored = math.prod(layout.shape) * layout.dtype.itemsize, self.archive.getinfo(name).file_size
+        if layout.dtype.kind == "O":
+            raise DataError(f"{what} holds objects, which are never unpickled; save it as plain numbers")
+        if size > stored:
+            raise DataError(f"{what} ends after {stored} of {size} bytes; save it again")
+        if size > _MOST_BYTES:
+            raise DataError(f"{what} takes {size / 1e9:.1f} GB, more than is read at once; cut the recording")
+        with self.archive.open(name) as stream:
+            try:
+                array: npt.NDArray[np.generic] = np.lib.format.read_array(stream, allow_pickle=False)
+            except ValueError as error:
+                raise DataError(f"{what} cannot be read: {_first_line(error)}; save it as plain numbers") from error
+        return array
+
+
+def _chunks(stream: IO[bytes], layout: _Layout) -> Iterator[npt.NDArray[Any]]:
+    size, left = layout.dtype.itemsize, math.prod(layout.shape)
+    while chunk := stream.read(min(_CHUNK_BYTES // size, left) * size):
+        count = len(chunk) // size
+        yield np.frombuffer(chunk, layout.dtype, count)
+        left -= count
+        if not count:
+            return
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[NpzArchive]:
+    """Open an archive; damage met while it is open is raised as DataError."""
+    try:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
+            found = NpzArchive(path, archive)
+            twice = [key for key, times in Counter(found.keys).items() if times > 1]
+            if twice:
+                raise DataError(f"{path}: {twice[0]} is in the archive twice; save it with one array of that name")
+            yield found
+    except (OSError, *_DAMAGED_ZIP) as error:
+        raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
+
+
+def array_names(path: Path) -> set[str]:
+    """Return the keys of an archive without reading arrays; of a damaged one its first key, of anything else none."""
+    if not is_regular(path):
+        return set()
+    try:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
+            return set(NpzArchive(path, archive).keys)
+    except (OSError, *_DAMAGED_ZIP):
+        return _first_key(path)
+
+
+def _first_key(path: Path) -> set[str]:
+    """Read the name in the first local header: a truncated archive has lost the directory at its end."""
+    with path.open("rb") as stream:
+        header = stream.read(_ZIP_HEADER.size)
+        if len(header) < _ZIP_HEADER.size or not header.startswith(_ZIP_MAGIC):
+            return set()
+        name_length, _ = _ZIP_HEADER.unpack(header)
+        return {stream.read(name_length).decode(errors="replace").removesuffix(".npy")}
+
+
+# Pickles of plain data ----------------------------------------------------------------------------------------
+
+Plain = Any  # None, bool, int, float, str, bytes, arrays, and lists, tuples and dicts of these
+
+
+def read_dict(path: Path) -> dict[str, Plain]:
+    """Return the dict that an object ``.npy`` holds; its arrays (read-only) are views of the file, unread until used.
+
+    Raises DataError where the file is none or damaged, holds anything else, or names an object that is not plain data.
+    """
+    with open_input(path) as file:
+        layout = _header(file, f"{path}:")
+        if layout.dtype.kind != "O":
+            raise DataError(
+                f"{path}: one array of shape {layout.shape}, expected a dict of arrays by name, saved with numpy.save"
+            )
+        try:
+            content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+            found = _PlainUnpickler(path, _Mapped(content, file.tell())).load()
+        except _DAMAGED_PICKLE as error:
+            raise DataError(
+                f"{path}: damaged or truncated npy ({_first_line(error)}); copy or save it again"
+            ) from error
+    inner = found[0] if isinstance(found, list) and len(found) == 1 else found
+    if not (isinstance(inner, dict) and all(isinstance(key, str) for key in inner)):
+        raise DataError(f"{path}: holds no dict of named values; save the recording as one with numpy.save")
+    return cast(dict[str, Plain], inner)
+
+
+class _Mapped:
+    """A mapped file, read as a stream: long byte strings are views of it."""
+
+    def __init__(self, content: memoryview, at: int) -> None:
+        self._content, self._at = content, at
+
+    def read(self, count: int) -> bytes | memoryview:
+        left = len(self._content) - self._at
+        if count > left:
+            raise ValueError(f"{count} bytes are announced and {left} are left")
+        found = self._content[self._at : self._at + count]
+        self._at += count
+        return found if count >= _LONG_BYTES else bytes(found)
+
+    def readline(self) -> bytes:
+        line = io.BytesIO(self._content[self._at : self._at + _LONG_BYTES]).readline()
+        self._at += len(line)
+        return line
+
+
+class _Begun:
+    """A dtype or an array between the instruction that begins it and the one that brings its state."""
+
+    __slots__ = ("finish", "value")
+
+    def __init__(self, finish: Callable[[Any], Any]) -> None:
+        self.finish = finish
+        self.value: Any = None
+
+
+class _Memo(dict[int, Any]):
+    """Values that a pickle may refer to again; what was begun is given as what it became."""
+
+    def __getitem__(self, key: int) -> Any:
+        kept = super().__getitem__(key)
+        return kept.value if isinstance(kept, _Begun) else kept
+
+
+# The library's reader in C takes memory for bytes before it has met them, and tells nothing of single instructions.
+_InPython: Any = pickle._Unpickler
+
+
+class _PlainUnpickler(_InPython):  # type: ignore[misc]
+    """The standard library's reader in Python, with the instructions and names of plain data alone."""
+
+    def __init__(self, path: Path, source: _Mapped) -> None:
+        super().__init__(source)
+        self.memo = _Memo()
+        self.dispatch = _Instructions(path)
+        self._path = path
+
+    def find_class(self, module: str, name: str) -> Callable[..., Any]:
+        """Return what makes the description of an object; raise DataError for any that plain data do not need."""
+        full = f"{module}.{name}".replace("numpy.core.", "numpy._core.")
+        if full not in _MAKERS:
+            raise DataError(
+                f"{self._path}: its pickle names {printable(f'{module}.{name}')[:100]}, and only plain numbers, texts, "
+                "lists, dicts and arrays are read; nothing of it was executed"
+            )
+        return _MAKERS[full]
+
+    def load_build(self) -> None:
+        """Finish the dtype or array that is last on the stack; nothing else has a state, so that nothing is set."""
+        state, begun = self.stack.pop(), self.stack[-1]
+        if not isinstance(begun, _Begun):
+            raise ValueError("a value is given a state")
+        self.stack[-1] = begun.value = begun.finish(state)
+
+
+class _Instructions(dict[int, Callable[[_PlainUnpickler], None]]):
+    """What is carried out for each instruction that plain data need; the others are refused, as are too many."""
+
+    def __init__(self, path: Path) -> None:
+        known = _InPython.dispatch
+        super().__init__({code: known[code] for code in _PLAIN} | {pickle.BUILD[0]: _PlainUnpickler.load_build})
+        self._path, self._left = path, _MOST_OPCODES
+
+    def __getitem__(self, code: int) -> Callable[[_PlainUnpickler], None]:
+        self._left -= 1
+        if self._left < 0:
+            raise DataError(f"{self._path}: more than {_MOST_OPCODES} pickled values; it is no recording")
+        return super().__getitem__(code)
+
+    def __missing__(self, code: int) -> NoReturn:
+        name = next((one.name for one in pickletools.opcodes if ord(one.code) == code), f"byte {code}")
+        raise DataError(f"{self._path}: its pickle uses {name}, which plain data do not need; it is not executed")
+
+
+_PLAIN = b"".join((
+    *(pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.GLOBAL, pickle.STACK_GLOBAL, pickle.REDUCE),
+    *(pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.INT, pickle.BININT, pickle.BININT1, pickle.BININT2),
+    *(pickle.LONG, pickle.LONG1, pickle.LONG4, pickle.FLOAT, pickle.BINFLOAT),
+    *(pickle.SHORT_BINUNICODE, pickle.BINUNICODE, pickle.BINUNICODE8),
+    *(pickle.SHORT_BINBYTES, pickle.BINBYTES, pickle.BINBYTES8),
+    *(pickle.EMPTY_LIST, pickle.LIST, pickle.APPEND, pickle.APPENDS),
+    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS),
+    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
+    *(pickle.MEMOIZE, pickle.PUT, pickle.BINPUT, pickle.LONG_BINPUT, pickle.GET, pickle.BINGET, pickle.LONG_BINGET),
+))  # fmt: skip
+_OBJECTS = "objects"
+
+
+def _dtype(text: Any, *_: Any) -> _Begun:
+    """Begin the dtype of a text like f8, whose byte order comes with its state."""
+    if text in ("O", "O8"):
+        return _Begun(lambda _: _OBJECTS)
+    dtype = np.dtype(str(text))
+    if dtype.kind not in "fiub":
+        raise ValueError(f"an array holds {dtype}, expected numbers")
+    return _Begun(lambda state: dtype.newbyteorder(state[1]) if state[1] in "<>" else dtype)
+
+
+def _array(*_: Any) -> _Begun:
+    return _Begun(_array_of)
+
+
+def _array_of(state: Any) -> Plain:
+    """Return an array of its state: a view of its bytes, or the list of its objects."""
+    _, shape, dtype, fortran_order, data = state
+    if dtype is _OBJECTS:
+        if not isinstance(data, list) or len(data) != math.prod(shape):
+            raise ValueError("an array of objects has another number of them")
+        return data
+    if len(data) != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"an array of {shape} {dtype} has {len(data)} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
+
+
+def _scalar(dtype: Any, data: Any) -> bool | int | float:
+    value: bool | int | float = np.frombuffer(data, dtype)[0].item()
+    return value
+
+
+def _class(*_: Any) -> NoReturn:
+    raise ValueError("a value is called")
+
+
+_MAKERS: dict[str, Callable[..., Any]] = {
+    "numpy._core.multiarray._reconstruct": _array,
+    "numpy._core.multiarray.scalar": _scalar,
+    "numpy.ndarray": _class,
+    "numpy.dtype": _dtype,
+}
