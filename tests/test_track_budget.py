@@ -52,15 +52,6 @@ def test_what_is_given_at_a_frame_does_not_depend_on_later_ones():
     np.testing.assert_array_equal(short.track_id, long.track_id[long.frame < 11])
 
 
-def test_withheld_tracks_are_the_same_with_a_budget():
-    np.testing.assert_array_equal(budgeted().held_out.uv_px, drive().held_out.uv_px)
-
-
-def test_packets_have_the_tracks_given():
-    for packet in budgeted().packets():
-        assert set(packet.frame.track_ids.tolist()) == tracks_of(budgeted().visible, packet.index)
-
-
 def test_every_part_of_the_view_has_one_track_before_any_has_two():
     crowd, alone = (0, 0, 3), (5, 2, 1)
     assert chosen(2, [9, 9, 9, 0], [crowd, crowd, crowd, alone]) == [0, 3]
@@ -82,7 +73,3 @@ def test_parts_are_cells_of_the_image_and_octaves_of_disparity():
     )
     parts = parts_of_view(uvs_px, (50.0, 50.0), 16)
     np.testing.assert_array_equal(parts, [[0, -1, 1], [0, -1, 2], [-1, 0, 1], [-1, 0, -1], [-1, 0, -1]])
-
-
-def test_a_recording_with_a_budget_is_another_one():
-    assert len({drive().content_hash(), budgeted().content_hash(), budgeted(BUDGET + 1).content_hash()}) == 3

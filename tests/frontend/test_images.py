@@ -62,11 +62,6 @@ def test_a_truncated_image_of_any_kind_is_named_and_the_decoder_says_nothing(
     assert capfd.readouterr().err == ""
 
 
-def test_colour_becomes_brightness(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "c.png"), cv2.merge([GREY, GREY, GREY]))
-    np.testing.assert_array_equal(read_image(tmp_path / "c.png", 8), GREY)
-
-
 @pytest.mark.parametrize(("shift", "bits"), [(2, 10), (4, 12), (8, 16)])
 def test_deep_images_keep_the_eight_bits_their_values_fill(tmp_path: Path, shift: int, bits: int) -> None:
     path = tmp_path / "deep.png"
@@ -88,11 +83,3 @@ def test_reading_ahead_keeps_the_order_and_is_a_few_ahead_only() -> None:
     time.sleep(0.02)
     assert len(begun) <= 5
     assert list(ahead) == [i * i for i in range(1, 50)]
-
-
-def test_an_error_of_a_reader_reaches_who_waits() -> None:
-    def read(i: int) -> int:
-        return 1 // (3 - i)
-
-    with pytest.raises(ZeroDivisionError):
-        list(read_ahead(range(9), read))

@@ -35,20 +35,6 @@ def test_a_planted_warp_is_recovered_whatever_the_exposure(image: Array) -> None
         assert alike[0] > 0.98
 
 
-def test_another_texture_does_not_fit(image: Array) -> None:
-    other = image[::-1, ::-1].copy()
-    _, _, alike = Patches.taken(image, CENTRES).fitted(other, CENTRES)
-    assert (alike < 0.8).all()
-
-
-def test_patches_of_no_track_can_be_fitted_and_joined(image: Array) -> None:
-    none = Patches.none()
-    _, places, alike = none.fitted(image, np.empty((0, 2)))
-    assert places.shape == (0, 2)
-    assert alike.size == 0
-    assert len(Patches.taken(image, CENTRES).joined(none).values) == 3
-
-
 def test_a_flat_patch_is_no_error(image: Array) -> None:
     flat = np.full_like(image, 7.0)
     _, places, alike = Patches.taken(flat, CENTRES).fitted(image, CENTRES)
@@ -69,9 +55,3 @@ def test_the_best_place_of_a_corner_is_its_tip_wherever_the_patch_was_taken(open
     # blur moves the corner of the grey values inwards, the more the sharper it is; the centres are 3 to 4 px apart
     assert np.linalg.norm(best - tip, axis=1).max() < 1.0
     assert np.ptp(best, axis=0).max() < 0.6
-
-
-def test_the_best_place_of_a_flat_patch_is_near(image: Array) -> None:
-    best = Patches.taken(np.full_like(image, 7.0), CENTRES).best_places
-    assert np.isfinite(best).all()
-    assert np.abs(best).max() <= 3.0

@@ -11,7 +11,6 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.frontend import StampedPair, motion, track_images
-from toolkit.frontend.corners import corners, count_in_cells
 from toolkit.frontend.tracker import TrackedCorners, Tracker
 from toolkit.geometry import Array
 from toolkit.settings import DEFAULTS, Frontend
@@ -68,16 +67,6 @@ def test_disparities_of_a_slanted_surface_are_its_own(plain: Filmed) -> None:
         # of images rounded to grey values
         assert np.median(np.abs(off)) < 0.03
         assert np.percentile(np.abs(off), 95) < 0.15
-
-
-def test_a_right_image_that_does_not_show_the_first_patch_ends_the_track(plain: Filmed, papered: Filmed) -> None:
-    as_before, other = (Tracker(plain.rig, DEFAULTS.frontend) for _ in range(2))
-    for one in (as_before, other):
-        one.step(*plain.images[0])
-    kept = as_before.step(*plain.images[1])
-    faded = other.step(plain.images[1][0], papered.images[4][1])
-    assert kept is not None
-    assert faded is None or np.isin(kept.track_ids, faded.track_ids).sum() < 0.7 * len(kept.track_ids)
 
 
 def test_a_track_stays_on_its_point_of_the_scene(filmed: Filmed) -> None:
@@ -230,15 +219,3 @@ def test_a_patch_that_is_no_longer_what_it_was_ends_its_track(papered: Filmed) -
         return int(np.isin(found[0].track_ids, found[-1].track_ids).sum())
 
     assert survivors(strict) < 0.6 * survivors(loose)
-
-
-@pytest.mark.parametrize("most", [10, 1000])
-def test_corners_come_first_from_the_emptiest_cells(plain: Filmed, most: int) -> None:
-    image = plain.images[0][0]
-    present = np.full((3, 4), 50)
-    present[1, 2] = 0
-    free = np.ones(image.shape, dtype=bool)
-    found = corners(image, free, present, 12.0, most)
-    assert len(found) <= most
-    count = count_in_cells(found[:10], (320, 240), (3, 4))
-    assert count[1, 2] == min(10, count_in_cells(corners(image, free, present, 12.0, 1000), (320, 240), (3, 4))[1, 2])

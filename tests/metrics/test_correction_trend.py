@@ -8,7 +8,7 @@ import pytest
 from scipy.special import chdtri
 
 from toolkit.estimate import Landmarks, Run, Trajectory
-from toolkit.metrics import Evaluation, correction_trend, score_run
+from toolkit.metrics import Evaluation, correction_trend
 from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.motion import motion_model, predicted
@@ -98,9 +98,3 @@ def test_what_corrects_nothing_and_what_holds_its_biases_has_no_trend(recording)
         scored(replace(run, causal=replace(run.causal, cov=held)), recording)
     with pytest.raises(Unavailable, match="no covariance of its whole state"):
         scored(replace(run, causal=replace(run.causal, cov=None)), recording)
-
-
-def test_a_final_answer_has_no_trend(recording):
-    scores = score_run(fixes(recording)[0], "final", recording)
-    assert scores.values[TREND] is None
-    assert "causal" in scores.notes[TREND]

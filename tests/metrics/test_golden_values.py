@@ -181,39 +181,3 @@ def test_every_metric_has_the_value_written_down(drifting, motion, known_start):
     for key, value in expected.items():
         # The held-out points come from an iteration, which stops a little elsewhere where LAPACK rounds otherwise.
         assert values[key] == pytest.approx(value, rel=1e-6 if key.startswith("heldout") else TOLERANCE), key
-
-
-def test_a_circle_driven_two_percent_too_wide_has_the_errors_of_its_chords(make_sequence, make_run):
-    """Truth p = R (cos a, sin a, 0), estimate 1.02 p, headings right: every error is 2 percent of a chord or of R."""
-    radius_m, turn = 70.0, 2.0 * np.pi / FRAMES
-    angles = turn * np.arange(FRAMES)
-    positions = radius_m * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    sequence = make_sequence(se3(about_z(angles + np.pi / 2), positions), track_count=3)
-    wide = se3(sequence.truth.T_world_imu[:, :3, :3], 1.02 * positions)
-    values = score_run(make_run(sequence.frames_t_ns, wide), "final", sequence).values
-
-    def chord_m(steps: Array | int) -> Array:
-        return 2.0 * radius_m * np.abs(np.sin(0.5 * turn * steps))
-
-    step_m = chord_m(1)
-    over_100_m = int(np.ceil(100.0 / step_m))
-    # KITTI: from every tenth frame to the first beyond each length, if the circle of 440 m goes on for that long.
-    lengths = [(length, int(np.floor(length / step_m)) + 1) for length in (100.0, 200.0, 300.0, 400.0)]
-    segments = [
-        0.02 * chord_m(n) / length for length, n in lengths for first in range(0, FRAMES, 10) if first + n < FRAMES
-    ]
-    expected = {
-        "ate_se3_m": 0.02 * radius_m,
-        "ate_yaw_m": 0.02 * radius_m,
-        "ate_sim3_m": 0.0,
-        "ate_none_m": 0.02 * np.sqrt(np.mean(chord_m(np.arange(FRAMES)) ** 2)),
-        "ate_se3_deg": 0.0,
-        "rpe_1s_m": 0.02 * chord_m(10),
-        "rpe_1s_deg": 0.0,
-        "rpe_100m_percent": 0.02 * chord_m(over_100_m),
-        "kitti_t_percent": 100.0 * np.mean(segments),
-        "kitti_r_deg_per_m": 0.0,
-        "end_drift_percent": 100.0 * 0.02 * chord_m(FRAMES - 1) / (step_m * (FRAMES - 1)),
-    }
-    # 70 m in doubles leave 1e-13 m, and angles near zero the root of the smallest double's cosine, 1e-7 deg at most.
-    assert {key: values[key] for key in expected} == pytest.approx(expected, rel=1e-9, abs=1e-7)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import about_z, se3, se3_exp, se3_inverse
+from toolkit.geometry import se3_exp, se3_inverse
 from toolkit.measurements import Prior
 from toolkit.metrics import Evaluation
 from toolkit.metrics.nees import score
@@ -60,13 +60,6 @@ def test_errors_drawn_from_what_is_stated_have_nees_one(sequence, make_run, scal
     # Four sigma of a mean of N chi-square variables of three degrees of freedom, over these: 7 % at 4000.
     found, _ = values(drawn(sequence, make_run, scale), sequence)
     assert found == pytest.approx([scale] * 3, rel=4.0 * np.sqrt(2.0 / (3 * FRAMES)))
-
-
-def test_a_world_of_its_own_does_not_matter(sequence, make_run):
-    elsewhere = se3(about_z(1.0), np.array([10.0, 20.0, 30.0]))
-    prior = replace(sequence.prior, T_world_imu=elsewhere @ sequence.prior.T_world_imu)
-    moved, _ = values(drawn(sequence, make_run, T_new_old=elsewhere), replace(sequence, prior=prior))
-    assert moved == pytest.approx(values(drawn(sequence, make_run), sequence)[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("key", KEYS)

@@ -11,7 +11,6 @@ from scipy.optimize import least_squares
 from toolkit.estimate import Landmarks
 from toolkit.geometry import se3_exp, se3_inverse, transform
 from toolkit.metrics import Evaluation, reprojection, score_run
-from toolkit.metrics.parts import leave_one_out
 from toolkit.metrics.parts.leave_one_out import CAP_PX, predict_left_out
 from toolkit.models import stereo
 
@@ -58,23 +57,6 @@ def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap(make_sequence
     assert (errors_px[lost] == CAP_PX).all()
     assert errors_px[~lost].max() < 1e-9  # exact points, rounding only
     assert f"{lost.sum()} behind the camera" in score_run(run, "final", sequence).notes["reproj_rmse_px"]
-
-
-def test_landmarks_left_out_are_counted(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(60), track_count=80)
-    landmarks = first_sighting_landmarks(sequence, sequence.truth.T_world_imu)
-    half = Landmarks(landmarks.track_ids[::2], landmarks.points_world[::2])
-    scored = np.isin(sequence.visible.track_id, half.track_ids).sum()
-    scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, half), "final", sequence)
-    assert f"{scored} of {len(sequence.visible)} observations" in scores.notes["reproj_median_px"]
-
-
-def test_without_landmarks_only_the_in_sample_error_is_missing(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(60))
-    scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu), "final", sequence)
-    assert scores.values["reproj_median_px"] is None
-    assert scores.notes["reproj_rmse_px"] == "the estimator has no landmarks"
-    assert scores.values["heldout_reproj_median_px"] is not None
 
 
 def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise(make_sequence, make_run, drive):
@@ -150,16 +132,6 @@ def test_leaving_a_view_out_equals_triangulating_anew(make_sequence, drive, pixe
     errors_anew_px = np.sqrt(np.mean((anew_px - uv_px[rows]) ** 2, axis=1))
     np.testing.assert_allclose(errors_px, errors_anew_px, atol=tolerance_px)
     assert np.median(errors_px) > 0.3
-
-
-@pytest.mark.parametrize("views", [1, 100, 10**9])
-def test_in_how_many_parts_it_is_solved_makes_no_difference(make_sequence, drive, monkeypatch, views):
-    sequence = make_sequence(drive(30), track_count=20, pixel_sigma=0.5)
-    tracks = tracks_of(sequence, drive(30))
-    whole = predict_left_out(*tracks, sequence.rig)
-    monkeypatch.setattr(leave_one_out, "_VIEWS_AT_A_TIME", views)
-    for one, other in zip(predict_left_out(*tracks, sequence.rig), whole, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew(make_sequence, drive):

@@ -1,7 +1,6 @@
 """Rendered images show the scene where it is, and a folder of them is the scenario's recording."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.errors import OutputError
 from toolkit.geometry import Array, se3_inverse
@@ -18,7 +16,7 @@ from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
 from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
 from toolkit.simulation.filming import Filming, LensModel, errors_px, film
-from toolkit.simulation.renderer import Eye, Floats, Sensor, exposed, light
+from toolkit.simulation.renderer import Eye, Floats, Sensor, light
 from toolkit.simulation.surfaces import Panel, furnished_hall
 
 SHORT = replace(FLIGHT, duration_s=0.2)
@@ -99,20 +97,6 @@ def test_the_camera_is_surrounded_and_nothing_stands_in_its_way() -> None:
     assert (light(panels.at(60.0), eye, T_world_cam) > 0.0).all()
 
 
-def test_only_what_flies_about_moves() -> None:
-    eye, pose = Eye.of(filming._Pair.of(FLIGHT, "none").lenses[0]), pose_at(0.0)
-    still, moving = furnished_hall(), furnished_hall(8)
-    np.testing.assert_array_equal(light(still.at(0.0), eye, pose), light(still.at(1.0), eye, pose))
-    changed = light(moving.at(0.0), eye, pose) != light(moving.at(1.0), eye, pose)
-    assert 0.01 < changed.mean() < 0.6
-
-
-def test_an_exposure_is_the_mean_over_its_time() -> None:
-    ramp: Callable[[float], Floats] = lambda t_s: np.full((2, 2), 100.0 * t_s, dtype=np.float32)  # noqa: E731
-    np.testing.assert_allclose(exposed(ramp, 1.0, 0.0, 5), 100.0)
-    np.testing.assert_allclose(exposed(lambda t_s: ramp(t_s) ** 2, 1.0, 0.2, 5), 1e4 * (1.0 + 0.08**2 / 2.0), rtol=1e-5)
-
-
 def test_the_sensors_noise_is_as_stated() -> None:
     grey = np.full((400, 400), 100.0, dtype=np.float32)
     image = Sensor(dark_sigma=1.0, variance_per_grey=0.08).developed(grey, 1.25, np.random.default_rng(0))
@@ -149,11 +133,6 @@ def test_the_folder_is_the_scenarios_recording(filmed: Path) -> None:
     assert np.isfinite(off_px).all()
     assert (np.median(np.abs(off_px), axis=0) < [0.1, 0.4, 0.15]).all()
     assert read.provenance.facts[1].startswith("against the rendered scene")
-
-
-def test_simulated_tracks_of_a_rendered_folder_do_not_pass_for_a_real_recording(filmed: Path) -> None:
-    provenance = load_sequence(str(filmed), 0, Frontend(tracks="simulated")).provenance
-    assert "real IMU" not in " ".join([provenance.source, *provenance.facts])
 
 
 def test_errors_against_the_scene_are_those_planted(filmed: Path) -> None:
@@ -208,23 +187,6 @@ def test_images_for_which_there_is_no_room_are_refused_before_any_work(
     with pytest.raises(OutputError, match=r"72001 stereo pairs take about 28\.8 GB, and 20 GB are free there"):
         film(hour, 0, tmp_path / "new" / "deeper")
     assert not list(tmp_path.iterdir())
-
-
-def test_how_much_is_to_be_made_is_reported_before_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(filming, "film", stopped)
-    words = ("simulate", "flight", "--images", "--duration", "60", "--out", str(tmp_path / "long"))
-    assert main(words) == 130
-    assert "1201 stereo pairs, about 0.48 GB" in capsys.readouterr().err
-
-
-def test_the_stated_size_of_a_pair_is_about_what_it_takes(filmed: Path) -> None:
-    sizes = [path.stat().st_size for path in filmed.rglob("*.png")]
-    assert 2.0 * np.mean(sizes) / 1e9 == pytest.approx(filming._PAIR_GB, rel=0.35)
 
 
 def test_a_world_of_points_cannot_be_filmed(tmp_path: Path) -> None:

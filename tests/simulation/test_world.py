@@ -8,7 +8,7 @@ import pytest
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project
 from toolkit.simulation import DRIVE, FLIGHT, Scenario
-from toolkit.simulation.scenes import roadside, room
+from toolkit.simulation.scenes import roadside
 from toolkit.simulation.sensors import follow, visibility
 
 
@@ -55,13 +55,6 @@ def test_a_track_is_one_landmark_without_gaps_and_never_comes_back(scenario: Sce
     assert (np.diff(first_frame) >= 0).all(), "ids are given in order of time"
 
 
-def test_a_landmark_is_followed_by_one_track_at_a_time() -> None:
-    _, _, seen = view(FLIGHT)
-    tracks = follow(seen, FLIGHT.camera, np.random.default_rng(1))
-    pairs = np.stack([tracks.frame, tracks.landmark])
-    assert np.unique(pairs, axis=1).shape == pairs.shape
-
-
 def test_tracks_end_by_chance_as_often_as_requested() -> None:
     seen = np.ones((400, 150), dtype=bool)  # nothing ever leaves the view
     camera = replace(FLIGHT.camera, loss_per_frame=0.04)
@@ -70,22 +63,6 @@ def test_tracks_end_by_chance_as_often_as_requested() -> None:
     ended = tracks.track_id.max() + 1 - camera.max_tracks
     # Binomial: five standard deviations.
     assert abs(ended / continued - 0.04) < 5.0 * np.sqrt(0.04 * 0.96 / continued)
-
-
-def test_no_tracks_without_anything_to_see() -> None:
-    assert follow(np.zeros((5, 10), dtype=bool), DRIVE.camera, np.random.default_rng(0)).frame.size == 0
-
-
-def test_the_walls_of_a_room_are_equally_dense() -> None:
-    lower, upper = np.zeros(3), np.array([10.0, 6.0, 3.0])
-    points = room(lower, upper, 20_000, np.random.default_rng(2))
-    assert (points >= lower).all()
-    assert (points <= upper).all()
-    depth = np.concatenate([points - lower, upper - points], axis=1)
-    wall = np.argmin(depth, axis=1) % 3
-    share = np.bincount(wall) / len(points)
-    # Counted by the nearest wall; near the edges a point may belong to its neighbour.
-    np.testing.assert_allclose(share, np.array([18.0, 30.0, 60.0]) / 108.0, atol=0.03)
 
 
 def test_no_landmark_stands_in_the_way_however_long_the_road_is() -> None:
