@@ -22,10 +22,19 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.motion import motion_model
-from toolkit.models.stereo_adjustment import RobustCamera, SolvedWindow, TrackedWindow, solve_window, without_oldest
+from toolkit.models.stereo_adjustment import (
+    Ending,
+    RobustCamera,
+    SolvedWindow,
+    TrackedWindow,
+    solve_window,
+    without_oldest,
+)
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
 RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept"
+
+_ENDING = Ending()
 
 
 def build(setup: Setup) -> Estimator:
@@ -53,12 +62,12 @@ class Smart:
         """Take in one packet and return the state at its frame."""
         tracked = self._extended(packet)
         try:
-            self._solution = solve_window(tracked.window, self._camera)
+            self._solution = solve_window(tracked.window, self._camera, _ENDING)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; the window starts again at this frame")
             self._complete_all()
             tracked = self._started(packet)
-            self._solution = solve_window(tracked.window, self._camera)
+            self._solution = solve_window(tracked.window, self._camera, _ENDING)
         self._tracked = replace(tracked, window=self._solution.window)
         self._read(packet)
         self._shorten(packet)
@@ -89,14 +98,8 @@ class Smart:
     def _with_state(
         self, tracked: TrackedWindow, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph
     ) -> TrackedWindow:
-        window, estimate = tracked.window, self._belief.estimate(frame.t_ns)
-        new = gtsam.Values()
-        self._motion.insert(new, estimate, k)
-        values = gtsam.Values(window.values)
-        values.insert(new)
-        keys = (*window.keys, tuple(self._motion.keys(k)))
-        longer = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
-        return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
+        estimate = self._belief.estimate(frame.t_ns)
+        return tracked.extended(self._motion, estimate, factors, frame, k, self._rig)
 
     def _read(self, packet: Packet) -> None:
         """Read every state and landmark of the window; drop the landmarks that fell behind a camera."""

@@ -90,8 +90,8 @@ def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario
     sequence, last = changed(simulate(scenario, 3)), {}
     taken_in, solved = [], smart.solve_window
 
-    def spied(window, rig):
-        solution = solved(window, rig)
+    def spied(window, camera, ending):
+        solution = solved(window, camera, ending)
         taken_in.append(solution)
         inverse = np.linalg.inv(solution.root @ solution.root.T)
         count, d = len(window.keys), window.size
@@ -157,11 +157,11 @@ def refusing_once(monkeypatch):
     """Have the smoother refuse a window of eight states, once; return the list of what was refused."""
     solved, refused = smart.solve_window, []
 
-    def solve_window(window, rig):
+    def solve_window(window, camera, ending):
         if len(window.keys) == 8 and not refused:
             refused.append(window)
             raise EstimatorError("nothing determines it")
-        return solved(window, rig)
+        return solved(window, camera, ending)
 
     monkeypatch.setattr(smart, "solve_window", solve_window)
     return refused

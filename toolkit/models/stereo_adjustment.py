@@ -25,10 +25,12 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.sparse import csc_array
 
 from toolkit.errors import EstimatorError
+from toolkit.estimate import Estimate
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.state import MotionModel
 
 # Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
 _BEHIND_NORM = 100.0
@@ -36,13 +38,9 @@ _BEHIND_NORM = 100.0
 _NO_LOSS = 1e6
 # Added to a landmark's 3x3 block so that it is never singular; far below the information of any sighting.
 _LEAST_INFORMATION_PER_M2 = 1e-12
-MOST_ITERATIONS = 5
-# Newton's method converges quadratically: after a step shorter than this, in sigmas of all states together, the next is
-# a tenth of a sigma, and is taken with the next frame. If a step gains hardly anything, further ones gain nothing.
-LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
-# Used only after a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than
-# the information on position and heading in the world, and would fix these.
-_FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
+# Marquardt's damping, a share of each unknown's information, used only after a step that fails. It begins small because
+# motion samples tie neighbouring states so tightly that a millionth would already fix roll and pitch.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 # Parts of a landmark's step that are tried if the window's step raises the cost; damping the poses does not shorten it.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 
@@ -270,15 +268,30 @@ class TrackedWindow:
         sightings = Sightings(none, none, np.empty((0, 3)))
         return cls(StereoWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
 
+    def extended(
+        self,
+        model: MotionModel,
+        estimate: Estimate,
+        factors: gtsam.NonlinearFactorGraph,
+        frame: StereoFrame,
+        k: int,
+        rig: StereoRig,
+    ) -> "TrackedWindow":
+        """Return the window with state k at an estimate, the factors that tie it, and the frame it sees.
+
+        Known tracks continue, new ones are triangulated; new tracks of too small a disparity are left out.
+        """
+        values, window = gtsam.Values(self.window.values), self.window
+        model.insert(values, estimate, k)
+        keys = (*window.keys, tuple(model.keys(k)))
+        window = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
+        return replace(self, window=window)._seeing(frame, estimate.T_world_imu, rig)
+
     def points_by_id(self) -> dict[int, Array]:
         """Return the point (3,) m of every track."""
         return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
 
-    def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
-        """Add the sightings of the newest state, at a pose (4, 4): known tracks continue, new ones are triangulated.
-
-        New tracks of too small a disparity are left out.
-        """
+    def _seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
         known = np.isin(frame.track_ids, self.track_ids)
         new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
         used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
@@ -300,6 +313,12 @@ class TrackedWindow:
         taken = self.track_ids[seen.point[seen.pose == len(self.window.keys) - 1]]
         return frame.select(np.isin(frame.track_ids, taken))
 
+    def with_sightings(self, kept: BoolArray) -> "TrackedWindow":
+        """Return the window with some of its sightings, a mask (N,), and without points that have none."""
+        seen = self.window.sightings
+        left = Sightings(seen.pose[kept], seen.point[kept], seen.uv_px[kept])
+        return TrackedWindow(replace(self.window, sightings=left), self.track_ids).compacted()
+
     def compacted(self) -> "TrackedWindow":
         """Drop the points without sightings."""
         seen = self.window.sightings
@@ -316,8 +335,7 @@ class TrackedWindow:
         behind = np.unique(seen.point[~in_front])
         if not behind.size:
             return self, self.track_ids[behind]
-        left = seen.of_points(np.setdiff1d(seen.point, behind))
-        return TrackedWindow(replace(self.window, sightings=left), self.track_ids).compacted(), self.track_ids[behind]
+        return self.with_sightings(~np.isin(seen.point, behind)), self.track_ids[behind]
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,7 +449,20 @@ class SolvedWindow:
         return np.asarray(half.T @ half)
 
 
-def solve_window(window: StereoWindow, camera: RobustCamera, iterations: int = MOST_ITERATIONS) -> SolvedWindow:
+@dataclass(frozen=True)
+class Ending:
+    """When a solve ends: after a short step, in sigmas of all states together, a small gain, or too many iterations.
+
+    Newton's method converges quadratically: after a step of two sigmas, the next is a tenth of a sigma, and a smoother
+    takes it with the next frame. If a step gains hardly anything, further ones gain nothing.
+    """
+
+    step_sigmas: float = 2.0
+    relative_decrease: float = 1e-3
+    iterations: int = 5
+
+
+def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -439,11 +470,11 @@ def solve_window(window: StereoWindow, camera: RobustCamera, iterations: int = M
     here, damping = Evaluated.of(window, camera), 0.0
     if not np.isfinite(here.error):
         raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
-    for _ in range(iterations):
+    for _ in range(ending.iterations):
         system = here.linearised()
         step = _descent(here, system, damping, camera)
         decrease, here = here.error - step.there.error, step.there
-        if step.sigmas <= LAST_STEP_SIGMAS or decrease <= RELATIVE_DECREASE * here.error:
+        if step.sigmas <= ending.step_sigmas or decrease <= ending.relative_decrease * here.error:
             break
         damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
     try:

@@ -23,9 +23,9 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief, MotionModel
 from toolkit.models.stereo_adjustment import (
+    Ending,
     Evaluated,
     RobustCamera,
-    Sightings,
     StereoWindow,
     TrackedWindow,
     Vision,
@@ -40,7 +40,7 @@ FRAMES, MOST_STRETCHES = 30, 6
 TRACKS = 100
 # Probability of the chi-square bound beyond which, by the stated noise, a sighting is an outlier.
 SOUND = 0.999
-_MOST_ITERATIONS = 15
+_ENDING = Ending(iterations=15)
 # Huber's threshold (sigma), as in the start: the median norm of a sound whitened residual.
 _HUBER = 1.5
 # Standard deviations of the prior on the first state: attitude rad, position m, velocity m/s, biases m/s^2 and rad/s.
@@ -70,13 +70,10 @@ class Stretch:
 
         Raises EstimatorError where the measurements do not determine the states.
         """
-        tracked, values, keys = TrackedWindow.empty(), gtsam.Values(), list[tuple[int, ...]]()
-        model = motion_model(noise, self.gravity_world)
+        tracked, model = TrackedWindow.empty(), motion_model(noise, self.gravity_world)
         for packet, state in zip(self.packets, self.start, strict=True):
-            model.insert(values, state.estimate(packet.frame.t_ns), packet.index)
-            keys.append(tuple(model.keys(packet.index)))
-            window = replace(tracked.window, keys=tuple(keys), values=values)
-            tracked = replace(tracked, window=window).seeing(packet.frame, state.T_world_imu, rig)
+            estimate, nothing = state.estimate(packet.frame.t_ns), gtsam.NonlinearFactorGraph()
+            tracked = tracked.extended(model, estimate, nothing, packet.frame, packet.index, rig)
         tracked, _ = tracked.in_front(rig)
         return self._solved(tracked.window, model, rig)
 
@@ -97,7 +94,7 @@ class Stretch:
             for packet in self.packets
         )
         camera = RobustCamera.of(rig, _HUBER)
-        solved = solve_window(replace(window, motion=motion), camera, _MOST_ITERATIONS)
+        solved = solve_window(replace(window, motion=motion), camera, _ENDING)
         return Adjusted(solved.window, camera)
 
 
@@ -184,10 +181,7 @@ class Adjusted:
         vision, seen = self.vision, self.window.sightings
         bound = chi2_bound(stereo.degrees_of_freedom(seen.uv_px), SOUND)
         sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.seen.in_front
-        kept = Sightings(seen.pose[sound], seen.point[sound], seen.uv_px[sound])
-        return (
-            TrackedWindow(replace(self.window, sightings=kept), np.arange(len(self.window.points))).compacted().window
-        )
+        return TrackedWindow(self.window, np.arange(len(self.window.points))).with_sightings(sound).window
 
     def residuals(self, fewest_sightings: int) -> SoundResiduals:
         """Return the residuals of the plausible sightings of tracks with so many or more of them."""
