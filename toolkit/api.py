@@ -75,10 +75,10 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "mine.py" a
     file, "ladder" every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name.
     ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit
-    reports and leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a
-    record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes,
-    one a processor by default; ``scheduler`` the address of a Dask cluster in their place. ``resume`` is a run
-    directory in which every run over seeds is kept as it ends, and found by the next comparison of it.
+    reports and leaves alone. ``seeds`` is the number of seeds, from ``seed`` on, over which a simulated source is
+    repeated. ``settings`` is a record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is
+    the number of processes, one a processor by default; ``scheduler`` the address of a Dask cluster in their place.
+    ``resume`` is a run directory in which every run over seeds is kept as it ends, and found by the next comparison.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
     trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,

@@ -30,8 +30,8 @@ FAR_STEP = float(chdtri(6, 1e-6))
 # Chosen by looking at real recordings; in sound simulated runs no step is far (docs/estimators.md has the figures).
 MOST_FAR_STEPS = 1.0 / 6.0
 # The gate passes nearly all sound measurements, and still 65 % where tracks go wrong all the time. A filter whose
-# covariance does not cover its error rejects nearly all measurements, and from then on: so much must pass in the whole
-# run and in its last quarter. Chosen likewise; in sound simulated runs at least 85 % of a run's measurements pass.
+# covariance does not cover its error rejects nearly all measurements, and from then on: this share must pass in the
+# whole run and in its last quarter. Chosen likewise; in sound simulated runs at least 85 % of the measurements pass.
 LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
 # A track that is tested as a whole passes only if all of its sightings are sound: of tracks of 12 sightings, one in ten
 # of which is an outlier, 28 % pass in a run that is millimetres off. So many sightings may be outliers in a run that
@@ -126,7 +126,7 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
 def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
     """Return the least share of measurements that must pass, for tracks as long as the accepted ones are on average.
 
-    Their length is in sightings of three degrees of freedom, of which at least so many are in a measurement.
+    Their length is in sightings of three degrees of freedom, at least one a measurement.
     """
     if "nis_dof" not in info or not accepted:
         return LEAST_ACCEPTED

@@ -307,7 +307,7 @@ def _feed(digest: "hashlib._Hash", value: object, digits: int | None) -> None:
 
 
 def _rounded(array: Array, digits: int) -> Array:
-    """Return an array rounded to so many digits of its largest value, without -0.0, whose bits are not those of 0."""
+    """Return an array rounded to ``digits`` digits of its largest value; -0.0, whose bits are others, becomes 0."""
     finite = np.abs(array[np.isfinite(array)])
     largest = float(finite.max()) if finite.size else 0.0
     if largest == 0.0:

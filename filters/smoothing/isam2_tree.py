@@ -47,7 +47,7 @@ RECENT_FRAMES, LONG_LIVED_SIGHTINGS = 100, 10
 # A variable on which no frame has had factors for this many frames keeps its linearisation point, as do Python factors
 # on it: a small change of heading moves the whole past, and a frame would cost as much as the run is long.
 FROZEN_AFTER_FRAMES = 30
-# A variable on which no frame has had factors for this many frames leaves the tree; this is done every so many frames,
+# A variable on which no frame has had factors for this many frames leaves the tree; this is done at this interval,
 # because each time traverses the whole tree. Variables with a marginal of it keep their linearisation points too.
 RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
 # After rounding has made Cholesky factorisation fail, it is tried again this many frames with vision later.

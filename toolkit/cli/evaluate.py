@@ -41,7 +41,7 @@ MOST_RUNS = 10_000
     ),
     arg(
         "--max-dt S",
-        "pair each pose with the nearest one within so many seconds, as evo does (default: interpolate)",
+        "pair each pose with the nearest one within S seconds, as evo does (default: interpolate)",
         positive_seconds,
     ),
     arg("--offset S", "added to the trajectories' stamps", number_within("seconds", -1e9, 1e10), default=0.0),

@@ -219,7 +219,7 @@ def check_built_in(source: str, frontend: Frontend) -> None:
 
 
 def _check_topics(source: str, reader: RecordingFormat | None, frontend: Frontend) -> None:
-    """Raise DataError where topics are named of what has none."""
+    """Raise DataError where topics are named for a recording that is no bag."""
     if frontend.topics is not None and not isinstance(reader, HasTopics):
         raise DataError(f"{source}: it has no topics, a bag has; leave --topics out, or compare it by itself")
 

@@ -36,7 +36,7 @@ from toolkit.sequence import Sequence as Recording
 from toolkit.settings import DEFAULTS, Frontend
 
 HAS_TOPICS = True
-# Images are rectified already where so many times as many corners meet their row as once the calibration is applied.
+# Images are rectified already where this many times as many corners meet their row as once the calibration is applied.
 _CLEARLY = 2
 _NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 

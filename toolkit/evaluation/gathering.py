@@ -74,7 +74,7 @@ def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
 
 
 def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:
-    """Return an item for each file, and for each that is missing until there are so many."""
+    """Return an item for each file, and for each that is missing of ``runs``."""
     there = [Item(system, sequence, printable(file.stem), file) for file in files]
     return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(runs - len(there))]
 

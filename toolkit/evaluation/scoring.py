@@ -277,7 +277,7 @@ def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched
 def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile, terms: Terms) -> Scores:
     pairs = PairsAgainstTruth(matched, terms.level)
     found: list[Scores] = []
-    with np.errstate(all="ignore"):  # what is not finite is no value, with that as its reason
+    with np.errstate(all="ignore"):  # a value that is not finite becomes None, with that as its reason
         for file_of_metrics in (ate, rpe, kitti, drift, clock_offset):
             found.append(_or_reason(file_of_metrics.score, pairs, file_of_metrics.METRICS))
         found.append(_nees_scores(file, estimate, truth.stamped, level=terms.level))

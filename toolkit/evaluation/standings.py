@@ -237,7 +237,7 @@ def _cost(value: float, metric: Metric) -> float:
 def evaluate(
     gathered: Gathered, terms: Terms, ranked_by: str = RANKED_BY, progress: Progress = SILENT, workers: int = 1
 ) -> EvaluatedSystems:
-    """Score every run, in so many processes where they are many.
+    """Score every run, in ``workers`` processes where they are many.
 
     Raises DataError where a truth cannot be used, or no run can. A single run that cannot be used counts as failed,
     with the reason, and so does a run that covers too little of the truth's time.

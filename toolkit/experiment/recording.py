@@ -33,7 +33,7 @@ STARTS: dict[Start, Callable[[Sequence], Prior]] = {
 
 @dataclass(frozen=True)
 class Part:
-    """Which frames of a recording are used: seconds after its first frame, ends included, and one frame in so many.
+    """Which frames of a recording are used: seconds after its first frame, ends included, and one frame in ``every``.
 
     Motion samples and truth stay whole. Raises SettingsError for a time or a step that selects nothing.
     """
@@ -47,7 +47,7 @@ class Part:
         if not 0.0 <= self.from_s < to_s:
             raise SettingsError(f"{self}: a part begins and ends at seconds after the first frame, and ends last")
         if self.every < 1:
-            raise SettingsError(f"every is {self.every}; one frame in so many is used, 1 or more")
+            raise SettingsError(f"every is {self.every}; one frame in N is used, N is 1 or more")
 
     def __str__(self) -> str:
         end = "the end" if self.to_s is None else f"{self.to_s:g} s"

@@ -37,7 +37,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class QuantilesOfAll:
-    """Quartiles over n runs of which ``bad`` did not end well; None where so many are bad that they decide it.
+    """Quartiles over n runs of which ``bad`` did not end well; None where those decide it.
 
     A run that did not end well counts as infinitely bad: its score until then does not show how it would have gone on.
     """

@@ -162,7 +162,7 @@ def nothing_kept(_unit: object) -> Hashable:
 def results_of(
     units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
 ) -> Generator[tuple[int, R | LostUnit], None, None]:
-    """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
+    """Yield the place and the result of every unit as each is there, from several processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress, needs)
 

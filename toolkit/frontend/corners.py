@@ -27,7 +27,7 @@ _LEVELS_BACK = 1
 
 
 def corners(image: Image, free: BoolArray, present: IntArray, spacing_px: float, most: int) -> Array:
-    """Return at most so many corners (N, 2) px, first those of the emptiest cells, and in a cell the strongest.
+    """Return ``most`` corners or fewer (N, 2) px, first those of the emptiest cells, and in a cell the strongest.
 
     ``free`` says for each pixel whether a track may begin there, ``present`` (rows, columns) how many tracks each cell
     of the grid holds. No two corners are nearer than the spacing.
@@ -52,7 +52,7 @@ def corners(image: Image, free: BoolArray, present: IntArray, spacing_px: float,
 
 
 def grid_of(size_px: tuple[int, int], tracks: int) -> tuple[int, int]:
-    """Return rows and columns of a grid of nearly square cells, so many that each holds about four tracks."""
+    """Return rows and columns of a grid of nearly square cells, such that each holds about four tracks."""
     width, height = size_px
     rows = max(round(float(np.sqrt(0.25 * tracks * height / width))), 2)
     return rows, max(round(rows * width / height), 2)

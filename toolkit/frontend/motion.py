@@ -26,10 +26,10 @@ _LEAST_DISPARITY_PX = 0.5
 _LEAST_DEPTH_M = 1e-3
 # Tracks are held against a pair that is five to ten pairs back.
 _PAIRS_BACK = 5
-# A track has left its point where it is off by so many times the median of all tracks, in their own uncertainty, and
+# A track has left its point where it is off by this many times the median of all tracks, in their own uncertainty, and
 # by more than the noise that tracks are said to have (px). The factor was chosen on one rendered flight.
 _MEDIANS, _LEAST_PX = 6.0, 0.5
-# The motion is refined by one step, with the tracks that are off by less than so many medians.
+# The motion is refined by one step, with the tracks that are off by less than this many medians.
 _OF_MOTION_MEDIANS = 3.0
 # Of fewer tracks no median is taken.
 _FEWEST_OF_A_MEDIAN = 20
@@ -114,7 +114,7 @@ def _pose_of(points: Array, left_px: Array, rig: StereoRig, threshold_px: float)
 
 
 class _Earlier(NamedTuple):
-    """Tracks of an earlier pair, so many pairs ago: ids (N,), in order, and uL, uR, v (N, 3) px."""
+    """Tracks of a pair that is ``pairs`` earlier: ids (N,), in order, and uL, uR, v (N, 3) px."""
 
     pairs: int
     track_ids: IntArray

@@ -21,7 +21,7 @@ _VIDEO, _VIDEO_HZ = "tracks.avi", 10.0
 def write_stills(
     recording: ImageRecording, tracks: ImageTracks, directory: Path, count: int, progress: Progress = SILENT
 ) -> tuple[str, ...]:
-    """Write so many stills, spread over the recording, to a directory, whole or not at all; return their names.
+    """Write ``count`` stills, spread over the recording, to a directory, whole or not at all; return their names.
 
     A still is a left image beside its right one: a circle a track, blue where it is new and red where it is old, with
     its way over the last frames. Raises OutputError where the directory holds anything else.
@@ -108,7 +108,7 @@ def _pixel(place: Array) -> tuple[int, int]:
 
 
 def _colour(age: int) -> tuple[int, int, int]:
-    """Return blue, green and red of a track that was seen so many frames: from blue over green to red."""
+    """Return blue, green and red of a track by the number of frames it was seen in: from blue over green to red."""
     share = min(age / _OLD, 1.0)
     blue, red = max(1.0 - 2.0 * share, 0.0), max(2.0 * share - 1.0, 0.0)
     return round(255 * blue), round(255 * (1.0 - blue - red)), round(255 * red)

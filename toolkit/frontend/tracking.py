@@ -200,7 +200,7 @@ def _exchanged(pair: StampedPair, rig: RectifiedPair, settings: Frontend, bits: 
 def _matched_with(
     pairs: Sequence[StampedPair], place: int, offset: int, rig: RectifiedPair, settings: Frontend, bits: int
 ) -> int:
-    """Return how many corners of a left image are found in the right image of a pair so many pairs away."""
+    """Return how many corners of a left image are found in the right image of a pair ``offset`` pairs later."""
     if not 0 <= place + offset < len(pairs):
         return 0
     images = read_pair(replace(pairs[place], right=pairs[place + offset].right), rig, bits)
@@ -214,7 +214,7 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
     places, wanted, matched = _looked_at(pairs, rig, settings, bits)
     least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
-    # A pair begins so many tracks at most: where enough are found as called, no other way can find more by the factor.
+    # At most this many tracks begin at a pair: where enough are found as called, none can find more by the factor.
     most = settings.max_tracks * len(places)
     if most > least and sum(_exchanged(pairs[place], rig, settings, bits) for place in places) > least:
         raise DataError(

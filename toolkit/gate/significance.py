@@ -27,7 +27,7 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
-# The mean NEES over runs scatters by chance; a NIS is a mean over so many innovations that it hardly does.
+# The mean NEES over runs scatters by chance; a NIS is a mean over thousands of innovations and hardly does.
 _WITH_BAND = ("nees_pose_mean",)
 # Another processor's rounding moves a metric by less than this, relative (docs/gate.md).
 ROUNDING = 1e-6
@@ -150,7 +150,7 @@ def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
 
 
 def percent_text(change: float) -> str:
-    """Return a change in percent, with so many digits that one which counts is not printed as none."""
+    """Return a change in percent, with enough digits that one which counts is not printed as 0."""
     return f"{change:+.1f} %" if abs(change) >= 0.1 else f"{change:+.1g} %"
 
 

@@ -176,7 +176,7 @@ def matched_poses(estimate: Poses, truth: Poses) -> Matched:
 
 def _unless_unavailable(compute: Callable[[], float]) -> float | None:
     try:
-        with np.errstate(all="ignore"):  # what is not finite is no value
+        with np.errstate(all="ignore"):  # a value that is not finite becomes None
             value = compute()
     except Unavailable:
         return None

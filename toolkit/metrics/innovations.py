@@ -51,7 +51,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def refuses_much(accepted_percent: float) -> bool:
-    """Say whether a gate rejected so many measurements that there are mismatches or the model is wrong."""
+    """Say whether a gate rejected more measurements than a sound model and sound tracks explain."""
     return accepted_percent < _LEAST_USUAL_PERCENT
 
 

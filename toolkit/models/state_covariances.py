@@ -16,7 +16,7 @@ of fifty. Nested dissection cuts the graph in halves recursively; the variables 
 1973, "Nested dissection of a regular finite element mesh"): from the root to any state it is some tens of variables,
 and on those drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Nested
 dissection is tried first where states have no velocity (their steps are measured twists), but not where landmarks are
-seen for long, as while a vehicle stands: such landmarks connect so many states that dissection finds no small cut. The
+seen for long, as while a vehicle stands: such landmarks connect hundreds of states: no cut is small. The
 result of an order is accepted if some of its covariances equal those computed for these states separately: for the
 order of time the first state, where rounding accumulates, else a few states.
 

@@ -19,7 +19,7 @@ from toolkit.sequence import Sequence
 
 # Raised with every change of the measurement that changes what it finds.
 _MEASUREMENT = 2
-# The weight of tracks is measured with the motion's noise so many times as large as stated: a motion that errs more
+# The weight of tracks is measured with the motion's noise this many times as large as stated: a motion that errs more
 # than stated would otherwise pull the poses, and with them all residuals of an image.
 _LOOSE = 10.0
 # With fewer frames a stretch shows no correlation along tracks.

@@ -26,7 +26,7 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
-# A length below this (m) is told in millimetres; a value has at most so many digits.
+# A length below this (m) is told in millimetres; a value has at most this many digits.
 _SHORT_M, _MOST_DIGITS = 0.1, 7
 _NUMBERS = (
     ("before", "", ""),
@@ -73,7 +73,7 @@ def _row(verdict: Verdict) -> tuple[str, ...]:
 
 
 def _values(verdict: Verdict) -> tuple[str, str]:
-    """Return the value before and now with their unit, and so many digits that a difference shows."""
+    """Return the value before and now with their unit, and enough digits that a difference shows."""
     before, now = verdict.before, verdict.after
     given = [abs(value) for value in (before, now) if value is not None and math.isfinite(value)]
     metric = _metric(verdict.metric)

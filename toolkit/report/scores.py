@@ -174,7 +174,7 @@ class WholeRuns(Struct, frozen=True, kw_only=True):
 
     position_rmse_m: Annotated[float | None, Meta(description="root mean square over frames and seeds, not aligned")]
     runs: Annotated[Count, Meta(description="the most runs that have a NEES at one frame")]
-    nees_pose_band: Annotated[tuple[float, float] | None, Meta(description="95 % band of the mean of so many runs")]
+    nees_pose_band: Annotated[tuple[float, float] | None, Meta(description="95 % band of the mean over the runs")]
     nees_pose_in_band_percent: Annotated[float | None, Meta(description="share of the frames within their band")]
     nees_pose_above_percent: Annotated[float | None, Meta(description="share of the frames above their band")]
 

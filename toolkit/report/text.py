@@ -139,7 +139,7 @@ def cell(value: float | None, metric: Metric, unit: ShownUnit | None = None) -> 
 
 
 def number(value: float, digits: int = DIGITS) -> str:
-    """Return a number with so many significant digits, its whole part in full; in powers of ten where it is extreme."""
+    """Return a number with ``digits`` significant digits, its whole part in full, in powers of ten where extreme."""
     if value == 0.0:
         return "0"
     if abs(value) >= _LARGEST or not math.isfinite(value):

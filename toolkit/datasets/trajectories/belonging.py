@@ -28,7 +28,7 @@ _MOST, _NEARLY_ALL, _COVERED = 0.5, 0.9, 0.5
 _SCALES = (1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9)
 
 
-# A unit of length is named where the median ratio of speeds, over so many steps in motion, is within this factor of it.
+# A unit of length is named where the median ratio of speeds, over enough steps in motion, is within this factor of it.
 _LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 _WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
 

@@ -52,7 +52,7 @@ class Rows:
         return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
 
     def stamps(self, per_unit_ns: int) -> IntArray:
-        """Return the first cells, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
+        """Return the first cells, in units of ``per_unit_ns``, as int64 nanoseconds (N,), rounded only there.
 
         A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
         or beyond what 64 bits hold.

@@ -193,7 +193,7 @@ def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
 def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title: str) -> Figure:
     """Draw tracks over the truth and one run's landmarks, with legend and closer look beside the map."""
     truth, tracks = true_track(comparison), [track_of(comparison, run) for run in runs]
-    # A run that flew off would squash all the others; its own figure shows where it went.
+    # A run that diverged would squash all the others; its own figure shows where it went.
     shown = [track for track, run in zip(tracks, runs, strict=True) if run.status == "ok" or len(runs) == 1]
     shown += [] if truth is None else [truth]
     landmarks = NOWHERE if mapper is None else from_above(comparison, mapper, mapper.landmarks.points_world)

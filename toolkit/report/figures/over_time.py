@@ -50,14 +50,14 @@ from toolkit.report.text import number
 
 # What leaves a panel is drawn up to this many times the largest error of what does not.
 _ROOM_BEYOND = 1.5
-# A heading larger than so many times that of the middle row leaves its panel, which has no logarithmic axis.
+# A heading larger than this many times that of the middle row leaves its panel, which has no logarithmic axis.
 _FAR_FROM_MIDDLE = 10.0
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
 _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _ORDER_OF_MAGNITUDE, _BELOW_LEAST, _LEAST_LOGARITHMIC_M = 12.0, 0.2, 1e-5
 _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
-# An axis shows all of the error, and of the band at most so many times the largest error.
+# An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
 _BAND_ALPHA = 0.16
 _LEAST_M, _LEAST_DEG = 1e-3, 1e-3

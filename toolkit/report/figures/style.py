@@ -36,7 +36,7 @@ _LINE_OF: dict[Output, tuple[Dashes, ...]] = {
     "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
-# From so many panels on there are four in a row, before that three; two or four make a square.
+# From this many panels on there are four in a row, before that three; two or four make a square.
 _MANY = 10
 _PANEL_IN = 1.35
 _FEW_DECADES = 1.7
@@ -176,7 +176,7 @@ def panels_of(
 
 
 def columns_for(count: int) -> int:
-    """Return how many columns so many panels have."""
+    """Return in how many columns a number of panels is laid out."""
     if count >= _MANY:
         return 4
     return 2 if count in (2, 4) else min(3, count)
