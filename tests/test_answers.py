@@ -57,40 +57,24 @@ def test_answers_of_the_documented_shapes_pass(sequence: Sequence) -> None:
     assert run(sequence, lambda sound, _: replace(sound, t_ns=np.int64(sound.t_ns), info={"nis": np.float32(2)})).causal
 
 
-@pytest.mark.parametrize(
-    ("answer", "why"),
-    [
-        (
-            lambda sound, _: (sound.t_ns, sound.T_world_imu),
-            "frame 0 is a tuple; step returns an",
-        ),
-        (lambda sound, _: sound.T_world_imu, "frame 0 is a ndarray"),
-        (
-            lambda sound, _: replace(sound, T_world_imu=np.eye(3)),
-            r"T_world_imu .* frame 0 has shape (3, 3); expec",
-        ),
-        (lambda sound, _: replace(sound, T_world_imu=None), "T_world_imu of its answer to frame 0 is None"),
-        (
-            lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.tolist()),
-            "is a list; it is an",
-        ),
-        (lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.astype(complex)), "has the type complex128"),
-        (lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.astype(object)), "has the type object"),
-        (lambda sound, _: replace(sound, t_ns=sound.t_ns + 5), "t_ns of its answer to frame 0 is"),
-        (lambda sound, _: replace(sound, t_ns=sound.t_ns / 1e9), "in whole ns"),
-        (lambda sound, _: replace(sound, cov=np.eye(3)), "expected (6, 6) or (9, 9) or (12, 12) or (15, 15)"),
-        (
-            lambda sound, packet: replace(sound, cov=np.eye(9 if packet.index else 6)),
-            "frame 1 has shape (9, 9), and",
-        ),
-        (lambda sound, _: replace(sound, v_world=np.zeros(2)), "v_world of its answer to frame 0 has shape (2,)"),
-        (lambda sound, _: replace(sound, bias=np.zeros((6, 1))), "bias of its answer to frame 0 has shape (6, 1)"),
-        (lambda sound, _: replace(sound, info=[1.0]), "info of its answer to frame 0 is a list"),
-        (lambda sound, _: replace(sound, info={"nis": "1"}), "has 'nis': '1'; it is a dict of numbers by name"),
-    ],
-)
+ANSWERS: dict[str, Answer] = {
+    "frame 0 is a tuple; step returns an": lambda sound, _: (sound.t_ns, sound.T_world_imu),
+    "T_world_imu .* frame 0 has shape (3, 3); expec": lambda sound, _: replace(sound, T_world_imu=np.eye(3)),
+    "T_world_imu of its answer to frame 0 is None": lambda sound, _: replace(sound, T_world_imu=None),
+    "is a list; it is an": lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.tolist()),
+    "has the type complex128": lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.astype(complex)),
+    "t_ns of its answer to frame 0 is .* in whole ns": lambda sound, _: replace(sound, t_ns=sound.t_ns / 1e9),
+    "expected (6, 6) or (9, 9) or (12, 12) or (15, 15)": lambda sound, _: replace(sound, cov=np.eye(3)),
+    "frame 1 has shape (9, 9), and": lambda sound, packet: replace(sound, cov=np.eye(9 if packet.index else 6)),
+    "bias of its answer to frame 0 has shape (6, 1)": lambda sound, _: replace(sound, bias=np.zeros((6, 1))),
+    "info of its answer to frame 0 is a list": lambda sound, _: replace(sound, info=[1.0]),
+    "has 'nis': '1'; it is a dict of numbers by name": lambda sound, _: replace(sound, info={"nis": "1"}),
+}
+
+
+@pytest.mark.parametrize(("why", "answer"), ANSWERS.items())
 def test_a_step_that_answers_otherwise_fails_its_run_and_nothing_else(
-    sequence: Sequence, answer: Answer, why: str
+    sequence: Sequence, why: str, answer: Answer
 ) -> None:
     done = run(sequence, answer)
     assert done.status == "failed"
@@ -98,36 +82,26 @@ def test_a_step_that_answers_otherwise_fails_its_run_and_nothing_else(
     assert len(done.log) == 1  # the line says it; a traceback would be of ours
 
 
-def of_landmarks(ids: Any, points: Any) -> End:
-    return lambda sound: replace(sound, landmarks=Landmarks(ids, points))
-
-
 def of_trajectory(**changed: Any) -> End:
     return lambda sound: replace(sound, trajectory=replace(sound.trajectory, **changed))
 
 
-@pytest.mark.parametrize(
-    ("end", "why"),
-    [
-        (lambda sound: None, "finish returned None; it must return a Finished"),
-        (lambda sound: sound.trajectory, "finish returned a Trajectory"),
-        (lambda sound: replace(sound, trajectory=[]), "the trajectory of its finish is a list"),
-        (lambda sound: replace(sound, landmarks=None), "the landmarks of its finish are None"),
-        (lambda sound: replace(sound, log="all is well"), "the log of its finish is a str"),
-        (
-            of_trajectory(T_world_imu=np.eye(4)),
-            "T_world_imu of its final trajectory has shape (4, 4); expected",
-        ),
-        (of_trajectory(cov=np.ones((5, 6, 6))), "cov of its final trajectory has shape (5, 6, 6)"),
-        (of_trajectory(t_ns=np.arange(FRAMES)), "the stamps of its final trajectory are not those of frames"),
-        (
-            of_landmarks(np.arange(2), np.zeros((1, 3))),
-            "points_world of its landmarks has shape (1, 3); expected",
-        ),
-    ],
-)
+ENDS: dict[str, End] = {
+    "finish returned a Trajectory; it must return a Finished": lambda sound: sound.trajectory,
+    "the trajectory of its finish is a list": lambda sound: replace(sound, trajectory=[]),
+    "the landmarks of its finish are None": lambda sound: replace(sound, landmarks=None),
+    "the log of its finish is a str": lambda sound: replace(sound, log="all is well"),
+    "T_world_imu of its final trajectory has shape (4, 4); expected": of_trajectory(T_world_imu=np.eye(4)),
+    "the stamps of its final trajectory are not those of frames": of_trajectory(t_ns=np.arange(FRAMES)),
+    "points_world of its landmarks has shape (1, 3); expected": lambda sound: replace(
+        sound, landmarks=Landmarks(np.arange(2), np.zeros((1, 3)))
+    ),
+}
+
+
+@pytest.mark.parametrize(("why", "end"), ENDS.items())
 def test_a_finish_that_answers_otherwise_fails_its_run_and_keeps_the_causal_answers(
-    sequence: Sequence, end: End, why: str
+    sequence: Sequence, why: str, end: End
 ) -> None:
     done = run(sequence, end=end)
     assert done.status == "failed"
