@@ -132,7 +132,7 @@ def test_piped_output_is_never_wrapped_or_cut(
 )
 def test_every_option_in_seconds_reads_the_same_words(text: str, seconds: float) -> None:
     options = parser().parse_args(["compare", "drive", "--window", text, "--from", text, "--to", text])
-    read = [vars(options)["settings.window.lag_s"], options.from_s, options.to_s]
+    read = [vars(options)["--window=window.lag_s"], options.from_s, options.to_s]
     read.append(parser().parse_args(["simulate", "drive", "--out", "s", "--duration", text]).duration)
     assert read == pytest.approx([seconds] * 4)
 

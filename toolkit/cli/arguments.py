@@ -291,14 +291,10 @@ REPAIR = OneOf(
     )
 )
 
-# Options that are short for a setting, by its key; a parsed command line has their values as settings.KEY.
-_SHORT_FOR: dict[str, str] = {}
-
 
 def setting(key: str, made: Argument) -> Argument:
-    """Return the option as one that is short for the setting ``key``."""
-    _SHORT_FOR[key] = made.name
-    return Argument(made.name, {**made.how, "dest": f"settings.{key}"})
+    """Return the option as one that is short for the setting ``key``; a command line has its value as OPTION=KEY."""
+    return Argument(made.name, {**made.how, "dest": f"{made.name}={key}"})
 
 
 TOPICS = setting(
@@ -365,11 +361,11 @@ def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any
     """
     from toolkit.settings import assigned
 
-    short = [
-        (f"{option} {value:g}" if isinstance(value, float) else f"{option} {value}", key, value)
-        for key, option in _SHORT_FOR.items()
-        if (value := getattr(options, f"settings.{key}", None)) is not None
-    ]
+    short = []
+    for dest, value in vars(options).items():
+        option, _, key = dest.partition("=")
+        if key and value is not None:
+            short.append((f"{option} {value:g}" if isinstance(value, float) else f"{option} {value}", key, value))
     if getattr(options, "no_fast", False):
         short.append(("--no-fast", "arithmetic", "numpy"))
     by_set = [(f"--set {text}", *assigned(text)) for text in getattr(options, "set", ())]
