@@ -33,34 +33,35 @@ from toolkit.report.camera_frames import camera_frames
 from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.manifest import Manifest, manifest_document, read_manifest
-from toolkit.report.report_json import CameraFrame, Report, SeedsReport, read_report, read_seeds_report
-from toolkit.report.scores import MetricsDocument, Seeds, metrics_document, read_metrics, read_seeds, seeds_document
+from toolkit.report.report_json import (
+    CameraFrame,
+    DrawnOverSeeds,
+    DrawnRun,
+    Report,
+    SeedsReport,
+    read_report,
+    read_seeds_report,
+)
+from toolkit.report.scores import (
+    MetricsDocument,
+    RunOverSeeds,
+    ScoredRun,
+    Seeds,
+    metrics_document,
+    read_metrics,
+    read_seeds,
+    seeds_document,
+)
 
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
-_Rows = list[tuple[str, Output]]
-
 
 if TYPE_CHECKING:
     from toolkit.report.figures import FigureChoice, FigureFormat
 
 
-METRICS, SEEDS = "metrics.json", "seeds.json"
-
-
-REPORT, MANIFEST = "report.json", "manifest.json"
-
-
+METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 REPORT_TEXT, PAGE = "report.md", "report.html"
-
-
 FOLDERS = ("figures", "landmarks", "trajectories")
-
-
-# The figures of the versions that did not list their files; one more a run is named for its estimator.
-_FIGURES = (
-    *("top_all", "errors_over_time", "reprojection", "frame_times"),
-    *("errors_over_seeds", "nees_over_seeds"),
-)
 
 
 def check_run_directory(target: Path) -> None:
@@ -71,24 +72,21 @@ def check_run_directory(target: Path) -> None:
 def written_by_us(directory: Path) -> frozenset[str]:
     """Return what in a directory an earlier run wrote: files by their relative path, folders with a slash behind.
 
-    They are the outcomes of a run that is not complete or is continued; those its manifest lists, or where an earlier
-    version listed none, those that version wrote by its estimators' names; and the page that ``vislam report`` puts
-    beside them. None of these where there is no manifest of ours: many programs write a file of that name.
+    They are the outcomes of a run that is not complete or is continued; those its manifest lists; and the page that
+    ``vislam report`` puts beside them. None of these where there is no manifest of ours: many programs write a file of
+    that name.
     """
-    outcomes = files_of_ours(directory)
+    files = set(files_of_ours(directory))
     try:
         manifest = read_manifest(directory / MANIFEST)
     except DataError:
-        return _with_folders(outcomes)
-    files = _files_of_an_earlier_version(manifest) if manifest.files is UNSET else frozenset(manifest.files)
-    page = {PAGE} if _is_page(directory / PAGE) else set()
-    return _with_folders(outcomes | files | page) | {f"{folder}/" for folder in FOLDERS}
-
-
-def _with_folders(files: frozenset[str]) -> frozenset[str]:
-    """Return files and the folders they are in."""
-    folders = {folder.as_posix() for file in files for folder in PurePosixPath(file).parents}
-    return files | {f"{folder}/" for folder in folders - {"."}}
+        folders = set()
+    else:
+        files |= set(() if manifest.files is UNSET else manifest.files)
+        files |= {PAGE} if _is_page(directory / PAGE) else set()
+        folders = {f"{folder}/" for folder in FOLDERS}
+    folders |= {f"{folder.as_posix()}/" for file in files for folder in PurePosixPath(file).parents}
+    return frozenset(files | folders - {"./"})
 
 
 def _is_page(path: Path) -> bool:
@@ -98,22 +96,6 @@ def _is_page(path: Path) -> bool:
             return b"vislam report</title>" in file.read(4096)
     except OSError:
         return False
-
-
-def _files_of_an_earlier_version(manifest: Manifest) -> frozenset[str]:
-    """Return the files of a run whose manifest does not list them."""
-    others = () if manifest.references is UNSET else manifest.references
-    names = (*manifest.estimators, *others)
-    outputs: tuple[Output, ...] = ("causal", "final")
-    figures = (*_FIGURES, *(f"top_{plain_name(name)}" for name in names))
-    return frozenset(
-        (
-            *(METRICS, SEEDS, REPORT, MANIFEST, REPORT_TEXT, report_json.TRUTH_FILE),
-            *(report_json.trajectory_file(name, output) for name in names for output in outputs),
-            *(report_json.landmarks_file(name) for name in names),
-            *(f"figures/{figure}.png" for figure in figures),
-        )
-    )
 
 
 def directories_for(cases: Sequence[PreparedCase], out: Path) -> tuple[Path, ...]:
@@ -225,7 +207,7 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            _write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
+            _write_text(directory / report_json.trajectory_file(row.estimator, row.output), tum.text(trajectory))
     for run in comparison.runs:
         _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
 
@@ -233,19 +215,14 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
 def _write_truth(comparison: Comparison, directory: Path) -> None:
     truth = truth_during(comparison.sequence)
     if truth is not None:
-        _write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
-
-
-def _write_tum(trajectory: Trajectory, path: Path) -> None:
-    """Write a trajectory as a TUM file."""
-    path.write_text(tum.text(trajectory), encoding="utf-8")
+        _write_text(directory / report_json.TRUTH_FILE, tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
 
 
 def _write_landmarks(landmarks: Landmarks, path: Path) -> None:
     """Write landmarks as CSV, one a row: track id and position in the world in metres."""
     rows = zip(landmarks.track_ids.tolist(), landmarks.points_world.tolist(), strict=True)
     lines = [f"{track_id},{x:.15g},{y:.15g},{z:.15g}" for track_id, (x, y, z) in rows]
-    path.write_text("\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n", encoding="utf-8")
+    _write_text(path, "\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n")
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -312,15 +289,13 @@ def read_run(directory: Path) -> RunFiles | SeedsFiles:
 
 def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
     scores, report = read_metrics(directory / METRICS), read_report(directory / REPORT)
-    drawn = [(run.estimator, run.output) for run in report.runs]
-    _check_same_runs(directory, METRICS, [(run.estimator, run.output) for run in scores.runs], drawn)
+    drawn = _check_same_runs(directory, METRICS, scores.runs, report.runs)
     if not {(one.estimator, one.output) for one in report.maps} <= set(drawn):
         raise DataError(f"{directory / REPORT} has the map of a run it does not have; repeat the comparison")
     names = [report.truth, *(run.trajectory for run in report.runs)]
     tracks = {name: _track(directory / name, report.start_ns) for name in names if name is not None}
     landmarks = {one.landmarks: _landmarks(directory / one.landmarks) for one in report.maps}
-    frames = () if report.frames is UNSET else report.frames
-    images = {frame.image: _inside(directory, frame.image) for frame in frames}
+    images = {frame.image: _inside(directory, frame.image) for frame in report.frames or ()}
     return RunFiles(directory, scores, report, manifest, tracks, landmarks, images)
 
 
@@ -333,15 +308,21 @@ def _inside(directory: Path, name: str) -> bytes:
 
 def _over_seeds(directory: Path, manifest: Manifest) -> SeedsFiles:
     scores, report = read_seeds(directory / SEEDS), read_seeds_report(directory / REPORT)
-    drawn = [(run.estimator, run.output) for run in report.runs]
-    _check_same_runs(directory, SEEDS, [(run.estimator, run.output) for run in scores.runs], drawn)
+    _check_same_runs(directory, SEEDS, scores.runs, report.runs)
     return SeedsFiles(directory, scores, report, manifest)
 
 
-def _check_same_runs(directory: Path, name: str, scored: _Rows, drawn: _Rows) -> None:
-    """Raise DataError unless the report draws the runs that have scores, in their order."""
-    if scored != drawn:
+def _check_same_runs(
+    directory: Path,
+    name: str,
+    scored: Sequence[ScoredRun | RunOverSeeds],
+    drawn: Sequence[DrawnRun | DrawnOverSeeds],
+) -> list[tuple[str, Output]]:
+    """Return the report's runs, which must be those that have scores, in their order; raises DataError otherwise."""
+    runs = [(run.estimator, run.output) for run in drawn]
+    if [(run.estimator, run.output) for run in scored] != runs:
         raise DataError(f"{directory}: {REPORT} does not have the runs of {name}; repeat the comparison")
+    return runs
 
 
 def _track(path: Path, start_ns: int) -> DrawnPath:

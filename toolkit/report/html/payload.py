@@ -10,20 +10,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET, UnsetType, to_builtins
+from msgspec import UNSET, to_builtins
 from msgspec.structs import asdict
 
 from toolkit.files.documents import number, numbers
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics import known_metrics
+from toolkit.metrics import Metric, known_metrics
 from toolkit.report import curves
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import look_numbers
 from toolkit.report.html.highlights import highlights
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
-from toolkit.report.scores import ConsistencyMark, MetricOverSeeds, RunOverSeeds
-from toolkit.report.text import ShownUnit, unit_of
+from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
+from toolkit.report.text import unit_of
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -38,15 +38,12 @@ _LARGE_M = 1e7
 def payload_of(runs: Sequence[Files]) -> Json:
     """Return what the page shows of run directories, side by side in this order."""
     titles = _titles(runs)
-    colours = _colours(runs)
+    colours = look_numbers(run.estimator for files in runs for run in files.scores.runs)
     return {
         "title": " / ".join(titles),
         "columns": columns_of(_values(runs), real=any(one.manifest.sequence.format != "simulated" for one in runs)),
         "cases": [
-            _case(files, f"c{i}", title, colours)
-            if isinstance(files, RunFiles)
-            else seeds_case(files, f"c{i}", title, colours)
-            for i, (files, title) in enumerate(zip(runs, titles, strict=True))
+            _case(files, f"c{i}", title, colours) for i, (files, title) in enumerate(zip(runs, titles, strict=True))
         ],
     }
 
@@ -61,24 +58,32 @@ def _titles(runs: Sequence[Files]) -> list[str]:
     return [next((title for title in choice if counts[title] == 1), choice[-1]) for choice in choices]
 
 
-def _colours(runs: Sequence[Files]) -> dict[str, int]:
-    return look_numbers(run.estimator for files in runs for run in files.scores.runs)
-
-
-def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
-    report, sequence = files.report, files.scores.sequence
-    rows = _rows(files, case_id, colours)
-    return {
-        "kind": "run",
+def _case(files: Files, case_id: str, title: str, colours: dict[str, int]) -> Json:
+    """Return what the page shows of one run directory: its documents, and what only a page needs."""
+    if isinstance(files, SeedsFiles):
+        rows = _rows_over_seeds(files, case_id, colours)
+        own: Json = {"kind": "seeds", "seeds": files.scores.seeds}
+        of_runs = f"{len(files.scores.seeds)} seeds"
+    else:
+        rows = _rows(files, case_id, colours)
+        own, of_runs = {"kind": "run"} | _of_one_run(files, rows), "one run"
+    return own | {
         "id": case_id,
         "title": title,
-        "sequence": asdict(sequence),
-        "words": to_builtins(report.words),
+        "sequence": to_builtins(files.scores.sequence),
+        "words": to_builtins(files.report.words),
+        "highlights": highlights(files.report.contests or (), rows, of_runs),
+        "rows": rows,
+        "manifest": to_builtins(files.manifest),
+    }
+
+
+def _of_one_run(files: RunFiles, rows: list[Json]) -> Json:
+    report = files.report
+    return {
         "card": [] if report.card is UNSET else report.card.words,
         "alignment": report.alignment,
         "error": to_builtins(report.error),
-        "highlights": highlights(report.contests or (), rows, "one run"),
-        "rows": rows,
         "truth": None if report.truth is None else _drawn(files.tracks[report.truth]),
         "maps": [_map(one, files, rows) for one in report.maps],
         "steps": [
@@ -86,8 +91,7 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
             | _with_median({"t_s": one.t_s, "step_ms": one.step_ms}, "step_ms")
             for one in report.steps
         ],
-        "frames": [_frame(frame, files, rows) for frame in files.report.frames or ()],
-        "manifest": to_builtins(files.manifest),
+        "frames": [_frame(frame, files, rows) for frame in report.frames or ()],
     }
 
 
@@ -95,7 +99,7 @@ def _frame(frame: CameraFrame, files: RunFiles, rows: list[Json]) -> Json:
     """Return an image, which the page holds itself, with the tracks on it and their errors by the rows' ids."""
     ids = {(row["estimator"], "causal" if row["output"] == "both" else row["output"]): row["id"] for row in rows}
     errors = {
-        ids[one.estimator, one.output]: [_hundredths(px) for px in one.off_px]
+        ids[one.estimator, one.output]: _decimals(one.off_px, 2)
         for one in frame.errors
         if (one.estimator, one.output) in ids
     }
@@ -104,51 +108,42 @@ def _frame(frame: CameraFrame, files: RunFiles, rows: list[Json]) -> Json:
         "t_s": frame.t_s,
         "image": f"data:image/jpeg;base64,{content}",
         "size": [frame.width_px, frame.height_px],
-        "u": [_tenths(u) for u in frame.u_px],
-        "v": [_tenths(v) for v in frame.v_px],
+        "u": _decimals(frame.u_px, 1),
+        "v": _decimals(frame.v_px, 1),
         "off": errors,
     }
 
 
-def _tenths(value: float | None) -> float | None:
-    return None if value is None else round(value, 1)
-
-
-def _hundredths(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)
+def _decimals(values: Sequence[float | None], digits: int) -> list[float | None]:
+    return [None if value is None else round(value, digits) for value in values]
 
 
 def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     """Return a row for each kind of output that says something of its own, as in the other tables."""
     repeated = {run.estimator for run in files.report.runs if run.repeats_causal}
     changes = files.report.words.changes
-    rows: list[Json] = []
-    for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
-        name = run.estimator
-        if drawn.repeats_causal:
-            continue
-        rows.append(
-            {
-                "id": f"{case_id}r{i}",
-                "estimator": name,
-                "output": "both" if name in repeated else run.output,
-                "status": run.status,
-                "mark": mark_of(run.consistency),
-                "judged": run.consistency is not UNSET,
-                "good": run.status == "ok",
-                "colour": colours[name],
-                "change": changes.get(name, ""),
-                "metrics": run.metrics,
-                "notes": run.notes,
-                "log": run.log,
-                "track": None if drawn.trajectory is None else _drawn(_aligned(files.tracks[drawn.trajectory], drawn)),
-                "errors": None if drawn.errors is None else thinned(asdict(drawn.errors), "position_m"),
-                "nees": _nees(drawn.nees),
-                "components": None if drawn.components is UNSET else _components(drawn.components),
-                "nis": drawn.nis if isinstance(drawn.nis, str) else _with_median(asdict(drawn.nis), "per_dof"),
-            }
-        )
-    return rows
+    return [
+        _row(run, f"{case_id}r{i}", colours)
+        | {
+            "output": "both" if run.estimator in repeated else run.output,
+            "good": run.status == "ok",
+            "change": changes.get(run.estimator, ""),
+            "track": None if drawn.trajectory is None else _drawn(_aligned(files.tracks[drawn.trajectory], drawn)),
+            "errors": None if drawn.errors is None else thinned(asdict(drawn.errors), "position_m"),
+            "nees": _nees(drawn.nees),
+            "components": None if drawn.components is UNSET else _components(drawn.components),
+            "nis": drawn.nis if isinstance(drawn.nis, str) else _with_median(asdict(drawn.nis), "per_dof"),
+        }
+        for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True))
+        if not drawn.repeats_causal
+    ]
+
+
+def _row(run: ScoredRun | RunOverSeeds, row_id: str, colours: dict[str, int]) -> Json:
+    """Return a run as its document has it, with its id and look, and what its stated uncertainty is marked as."""
+    mark = "" if run.consistency is UNSET or run.consistency.verdict == "consistent" else run.consistency.verdict
+    page = {"id": row_id, "colour": colours[run.estimator], "mark": mark, "judged": run.consistency is not UNSET}
+    return {**to_builtins(run), **page}
 
 
 def _rows_of(estimator: str, rows: list[Json]) -> list[str]:
@@ -209,7 +204,7 @@ def _values(runs: Sequence[Files]) -> dict[str, list[float | None]]:
     return values
 
 
-def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> list[dict[str, Any]]:
+def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> list[Json]:
     """Return a column for each metric that has values, and for each key that no metric here declares.
 
     First stand those of the table of a comparison, of a ``real`` recording where any of them is one.
@@ -218,7 +213,9 @@ def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> l
     valued = [metric for metric in present if any(value is not None for value in values[metric.key])]
     usual = usual_metrics(valued, real=real)
     usual += [metric for metric in present if metric.table == "where rows differ"]
-    columns = [
+    undeclared = sorted(values.keys() - {metric.key for metric in present})
+    others = [metric for metric in present if metric not in usual]
+    return [
         {
             "key": metric.key,
             "name": metric.name,
@@ -230,78 +227,33 @@ def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> l
             "usual": metric in usual,
             "usual_over_seeds": metric.over_seeds,
         }
-        for metric in (*usual, *(metric for metric in present if metric not in usual))
+        for metric in (*usual, *others, *(Metric(key, "", "", (key, ""), best="") for key in undeclared))
     ]
-    return [*columns, *(_undeclared(key) for key in sorted(values.keys() - {metric.key for metric in present}))]
-
-
-def _undeclared(key: str) -> dict[str, Any]:
-    """Return the column of a metric that the runs have and this installation does not know."""
-    words = {
-        "key": key,
-        "name": key,
-        "unit": "",
-        "shown_in": ShownUnit("")._asdict(),
-        "count": False,
-        "meaning": "",
-        "best": "",
-    }
-    return {**words, "usual": False, "usual_over_seeds": False}
-
-
-def seeds_case(files: SeedsFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
-    """Return what the page shows of one directory of a comparison over seeds."""
-    rows, seeds = _rows_over_seeds(files, case_id, colours), files.scores.seeds
-    return {
-        "kind": "seeds",
-        "id": case_id,
-        "title": title,
-        "sequence": asdict(files.scores.sequence),
-        "seeds": seeds,
-        "words": to_builtins(files.report.words),
-        "highlights": highlights(files.report.contests or (), rows, f"{len(seeds)} seeds"),
-        "rows": rows,
-        "manifest": to_builtins(files.manifest),
-    }
 
 
 def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     rows: list[Json] = []
     for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
+        ok, seeds = run.counts["ok"], len(run.status)
         if i > 0 and _are_the_same(files.scores.runs[i - 1], run):
             rows[-1]["output"] = "both"
             continue
         rows.append(
-            {
-                "id": f"{case_id}r{i}",
-                "estimator": run.estimator,
-                "output": run.output,
-                "status": _status(run),
-                "mark": mark_of(run.consistency),
-                "judged": run.consistency is not UNSET,
-                "good": run.counts["ok"] == len(run.status),
-                "colour": colours[run.estimator],
-                "change": "" if run.change is UNSET else run.change,
+            _row(run, f"{case_id}r{i}", colours)
+            | {
+                "status": "ok"
+                if run.counts["ok"] == len(run.status)
+                else f"{run.counts['ok']} of {len(run.status)} ok",
+                "good": ok == seeds,
+                "change": run.change or "",
                 "metrics": {key: metric.mean for key, metric in run.metrics.items()},
                 "spreads": {key: {"std": metric.std, "n": metric.n} for key, metric in run.metrics.items()},
                 "values": {key: metric.values for key, metric in run.metrics.items()},
                 "statuses": run.status,
-                "notes": run.notes,
                 **_series(drawn, files.report.t_s),
             }
         )
     return rows
-
-
-def mark_of(mark: ConsistencyMark | UnsetType) -> str:
-    """Return what a run is marked as, nothing where it is consistent or cannot be evaluated."""
-    return "" if mark is UNSET or mark.verdict == "consistent" else mark.verdict
-
-
-def _status(run: RunOverSeeds) -> str:
-    """Return "ok" where every seed ended well, else how many did."""
-    seeds = len(run.status)
-    return "ok" if run.counts["ok"] == seeds else f"{run.counts['ok']} of {seeds} ok"
 
 
 def _are_the_same(causal: RunOverSeeds, final: RunOverSeeds) -> bool:
@@ -362,7 +314,7 @@ def _as_array(values: Sequence[float | None]) -> Array:
 
 
 def coordinates(points: Array) -> dict[str, list[float | None]]:
-    """Return points (N, 3) as lists of x, y and z to the millimetre; what flew off keeps six digits."""
+    """Return points (N, 3) as lists of x, y and z to the millimetre, beyond 10 000 km with six digits."""
     axes = zip("xyz", points.T.tolist(), strict=True)
     return {axis: [_metres(value) for value in values] for axis, values in axes}
 
