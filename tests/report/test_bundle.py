@@ -120,16 +120,6 @@ def test_a_damaged_bundle_is_reported_in_one_line(bundle: Path, reproduce, tmp_p
     assert reported.count("\n") == 1
 
 
-def test_what_is_no_bundle_is_reported_in_one_line(bundle: Path, reproduce, tmp_path: Path) -> None:
-    (tmp_path / "cut.zip").write_bytes(bundle.read_bytes()[:-200])
-    (tmp_path / "text.zip").write_text("hello")
-    for name in ("cut.zip", "text.zip", "nowhere.zip"):
-        status, _, reported = reproduce(name)
-        assert status == 3
-        assert name in reported
-        assert reported.count("\n") == 1
-
-
 def test_every_byte_that_is_flipped_is_found_or_harmless(bundle: Path, tmp_path: Path) -> None:
     from toolkit.errors import DataError
 
@@ -143,12 +133,3 @@ def test_every_byte_that_is_flipped_is_found_or_harmless(bundle: Path, tmp_path:
             assert "\n" not in str(error)
         else:
             assert record == whole
-
-
-@pytest.mark.parametrize(
-    "words",
-    [("--bundle", "x.zip", "--format", "tum"), (), ("--format", "tum"), ("--bundle", "x.zip", "--output", "final")],
-)
-def test_export_says_what_goes_together(bundle: Path, capsys, words: tuple[str, ...]) -> None:
-    assert main(["export", str(bundle.with_suffix("")), *words]) == 2
-    assert "--bundle" in capsys.readouterr().err

@@ -6,13 +6,11 @@ from pathlib import Path
 import pytest
 
 from toolkit.cli import main
-from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
-from toolkit.files.documents import to_line
 from toolkit.noise import card_of, measured_noise
-from toolkit.report.card import card_lines, card_record, card_text
+from toolkit.report.card import card_lines, card_record
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.html.payload import payload_of
 from toolkit.report.records import read_card
@@ -70,15 +68,6 @@ def test_intervals_without_a_common_track_are_counted(walking: Sequence) -> None
     assert (card.blind_intervals, card.intervals) == (2, walking.frame_count - 1)
 
 
-def test_the_record_has_what_the_text_says(walking: Sequence) -> None:
-    card = card_of(walking)
-    record = card_record(card)
-    assert record.words == tuple(card_lines(card))
-    assert record.correlated
-    assert record.track_weight == pytest.approx(card.weight.value, rel=1e-5)
-    assert all(line in card_text(walking, card, None) for line in record.words)
-
-
 def test_the_command_prints_the_card_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "card.json"
     assert main(["card", "drive", "--max-frames", "50", "--json", str(target)]) == 0
@@ -86,11 +75,6 @@ def test_the_command_prints_the_card_and_writes_it(tmp_path: Path, capsys: pytes
     assert record.schema == "vislam.card/2"
     printed = capsys.readouterr().out
     assert all(line in printed for line in record.words)
-
-
-def test_the_command_refuses_a_recording_without_tracks_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["card", "drive", "--max-frames", "4"]) == DataError.exit_status
-    assert "4 frames are too few" in capsys.readouterr().err
 
 
 def compared(sequence: Sequence, card: bool = True) -> Comparison:
@@ -107,12 +91,6 @@ def test_a_report_and_its_page_have_the_card_on_request(walking: Sequence, tmp_p
     assert all(line in comparison_text(comparison, width=None) for line in words)
     write_run(comparison, tmp_path / "run", MadeBy("vislam compare", Configuration()))
     assert tuple(payload_of([read_run(tmp_path / "run")])["cases"][0]["card"]) == words
-
-
-def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:
-    comparison = compared(walking.truncated(20), card=False)
-    assert comparison.card is None
-    assert '"card"' not in to_line(report_document(comparison))
 
 
 def test_a_card_that_cannot_be_had_costs_a_comparison_nothing_and_is_told(walking: Sequence) -> None:

@@ -15,7 +15,6 @@ from matplotlib.inset import InsetIndicator
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, interpolate_poses, se3
-from toolkit.metrics import Scores
 from toolkit.registry import defaults, discover
 from toolkit.report import figures
 from toolkit.report.curves import (
@@ -141,26 +140,6 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert "astray" in position.get_title(loc="right")
 
 
-def test_a_heading_far_from_the_others_leaves_its_panel_and_is_named(
-    comparison: Comparison, comparison_of: ComparisonOf
-) -> None:
-    runs = [run for run in comparison.runs if run.status == "ok"]
-    turned = replace(runs[0], estimator="turned", final=None, causal=turning(runs[0].trajectory("causal"), 30.0))
-    (drawn,) = over_time.draw_errors(comparison_of(comparison.sequence, (*runs, turned)))
-    heading = drawn.figure.axes[1]
-    assert heading.get_ylim()[1] < 15.0
-    assert "turned" in heading.get_title(loc="right")
-
-
-def turning(trajectory: Trajectory | None, most_deg: float) -> Trajectory:
-    """Return a trajectory whose heading leaves the one given ever more."""
-    assert trajectory is not None
-    angles = np.radians(np.linspace(0.0, most_deg, trajectory.t_ns.size))
-    poses = trajectory.T_world_imu.copy()
-    poses[:, :3, :3] = np.stack([about_z(float(angle)) for angle in angles]) @ poses[:, :3, :3]
-    return replace(trajectory, T_world_imu=poses)
-
-
 @pytest.mark.parametrize(
     "draw", [reprojection.draw, over_time.draw_frame_times, over_time.draw_errors, from_above.draw_all]
 )
@@ -200,32 +179,9 @@ def test_components_are_estimate_minus_truth_in_the_worlds_axes(offset: Comparis
     np.testing.assert_allclose(np.linalg.norm(found.error[:, :3], axis=1), 0.5, atol=1e-10)
 
 
-def test_stated_deviations_turn_with_the_body(offset: Comparison, sequence: Sequence) -> None:
-    found, truth = of_offset(offset), sequence.truth
-    assert truth is not None
-    assert found.sigma is not None
-    estimate = offset.runs[0].final
-    assert estimate is not None
-    turn = estimate.T_world_imu[:, :3, :3]
-    np.testing.assert_allclose(found.sigma[:, 3:] ** 2, (turn**2) @ SIGMA_M**2, rtol=1e-9)
-    np.testing.assert_allclose((found.sigma[:, :3] ** 2).sum(axis=1), (SIGMA_DEG**2).sum(), rtol=1e-9)
-
-
 def all_components(comparison: Comparison) -> list[NamedFigure]:
     telling = over_time.draw_telling_components(comparison)
     return [*telling, *over_time.draw_other_components(comparison)]
-
-
-def test_the_least_and_the_most_consistent_estimator_are_drawn_by_component_first(
-    comparison: Comparison, rescored: Callable[..., Comparison]
-) -> None:
-    nees = {"steady": 0.01, "astray": 5.0, "late": 1.1}
-    scored = rescored(
-        comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": nees.get(row.estimator)}, {})
-    )
-    names = [figure.name for figure in all_components(scored)]
-    assert names[:2] == ["components_steady", "components_late"]
-    assert len({*names}) == len(names)
 
 
 def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comparison) -> None:
@@ -254,11 +210,6 @@ def test_a_panel_whose_values_leave_the_figure_says_how_large_they_become() -> N
     drawn = [bands.Drawn(name, "#000000", "final", series) for name, series in (("in", inside), ("out", beyond))]
     figure = bands.figure_with_bands(["in", "out"], drawn, "NEES", "a drive")
     assert [axes.get_title(loc="right") for axes in figure.axes] == ["67 % in band", "67 % in band, up to 7e+05"]
-
-
-def test_without_truth_there_is_no_nees_and_without_innovations_no_nis(without_truth: Comparison) -> None:
-    assert list(bands.draw_nees(without_truth)) == []
-    assert list(bands.draw_nis(without_truth)) == []
 
 
 def test_all_panels_of_a_map_share_a_scale_of_colours(comparison: Comparison) -> None:
@@ -314,13 +265,6 @@ def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
     assert np.isfinite(view_of([nowhere], NOWHERE)).all()
 
 
-def test_lines_that_are_apart_need_no_closer_look() -> None:
-    view = View(np.array([0.0, -50.0]), np.array([100.0, 50.0]))
-    assert where_tracks_coincide([straight(0.0), straight(20.0)], view, np.arange(101)) is None
-    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
-    assert where_tracks_coincide([straight(0.0), nowhere], view, np.arange(101)) is None
-
-
 @pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])
 def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Comparison, draw: Draw) -> None:
     (one,) = draw(fourteen)
@@ -371,3 +315,14 @@ def test_an_estimator_has_one_look_whatever_it_is_compared_with() -> None:
     for name in together:
         assert look_numbers([name])[name] == together[name]
     assert len({together[name] % COLOURS for name in (*defaults(), "one of my own")}) == len(defaults()) + 1
+
+
+def test_stated_deviations_turn_with_the_body(offset: Comparison, sequence: Sequence) -> None:
+    found, truth = of_offset(offset), sequence.truth
+    assert truth is not None
+    assert found.sigma is not None
+    estimate = offset.runs[0].final
+    assert estimate is not None
+    turn = estimate.T_world_imu[:, :3, :3]
+    np.testing.assert_allclose(found.sigma[:, 3:] ** 2, (turn**2) @ SIGMA_M**2, rtol=1e-9)
+    np.testing.assert_allclose((found.sigma[:, :3] ** 2).sum(axis=1), (SIGMA_DEG**2).sum(), rtol=1e-9)

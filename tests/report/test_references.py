@@ -132,14 +132,6 @@ def test_its_figures_and_files_have_names_without_blanks_and_brackets(export: Pa
     assert (manifest["estimators"], manifest["references"]) == (["dead-reckoning"], [NAME])
 
 
-def test_it_ends_with_the_frames_that_are_kept(export: Path) -> None:
-    comparison, directory = compared(export, max_frames=10)
-    (run,) = (run for run in comparison.runs if run.estimator == NAME)
-    assert run.causal is not None
-    np.testing.assert_array_equal(run.causal.t_ns, comparison.sequence.frames_t_ns)
-    assert entry(directory)["metrics"]["pairs"] == 10
-
-
 def test_one_of_another_clock_stays_and_says_so(export: Path) -> None:
     path = export / "est.txt"
     head, *states = path.read_text().splitlines()
@@ -148,14 +140,6 @@ def test_one_of_another_clock_stays_and_says_so(export: Path) -> None:
     comparison, directory = compared(export)
     assert entry(directory)["metrics"]["coverage_percent"] == 0.0
     assert "none of its poses (" in report_text(comparison, {})
-
-
-def test_an_export_without_one_and_a_built_in_have_none(export: Path) -> None:
-    (export / "est.txt").unlink()
-    assert load_references(str(export)) == {}
-    assert load_references("drive") == {}
-    comparison, _ = compared(export)
-    assert {row.estimator for row in comparison.rows} == {"dead-reckoning"}
 
 
 @pytest.mark.parametrize(

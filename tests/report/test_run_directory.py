@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -76,20 +77,57 @@ def test_a_failure_while_writing_leaves_nothing(
 
 
 @one_figure
-def test_a_failure_while_writing_keeps_the_earlier_run(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write(comparison, tmp_path / "run")
-    before = (tmp_path / "run" / "manifest.json").read_bytes()
-
-    def fail(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(figures, "drawn", fail)
-    with pytest.raises(KeyboardInterrupt):
-        write(comparison, tmp_path / "run")
+def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, tmp_path: Path) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    first = {path.relative_to(target) for path in target.rglob("*")}
+    # Another page than that of this run stands for one of it, and it has files that the next run has not.
+    (target / "report.html").write_text("<title>drive - vislam report</title>")
+    (target / "trajectories" / "truth.tum").rename(target / "trajectories" / "gone_final.tum")
+    manifest = json.loads((target / "manifest.json").read_text())
+    manifest["files"].append("trajectories/gone_final.tum")
+    (target / "manifest.json").write_text(json.dumps(manifest))
+    write(comparison, target)
+    assert {path.relative_to(target) for path in target.rglob("*")} == first
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert (tmp_path / "run" / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "figures/top_view_for_the_paper.png", "raw/imu.csv", "trajectories/other.tum", "report.html"]
+)
+@one_figure
+def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
+    comparison: Comparison, tmp_path: Path, name: str
+) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    check_run_directory(target)
+    (target / name).parent.mkdir(exist_ok=True)
+    (target / name).write_text("years of work")
+    first = name.partition("/")[0] if name.startswith("raw") else name
+    with pytest.raises(OutputError, match=f"holds other files, as {re.escape(first)},"):
+        check_run_directory(target)
+    with pytest.raises(OutputError, match="would be lost"):
+        write(comparison, target)
+    assert (target / name).read_text() == "years of work"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("name", ["thesis.tex", "manifest.json"])
+def test_a_foreign_directory_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / name).write_text("{}")
+    with pytest.raises(OutputError, match="other files"):
+        check_run_directory(tmp_path / "mine")
+    assert (tmp_path / "mine" / name).read_text() == "{}"
+
+
+def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        check_run_directory(tmp_path / "file")
+    with pytest.raises(OutputError):
+        check_run_directory(tmp_path / "file" / "run")
 
 
 @one_figure
@@ -110,55 +148,6 @@ def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
         write(comparison, target)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert (target / "metrics.json").is_file()
-
-
-@one_figure
-def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, tmp_path: Path) -> None:
-    target = tmp_path / "run"
-    write(comparison, target)
-    first = {path.relative_to(target) for path in target.rglob("*")}
-    # Another page than that of this run stands for one of it, and it has files that the next run has not.
-    (target / "report.html").write_text("<title>drive - vislam report</title>")
-    (target / "trajectories" / "truth.tum").rename(target / "trajectories" / "gone_final.tum")
-    manifest = json.loads((target / "manifest.json").read_text())
-    manifest["files"].append("trajectories/gone_final.tum")
-    (target / "manifest.json").write_text(json.dumps(manifest))
-    write(comparison, target)
-    assert {path.relative_to(target) for path in target.rglob("*")} == first
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-@one_figure
-def test_the_manifest_lists_every_file_of_the_run(comparison: Comparison, tmp_path: Path) -> None:
-    write(comparison, tmp_path / "run")
-    files = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    assert read_manifest(tmp_path / "run" / "manifest.json").files == tuple(sorted(files))
-
-
-@pytest.mark.parametrize("of_an_earlier_version", [False, True])
-@pytest.mark.parametrize(
-    "name", ["notes.txt", "figures/top_view_for_the_paper.png", "raw/imu.csv", "trajectories/other.tum", "report.html"]
-)
-@one_figure
-def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
-    comparison: Comparison, tmp_path: Path, name: str, of_an_earlier_version: bool
-) -> None:
-    target = tmp_path / "run"
-    write(comparison, target)
-    if of_an_earlier_version:
-        manifest = json.loads((target / "manifest.json").read_text())
-        del manifest["files"]
-        (target / "manifest.json").write_text(json.dumps(manifest))
-    check_run_directory(target)
-    (target / name).parent.mkdir(exist_ok=True)
-    (target / name).write_text("years of work")
-    first = name.partition("/")[0] if name.startswith("raw") else name
-    with pytest.raises(OutputError, match=f"holds other files, as {re.escape(first)},"):
-        check_run_directory(target)
-    with pytest.raises(OutputError, match="would be lost"):
-        write(comparison, target)
-    assert (target / name).read_text() == "years of work"
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @one_figure
@@ -191,55 +180,8 @@ def test_a_file_that_comes_while_the_run_is_written_is_not_lost(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-@one_figure
-def test_no_directory_is_left_above_a_run_that_failed(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(figures, "drawn", fail)
-    with pytest.raises(KeyboardInterrupt):
-        write(comparison, tmp_path / "runs" / "of" / "today")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_name_too_long_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="too long"):
-        check_run_directory(tmp_path / ("long" * 70))
-    assert list(tmp_path.iterdir()) == []
-
-
-@one_figure
-def test_an_empty_directory_is_used(comparison: Comparison, tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    write(comparison, tmp_path / "run")
-    assert (tmp_path / "run" / "metrics.json").is_file()
-
-
-@pytest.mark.parametrize("name", ["thesis.tex", "manifest.json"])
-def test_a_foreign_directory_is_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / name).write_text("{}")
-    with pytest.raises(OutputError, match="other files"):
-        check_run_directory(tmp_path / "mine")
-    assert (tmp_path / "mine" / name).read_text() == "{}"
-
-
-def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError):
-        check_run_directory(tmp_path / "file")
-    with pytest.raises(OutputError):
-        check_run_directory(tmp_path / "file" / "run")
-
-
-def test_the_current_directory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(OutputError, match="current directory"):
-        check_run_directory(Path())
-
-
-def test_checking_leaves_no_trace(tmp_path: Path) -> None:
-    check_run_directory(tmp_path / "deep" / "down" / "run")
-    assert list(tmp_path.iterdir()) == []
+def test_the_landmarks_of_a_run_directory_lose_nothing(comparison: Comparison, run_directory: Path) -> None:
+    for run in comparison.runs[:3]:
+        read = np.loadtxt(run_directory / f"landmarks/{run.estimator}.csv", delimiter=",", skiprows=1)
+        np.testing.assert_array_equal(read[:, 0], run.landmarks.track_ids)
+        np.testing.assert_allclose(read[:, 1:], run.landmarks.points_world, rtol=1e-14)

@@ -150,31 +150,6 @@ def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     assert page.find(".scrubber input").get_attribute("aria-valuetext") == reported
 
 
-def test_pointing_at_a_chart_reads_every_line_there(page: Page, single: Path) -> None:
-    page.open(single)
-    ActionChains(page.driver).move_to_element(page.into_view("canvas[data-chart^='Position error']")).perform()
-    page.settle()
-    reported = page.find(".hint").text
-    assert all(name in reported for name in ("steady", "astray", "late final"))
-    assert page.find(".readout").text != "0.0 s, 0 m"
-
-
-def test_errors_are_over_distance_or_time(page: Page, single: Path) -> None:
-    page.open(single)
-    chart = "canvas[data-chart^='Position error']"
-    over_distance = page.picture(chart)
-    page.click(".segmented button:last-child")
-    assert page.find(".segmented button:last-child").get_attribute("aria-pressed") == "true"
-    assert page.picture(chart) != over_distance
-
-
-def test_landmarks_can_be_left_out(page: Page, single: Path) -> None:
-    page.open(single)
-    before = page.picture("canvas[data-view='top']")
-    page.run("const s = document.querySelector('select'); s.value = ''; s.dispatchEvent(new Event('change'))")
-    assert page.picture("canvas[data-view='top']") != before
-
-
 def test_a_view_can_fill_the_window_and_escape_leaves_it(page: Page, single: Path) -> None:
     page.open(single, PHONE)
     page.press(".view-card .quiet", Keys.ENTER)
