@@ -14,8 +14,7 @@ import gtsam
 import numpy as np
 
 from filters.kalman.thinning import Thinned
-from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, relative_to_its_map
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -48,7 +47,7 @@ class Smart:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
-        self._camera = RobustCamera.of(setup.rig, outliers.smoother_huber)
+        self._camera = RobustCamera(setup.rig, outliers.smoother_huber)
         self._outlier_check, self._landmarks = OutlierCheck(setup.rig, outliers), KnownLandmarks(setup.rig)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)

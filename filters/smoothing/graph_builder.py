@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.outlier_check import OutlierCheck, RefusedTracks, relative_to_its_map
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, RefusedTracks, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray

@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.outlier_check import OutlierCheck
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck
 from toolkit.geometry import se3, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, relative_to_its_map
 from toolkit.geometry import se3, se3_inverse
 from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.smoothing.known_landmarks import KnownLandmarks
-from filters.smoothing.outlier_check import OutlierCheck, aligned
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, aligned
 from toolkit.geometry import se3_exp, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo

@@ -89,7 +89,7 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
 def test_its_loss_is_that_of_gtsam_projection_factors(scene):
     poses, points, seen = scene
     expected = projection_factors(seen).error(gtsam_values(poses, points))
-    assert Vision.at(poses, points, seen, CAMERA).loss == pytest.approx(expected, rel=1e-9)
+    assert Vision.at(poses, points, seen, CAMERA).losses.sum() == pytest.approx(expected, rel=1e-9)
 
 
 def test_point_steps_complete_the_step_of_the_whole_system(scene):
@@ -158,7 +158,7 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
 def test_what_is_lost_at_points_is_the_loss(scene):
     poses, points, seen = scene
     vision = Vision.at(poses, points, seen, CAMERA)
-    alone = [Vision.at(poses, points, seen.of_points(np.array([i])), CAMERA).loss for i in range(POINTS)]
+    alone = [Vision.at(poses, points, seen.of_points(np.array([i])), CAMERA).losses.sum() for i in range(POINTS)]
     np.testing.assert_allclose(vision.loss_of_points, alone, rtol=1e-12)
 
 
@@ -179,7 +179,7 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     others = seen.of_points(np.arange(1, POINTS))
     one, other = (Vision.at(poses, behind, s, CAMERA).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
-    assert Vision.at(poses, behind, seen, CAMERA).loss > Vision.at(poses, behind, others, CAMERA).loss
+    assert Vision.at(poses, behind, seen, CAMERA).losses.sum() > Vision.at(poses, behind, others, CAMERA).losses.sum()
 
 
 def blacked_out(sequence):

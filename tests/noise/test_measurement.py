@@ -14,7 +14,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.measurements import TwistChangeNoise
 from toolkit.motion_samples import NoSamples
 from toolkit.noise import measured_noise
-from toolkit.noise.motion import MotionScale, motion_scale
+from toolkit.noise.measurement import MotionScale, motion_scale
 from toolkit.noise.stretches import MotionFit, Stretch
 from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import Noise, Settings

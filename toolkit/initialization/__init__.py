@@ -1,10 +1,8 @@
 """The state every estimator starts from, found without truth: from the first stereo frames and the motion samples.
 
-Read ``start`` first: it says what each kind of motion needs. ``first_guess`` solves for it linearly, ``adjustment``
-makes it exact and gives its covariance.
+Read ``start``: what each kind of motion needs, and the adjustment of the first frames from a linear ``first_guess``.
 """
 
-from toolkit.initialization.adjustment import GYRO_BIAS_SIGMA
-from toolkit.initialization.start import start_from_measurements, start_from_truth
+from toolkit.initialization.start import GYRO_BIAS_SIGMA, start_from_measurements, start_from_truth
 
 __all__ = ["GYRO_BIAS_SIGMA", "start_from_measurements", "start_from_truth"]

@@ -70,3 +70,12 @@ def huber_weights(distances_squared: Array, threshold: Array | float | None) -> 
         return np.ones_like(distances_squared)
     weights: Array = np.minimum(1.0, threshold / np.sqrt(np.maximum(distances_squared, 1e-12)))
     return weights
+
+
+def huber_losses(distances_squared: Array, threshold: float | None) -> Array:
+    """Return Huber's loss (N,) of squared whitened residual norms (N,): half of them where small, or without a loss."""
+    half: Array = 0.5 * distances_squared
+    if threshold is None:
+        return half
+    beyond = threshold * (np.sqrt(distances_squared) - threshold / 2)
+    return np.where(distances_squared <= threshold**2, half, beyond)

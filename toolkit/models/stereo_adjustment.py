@@ -29,13 +29,11 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.gating import LEAST_DISPARITY_PX, huber_losses, huber_weights
 from toolkit.models.state import MotionModel
 
-# Norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
-_BEHIND_NORM = 100.0
-# A threshold of Huber's loss, in standard deviations, that no sighting reaches: no loss.
-_NO_LOSS = 1e6
+# Squared norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
+_BEHIND = 100.0**2
 # Added to a landmark's 3x3 block so that it is never singular; far below the information of any sighting.
 _LEAST_INFORMATION_PER_M2 = 1e-12
 # Marquardt's damping, a share of each unknown's information, used only after a step that fails. It begins small because
@@ -47,15 +45,10 @@ _SHARES = (1.0, 0.5, 0.25, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class RobustCamera:
-    """A rig, and the threshold of Huber's loss of whitened sightings."""
+    """A rig, and the threshold of Huber's loss of whitened sightings; None for no loss."""
 
     rig: StereoRig
-    huber: float
-
-    @classmethod
-    def of(cls, rig: StereoRig, huber: float | None) -> "RobustCamera":
-        """Return a camera with a threshold of the loss; None for no loss."""
-        return cls(rig, _NO_LOSS if huber is None else huber)
+    huber: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +63,6 @@ class Sightings:
         """Return the sightings of some points (M,); their row numbers stay."""
         rows = np.isin(self.point, points)
         return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
-
-
-class PointsInView(NamedTuple):
-    """The points of N sightings: attitudes (N, 3, 3) of the IMU, points (N, 3) m in its frame, depths (N,) m."""
-
-    R_world_imu: Array
-    points_imu: Array
-    depth_m: Array
-
-    @property
-    def in_front(self) -> BoolArray:
-        """Say which points (N,) are in front of the camera."""
-        front: BoolArray = self.depth_m > 0.0
-        return front
 
 
 class ReducedVision(NamedTuple):
@@ -101,65 +80,56 @@ class ReducedVision(NamedTuple):
         return (self.root @ whitened[..., None])[..., 0]
 
 
-def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> PointsInView:
-    """Return the points (M, 3) of sightings relative to their poses (K, 4, 4) of the IMU in the world."""
-    T_imu_world = se3_inverse(poses)[sightings.pose]
-    with np.errstate(invalid="ignore"):
-        points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
-        return PointsInView(poses[sightings.pose, :3, :3], points_imu, stereo.in_camera(points_imu, rig)[:, 2])
-
-
 @dataclass(frozen=True, eq=False)
 class Vision:
-    """Sightings evaluated at poses (K, 4, 4) and points (M, 3): their cost, and on demand their normal equations."""
+    """N sightings evaluated at K poses and M points: their cost, and on demand their normal equations.
+
+    ``points_imu`` (N, 3) m are the points in the frames of the IMU, whose attitudes are ``R_world_imu`` (N, 3, 3), and
+    ``in_front`` (N,) says which are in front of the camera; ``counts`` are K and M.
+    """
 
     counts: tuple[int, int]
     sightings: Sightings
-    seen: PointsInView
     camera: RobustCamera
+    R_world_imu: Array
+    points_imu: Array
+    in_front: BoolArray
 
     @classmethod
     def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
         """Evaluate sightings at poses (K, 4, 4) of the IMU in the world and points (M, 3) m in the world."""
-        seen = seen_from(poses, points, sightings, camera.rig)
-        return cls((len(poses), len(points)), sightings, seen, camera)
+        T_imu_world = se3_inverse(poses)[sightings.pose]
+        with np.errstate(invalid="ignore"):
+            points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
+            in_front = stereo.in_camera(points_imu, camera.rig)[:, 2] > 0.0
+        counts = len(poses), len(points)
+        return cls(counts, sightings, camera, poses[sightings.pose, :3, :3], points_imu, in_front)
 
-    @property
-    def loss(self) -> float:
-        """The sum of Huber's losses of the whitened residuals, half a square each where small, by tracks' weight."""
-        return float(self._losses.sum())
+    @cached_property
+    def losses(self) -> Array:
+        """The losses (N,) of the whitened residuals by Huber, times the weight of tracks."""
+        squares = np.where(self.in_front, self._squares, _BEHIND)
+        return self.camera.rig.track_weight * huber_losses(squares, self.camera.huber)
 
     @property
     def loss_of_points(self) -> Array:
         """The part (M,) of the loss due to the sightings of each point."""
-        return np.asarray(np.bincount(self.sightings.point, self._losses, minlength=self.counts[1]), dtype=np.float64)
-
-    @property
-    def _losses(self) -> Array:
-        norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
-        huber = self.camera.huber
-        beyond = huber * (norm - huber / 2)
-        return self.camera.rig.track_weight * np.where(norm <= huber, 0.5 * norm**2, beyond)
+        return np.asarray(np.bincount(self.sightings.point, self.losses, minlength=self.counts[1]), dtype=np.float64)
 
     def reduced(self) -> ReducedVision:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
-        weights = self._root_weights
-        weighted = weights[:, None, None] * stereo.whitener(self.sightings.uv_px, self.camera.rig)
+        weights = self.camera.rig.track_weight * huber_weights(self._squares, self.camera.huber)
+        roots = np.where(self.in_front, np.sqrt(weights), 0.0)
+        weighted = roots[:, None, None] * stereo.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
-        return _eliminated(weights[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts)
-
-    @property
-    def _root_weights(self) -> Array:
-        """The roots of Huber's weights (N,) times the weight of tracks; 0 behind the camera."""
-        huber, weight = self.camera.huber, self.camera.rig.track_weight
-        return np.where(self.seen.in_front, np.sqrt(weight * huber / np.maximum(self._norm, huber)), 0.0)
+        return eliminated(roots[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
         """The predicted images; points behind the camera are replaced by one that has an image."""
-        in_front, somewhere = self.seen.in_front, transform(self.camera.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
-        points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
-        return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
+        somewhere = transform(self.camera.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
+        points_imu = np.where(self.in_front[:, None], self.points_imu, somewhere)
+        return stereo.linearise(points_imu, self.R_world_imu, self.camera.rig)
 
     @property
     def H_pose(self) -> Array:
@@ -178,13 +148,18 @@ class Vision:
         return stereo.whitened_residuals(self.sightings.uv_px, self._predicted.uv_px, self.camera.rig)
 
     @cached_property
-    def _norm(self) -> Array:
-        return np.asarray(np.linalg.norm(self.whitened, axis=1))
+    def _squares(self) -> Array:
+        return np.asarray(np.square(self.whitened).sum(axis=1))
 
 
-def _eliminated(
+def eliminated(
     residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]
 ) -> ReducedVision:
+    """Eliminate M points of N sightings from K poses by Schur complements.
+
+    ``residual`` (N, 3) is measured less predicted, ``J_pose`` (N, 3, 6) and ``J_point`` (N, 3, 3) the Jacobians of the
+    prediction, all whitened and weighted; ``counts`` are K and M.
+    """
     (pose_count, point_count), point, pose = counts, seen.point, seen.pose
     # Small matrix products are several times as fast on contiguous arrays.
     to_point = np.ascontiguousarray(np.swapaxes(J_point, 1, 2))
@@ -331,7 +306,7 @@ class TrackedWindow:
     def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
         """Drop the points that are behind a camera that saw them; return the window and the ids (n,) of these."""
         seen = self.window.sightings
-        in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
+        in_front = Vision.at(self.window.poses, self.window.points, seen, RobustCamera(rig, None)).in_front
         behind = np.unique(seen.point[~in_front])
         if not behind.size:
             return self, self.track_ids[behind]
@@ -380,7 +355,7 @@ class Evaluated:
         """The cost of the window."""
         prior, off = self.window.prior, self.off_prior
         of_prior = float(0.5 * off @ prior.information @ off - prior.vector @ off)
-        return of_prior + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
+        return of_prior + float(self.motion.error(self.window.values.zeroVectors())) + float(self.vision.losses.sum())
 
     def linearised(self) -> System:
         """Return the normal equations."""

@@ -117,7 +117,7 @@ class _Residuals(NamedTuple):
     def of(cls, adjusted: Adjusted, begin: int) -> "_Residuals":
         """Return those of a stretch, by both images, of tracks seen often enough, numbered from ``begin`` on."""
         vision, seen = adjusted.vision, adjusted.window.sightings
-        both = vision.seen.in_front & ~is_left_only(seen.uv_px)
+        both = vision.in_front & ~is_left_only(seen.uv_px)
         often = (
             both
             & (np.bincount(seen.point[both], minlength=len(adjusted.window.points)) >= FEWEST_SIGHTINGS)[seen.point]

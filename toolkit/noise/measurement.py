@@ -1,6 +1,13 @@
-"""Measures the noise of a recording on stretches of it, and keeps what was measured under the recording's hash."""
+"""Measures the noise of a recording on stretches of it, and keeps what was measured under the recording's hash.
 
-from collections.abc import Iterable, Iterator
+The factor on the motion's white noise is the most likely one given the residuals of the motion samples at adjusted
+stretches (restricted likelihood: Patterson & Thompson 1971, "Recovery of inter-block information when block sizes are
+unequal"). With |r|^2 their squares, t their expectation and s the squared norm of their covariance
+(:class:`~toolkit.noise.stretches.MotionFit`), a step of Fisher's scoring multiplies the variance by
+``1 + (|r|^2 - t) / s``; it has the relative variance 2 / s.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -13,7 +20,6 @@ from toolkit.files.writing import replaced_file
 from toolkit.frontend.cache import folder
 from toolkit.measurements import MotionNoise, StereoRig
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight, track_weight
-from toolkit.noise.motion import MotionScale, motion_scale
 from toolkit.noise.stretches import Adjusted, MotionFit, Stretch, stretches
 from toolkit.sequence import Sequence
 
@@ -24,6 +30,26 @@ _MEASUREMENT = 2
 _LOOSE = 10.0
 # With fewer frames a stretch shows no correlation along tracks.
 _FEWEST_FRAMES = 2 * FEWEST_SIGHTINGS
+# The stated noise is kept unless the residuals exceed it by this many standard deviations, and the factor found does
+# too: chance does once in a thousand.
+_STANDARD_ERRORS = 3.0
+# A step changes the variance at most by this factor, because a linear step from far off overshoots. The scoring ends
+# where a step is a small part of a standard error.
+_LARGEST_STEP, _SMALL, _MOST_STEPS = 4.0, 0.3, 8
+# Largest factor: a motion whose errors are a hundred times the stated ones has another fault, which the audit names.
+_MOST = 100.0
+
+
+@dataclass(frozen=True)
+class MotionScale:
+    """The factor on the standard deviations of the motion's white noise, with its standard error.
+
+    ``ratio`` is that of the squared residuals to their expectation by the stated noise.
+    """
+
+    value: float = 1.0
+    error: float = 0.0
+    ratio: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -91,3 +117,28 @@ def _adjusted_again(
     for stretch, adjusted in before:
         with suppress(EstimatorError, np.linalg.LinAlgError):
             yield stretch, stretch.adjusted_again(adjusted, rig, noise)
+
+
+def motion_scale(fit: Callable[[float], MotionFit]) -> MotionScale:
+    """Return the factor by the fit of the motion samples under the stated noise times a factor.
+
+    Where a step leaves no stretch that could be adjusted, the fit says nothing and the stated noise is kept.
+    """
+    squares, expected, spread = fit(1.0)
+    ratio = squares / expected if expected > 0.0 else 1.0
+    if spread <= 0.0 or squares - expected <= _STANDARD_ERRORS * np.sqrt(2.0 * spread):
+        return MotionScale(ratio=ratio)
+    variance = 1.0
+    for _ in range(_MOST_STEPS):
+        step = float(np.clip(1.0 + (squares - expected) / spread, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
+        variance = float(np.clip(variance * step, 1.0, _MOST**2))
+        squares, expected, spread = fit(variance**0.5)
+        if spread <= 0.0:
+            return MotionScale(ratio=ratio)
+        if abs(squares - expected) < _SMALL * np.sqrt(2.0 * spread):
+            break
+    error = variance * float(np.sqrt(2.0 / spread))
+    if variance - 1.0 < _STANDARD_ERRORS * error:
+        return MotionScale(ratio=ratio)
+    value = float(np.sqrt(variance))
+    return MotionScale(value, 0.5 * error / value, ratio)

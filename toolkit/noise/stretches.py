@@ -93,7 +93,7 @@ class Stretch:
             else model.integrate(packet.motion, bias).factors(packet.index)
             for packet in self.packets
         )
-        camera = RobustCamera.of(rig, _HUBER)
+        camera = RobustCamera(rig, _HUBER)
         solved = solve_window(replace(window, motion=motion), camera, _ENDING)
         return Adjusted(solved.window, camera)
 
@@ -180,7 +180,7 @@ class Adjusted:
         """Return the window with the sightings that are plausible by the stated noise, and the points they see."""
         vision, seen = self.vision, self.window.sightings
         bound = chi2_bound(stereo.degrees_of_freedom(seen.uv_px), SOUND)
-        sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.seen.in_front
+        sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.in_front
         return TrackedWindow(self.window, np.arange(len(self.window.points))).with_sightings(sound).window
 
     def residuals(self, fewest_sightings: int) -> SoundResiduals:
