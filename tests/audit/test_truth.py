@@ -10,7 +10,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.truth import truth_clock, truth_mismatch
-from toolkit.datasets.trajectories.exchanged_axes import exchanges
+from toolkit.datasets.trajectories.belonging import exchanges
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Sequence, Truth

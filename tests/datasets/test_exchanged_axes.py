@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.datasets.trajectories.exchanged_axes import Exchange, check_axes, check_mirrored, exchanged, exchanges
+from toolkit.datasets.trajectories.belonging import Exchange, check_axes, check_mirrored, exchanged, exchanges
 from toolkit.errors import DataError
 from toolkit.geometry import Array, about_z, se3, se3_inverse, so3_exp
 from toolkit.simulation import SCENARIOS, simulate

@@ -198,7 +198,7 @@ def test_a_line_that_is_cut_off_is_named(tmp_path: Path, trajectory: Trajectory,
     rows = lines_of(name, trajectory)
     del rows[-1][4:]
     message = complaint(spoiled(tmp_path, name, rows))
-    assert f"line {COUNT} has 4 columns, expected {len(rows[0])} ({FORMATS[name].COLUMNS})" in message
+    assert f"line {COUNT} has 4 columns, expected {len(rows[0])} ({FORMATS[name].columns})" in message
 
 
 @pytest.mark.parametrize("name", STAMPED)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets.trajectories import euroc, tum
-from toolkit.datasets.trajectories.exchanged_axes import Exchange
+from toolkit.datasets.trajectories.belonging import Exchange
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
 from toolkit.files.documents import schema

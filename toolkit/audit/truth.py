@@ -11,7 +11,7 @@ from toolkit.audit.clocks import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import LEAST_INTERVALS, chained, interval_means, is_comparable, moved_by
 from toolkit.audit.robust import Scalar, chance_sigmas, median_error
-from toolkit.datasets.trajectories.exchanged_axes import exchanges
+from toolkit.datasets.trajectories.belonging import exchanges
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion, camera_motion

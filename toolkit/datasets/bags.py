@@ -23,7 +23,7 @@ from toolkit.datasets.io.bag_topics import Chosen, choose
 from toolkit.datasets.io.fields import check_frame_count, observations
 from toolkit.datasets.io.image_pairs import Listed, facts_of, images_only, pairs_of_asl, rig_of
 from toolkit.datasets.io.truth import truth_near, with_truth
-from toolkit.datasets.trajectories.poses import checked_poses
+from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, StampedPair, matched_corners, track_images
 from toolkit.frontend.cache import ImageSpool

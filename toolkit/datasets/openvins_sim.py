@@ -18,7 +18,7 @@ import numpy as np
 from toolkit.datasets.io.fields import Fields, check_frame_count, rectified_observations, stamps_ns
 from toolkit.datasets.io.tables import find_table, first_line, read_columns
 from toolkit.datasets.trajectories import openvins
-from toolkit.datasets.trajectories.poses import checked_poses
+from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import read_input, read_text_input

@@ -20,16 +20,17 @@ from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     backwards,
+    check_axes,
     check_clock,
     check_length_unit,
+    check_mirrored,
     check_turns,
     in_other_order,
     inverted,
     range_s,
     turned_body,
 )
-from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
-from toolkit.datasets.trajectories.poses import PosesFile, StatedApart, check_order
+from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
-from toolkit.datasets.trajectories.poses import PosesFile
+from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
 from toolkit.estimator import Build

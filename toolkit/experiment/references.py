@@ -6,6 +6,7 @@ from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     backwards,
+    check_axes,
     check_clock,
     check_length_unit,
     check_turns,
@@ -14,8 +15,7 @@ from toolkit.datasets.trajectories.belonging import (
     of_the_camera,
     range_s,
 )
-from toolkit.datasets.trajectories.exchanged_axes import check_axes
-from toolkit.datasets.trajectories.poses import PosesFile, check_order
+from toolkit.datasets.trajectories.formats import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.experiment.comparison import TRUTH, plain_name

@@ -13,9 +13,8 @@ from typing import Literal
 import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
-from toolkit.datasets.trajectories.belonging import range_s
-from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
-from toolkit.datasets.trajectories.poses import check_order
+from toolkit.datasets.trajectories.belonging import check_axes, check_mirrored, range_s
+from toolkit.datasets.trajectories.formats import check_order
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import unreadable
 from toolkit.geometry import Array, IntArray

@@ -14,7 +14,7 @@ from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.tables import columns_of, read_table
 from toolkit.datasets.io.truth import load_truth
 from toolkit.datasets.io.yaml_fields import read_fields
-from toolkit.datasets.trajectories.poses import checked_poses
+from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log

@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order
-from toolkit.datasets.trajectories.poses import check_order
+from toolkit.datasets.trajectories.formats import check_order
 from toolkit.geometry import Array, IntArray, interpolate_poses
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Sequence, Truth
@@ -28,7 +28,7 @@ def load_truth(path: Path) -> Truth:
     length or look w first.
     """
     read = tum.read(path, _KIND)
-    check_order(path, read.T_world_imu, tum.W_FIRST)
+    check_order(path, read.T_world_imu, tum.other_order)
     return Truth(read.t_ns, read.T_world_imu)
 
 
@@ -41,7 +41,7 @@ def with_truth(sequence: Sequence, truth: Truth) -> Sequence:
     reference = Reference.of_recording(sequence)
     check_clock("the truth", reference, truth.t_ns)
     # Only the order: the recording is not audited yet, and mixed axes of its own would look like a camera's.
-    readings = (in_other_order(tum.W_FIRST),)
+    readings = (in_other_order(tum.other_order),)
     check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
     return replace(sequence, truth=truth)
 

@@ -1,0 +1,371 @@
+"""The formats of trajectory files as a table: which columns they have, in which order and units; and their checks.
+
+TUM: Sturm, Engelhard, Endres, Burgard & Cremers, "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012).
+KITTI: Geiger, Lenz & Urtasun, "Are we ready for autonomous driving?" (CVPR 2012); its own poses are the left camera's,
+here, as in every file, they are the IMU's. EuRoC: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016).
+OpenVINS: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020): its states, and the recording of its poses with
+two covariances, upper triangles row by row: of the orientation, whose error is a small turn of the IMU frame, and of
+the position in the world. JPL's quaternion of the world to the IMU has the same four numbers as Hamilton's of the IMU
+to the world.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from toolkit.datasets.io.fields import probable_unit_of_ns, stamps_ns
+from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
+from toolkit.errors import DataError
+from toolkit.estimate import FARTHEST_M, Trajectory
+from toolkit.geometry import Array, BoolArray, IntArray, quaternion_from_rotation, rotation_from_quaternion, se3
+from toolkit.measurements import NS_PER_S
+
+# Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
+_UNIT_TOLERANCE = 1e-2
+_TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
+# A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
+_IDENTITY_TOLERANCE = 1e-2
+# Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
+_VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.9, 0.1
+
+
+@dataclass(frozen=True)
+class OtherOrder:
+    """The order that the quaternions of a format have by mistake.
+
+    Rolling what was read as x y z w by ``roll`` gives what the file then means; ``name`` calls the mistake, and
+    ``remedy`` is the instruction to correct it.
+    """
+
+    roll: int
+    name: str
+    remedy: str
+
+    def reread(self, R_world_imu: Array) -> Array:
+        """Return rotations (N, 3, 3) as they are if the quaternions were in this order."""
+        return rotation_from_quaternion(np.roll(quaternion_from_rotation(R_world_imu), self.roll, axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class StatedApart:
+    """Covariances (N, 3, 3) without what couples them: of orientations, rad^2 in the body frame, and of positions.
+
+    Those of positions are m^2 in the world frame.
+    """
+
+    orientation: Array
+    position: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PosesFile:
+    """The poses (N, 4, 4) of a trajectory file, their stamps (N,) ns, and how its quaternions might be misread.
+
+    Stamps are None where the format has none, and the order where it has no quaternions. ``covariances`` are those of
+    the orientation and of the position, where the file has them.
+    """
+
+    path: Path
+    format: str
+    t_ns: IntArray | None
+    T_world_imu: Array
+    other_order: OtherOrder | None
+    covariances: StatedApart | None = None
+
+    def __len__(self) -> int:
+        return len(self.T_world_imu)
+
+
+class TrajectoryFormat(Protocol):
+    """One format: ``columns`` names those of a line."""
+
+    @property
+    def columns(self) -> str:
+        """The columns of a line, as a message names them."""
+
+    def recognises(self, rows: Rows) -> bool:
+        """Say whether rows have the shape of this format; at most one has it."""
+
+    def parse(self, rows: Rows) -> PosesFile:
+        """Return the poses of rows; raise DataError, naming the line, where they are not of this format."""
+
+    def text(self, trajectory: Trajectory) -> str:
+        """Return a trajectory as the text of a file."""
+
+
+@dataclass(frozen=True)
+class Stamped:
+    """A format of stamps, positions (m) and quaternions; ``order`` are its columns behind the stamp.
+
+    They count x y z qx qy qz qw vx vy vz, gyro bias and accelerometer bias (three each) from 0. Only the pose is read.
+    """
+
+    name: str
+    columns: str
+    header: str
+    order: tuple[int, ...]
+    other_order: OtherOrder
+    unit_ns: int = NS_PER_S
+    commas: bool = False
+    may_go_on: bool = False
+    has_covariances: bool = False
+
+    @property
+    def _width(self) -> int:
+        return 1 + len(self.order) + 12 * self.has_covariances
+
+    def recognises(self, rows: Rows) -> bool:
+        """Say whether rows have the separator and the number of columns of this format."""
+        fits = rows.width >= self._width if self.may_go_on else rows.width == self._width
+        return fits and rows.commas == self.commas
+
+    def parse(self, rows: Rows) -> PosesFile:
+        """Return the poses of rows.
+
+        Raises DataError, naming the line and the likely cause, where they are not a table of finite numbers, time does
+        not increase or is in another unit, or quaternions are not of unit length.
+        """
+        if rows.commas != self.commas:
+            separators = "commas, not blanks" if self.commas else "blanks, not commas"
+            raise DataError(
+                f"{rows.path}: in a {self.name} file the columns ({self.columns}) are separated by {separators}"
+            )
+        table = rows.numbers(max(rows.width, self._width) if self.may_go_on else self._width, self.columns)
+        t_ns = self._stamps(rows, table[:, 0])
+        pose = [1 + self.order.index(column) for column in range(7)]
+        T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, pose])
+        stated = StatedApart(_symmetric(table[:, 8:14]), _symmetric(table[:, 14:20])) if self.has_covariances else None
+        return PosesFile(rows.path, self.name, t_ns, T_world_imu, self.other_order, stated)
+
+    def _stamps(self, rows: Rows, stamps: Array) -> IntArray:
+        if self.unit_ns == NS_PER_S:
+            stamps_ns(rows.path, "time", stamps)  # names a wrong unit
+            return rows.stamps(self.unit_ns)
+        t_ns, unit = rows.stamps(self.unit_ns), probable_unit_of_ns(stamps)
+        if unit is not None:
+            is_tum = unit.startswith("seconds") and rows.width == self._width
+            hint = "; a TUM file has blanks between its columns" if is_tum else ""
+            raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}{hint}")
+        return t_ns
+
+    def read(self, path: Path, kind: str | None = None) -> Trajectory:
+        """Read a file; ``kind`` describes it in the error where that fails. Raises DataError as :meth:`parse` does."""
+        poses = self.parse(read_rows(path, kind or f"a {self.name} file is text, one pose a line"))
+        assert poses.t_ns is not None
+        return Trajectory(poses.t_ns, poses.T_world_imu)
+
+    def text(self, trajectory: Trajectory) -> str:
+        """Return a trajectory as the text of a file.
+
+        Poses that are not finite are left out; velocity and biases that it does not have are nan.
+        """
+        kept = _finite(trajectory)
+        unknown = np.full((len(kept), 6), np.nan)
+        v_world = unknown[:, :3] if kept.v_world is None else kept.v_world
+        bias = unknown if kept.bias is None else kept.bias[:, [3, 4, 5, 0, 1, 2]]
+        quaternions = quaternion_from_rotation(kept.T_world_imu[:, :3, :3])
+        values = np.hstack([kept.positions, quaternions, v_world, bias])[:, self.order]
+        stamps = map(stamp_text if self.unit_ns == NS_PER_S else str, kept.t_ns.tolist())
+        return _rows_text(self.header, zip(stamps, values.tolist(), strict=True), "," if self.commas else " ")
+
+
+class Kitti:
+    """One pose a frame: the first three rows of its 4x4 matrix row by row between blanks, in metres; no stamps."""
+
+    columns = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
+    _WIDTH = 12
+
+    def recognises(self, rows: Rows) -> bool:
+        """Say whether rows have twelve columns between blanks."""
+        return not rows.commas and rows.width == self._WIDTH
+
+    def parse(self, rows: Rows) -> PosesFile:
+        """Return the poses of rows, without stamps.
+
+        Raises DataError, naming the line, where they are not a table of twelve finite numbers a line, or a matrix is
+        not a rotation.
+        """
+        matrices = rows.numbers(self._WIDTH, self.columns).reshape(-1, 3, 4)
+        rotations = matrices[:, :, :3]
+        off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+        checks = (
+            (np.isfinite(matrices).all(axis=(1, 2)), "holds a value that is not finite; write a pose for every frame"),
+            (np.abs(matrices[:, :, 3]).max(axis=1, initial=0.0) < FARTHEST_M, _TOO_FAR),
+            (off < _UNIT_TOLERANCE, f"does not hold a rotation; expected {self.columns}"),
+            (np.linalg.det(rotations) > 0.0, "holds a reflection, not a rotation: the sign of an axis is wrong"),
+        )
+        _check_lines(rows.path, rows.line_numbers, checks)
+        # Through quaternions, as in the other formats, so that printed digits leave a rotation.
+        R_world_imu = rotation_from_quaternion(quaternion_from_rotation(rotations))
+        return PosesFile(rows.path, "KITTI", None, se3(R_world_imu, matrices[:, :, 3]), None)
+
+    def text(self, trajectory: Trajectory) -> str:
+        """Return a trajectory, one pose for every frame, as the text of a file.
+
+        Raises DataError where a pose is not finite: rows are frames, so none can be left out.
+        """
+        poses = trajectory.T_world_imu
+        bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+        if bad.size:
+            raise DataError(f"pose {bad[0]} is not finite, and KITTI's rows are frames; choose a format with stamps")
+        return _rows_text("", (("", row) for row in poses[:, :3].reshape(-1, self._WIDTH).tolist()), " ")
+
+
+_W_FIRST = "the quaternions look w first"
+tum = Stamped(
+    "TUM",
+    "t x y z qx qy qz qw",
+    "# t_s x_m y_m z_m qx qy qz qw: the IMU in the world; quaternions are Hamilton, scalar last",
+    order=(0, 1, 2, 3, 4, 5, 6),
+    other_order=OtherOrder(
+        -1, "w first", f"{_W_FIRST}; TUM order is qx qy qz qw: move the fifth column to the end"
+    ),
+)  # fmt: skip
+kitti = Kitti()
+euroc = Stamped(
+    "EuRoC",
+    "t,x,y,z,qw,qx,qy,qz",
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+    order=(0, 1, 2, 6, 3, 4, 5),
+    other_order=OtherOrder(
+        1,
+        "w last",
+        "the quaternions look w last; EuRoC's order is qw,qx,qy,qz: move the eighth column before the fifth",
+    ),
+    unit_ns=1,
+    commas=True,
+    may_go_on=True,
+)
+openvins = Stamped(
+    "OpenVINS",
+    "t qx qy qz qw x y z vx vy vz bgx bgy bgz bax bay baz",
+    "# timestamp(s) q_GtoI(x y z w, JPL) p_IinG v_IinG bg ba; nan is not known",
+    order=(3, 4, 5, 6, 0, 1, 2, *range(7, 16)),
+    other_order=OtherOrder(
+        -1, "w first", f"{_W_FIRST}; OpenVINS' order is qx qy qz qw: move the scalar behind the others"
+    ),
+    may_go_on=True,
+)
+_OPENVINS_RECORDED = Stamped(
+    "OpenVINS",
+    "t x y z qx qy qz qw Pr11 ... Pt33",
+    "",
+    order=tum.order,
+    other_order=openvins.other_order,
+    has_covariances=True,
+)
+FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
+_KIND = f"there are {', '.join(f'{name} ({one.columns})' for name, one in FORMATS.items())}"
+
+
+def read_poses(path: Path) -> PosesFile:
+    """Read a file of any of the formats, which is recognised from its content and not from its name.
+
+    Raises DataError, naming the line and the likely cause, where it is missing, empty, of none of the formats or
+    not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
+    only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
+    """
+    rows = read_rows(path, _KIND)
+    for one in (_OPENVINS_RECORDED, *FORMATS.values()):
+        if one.recognises(rows):
+            with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
+                return one.parse(rows)
+    kind = "separated by commas" if rows.commas else "separated by blanks"
+    raise DataError(f"{path}: {rows.width} columns {kind} are no format that is known; {_KIND}")
+
+
+def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: Array) -> Array:
+    """Return the poses (N, 4, 4) of rows (N, 7), x y z in metres and a Hamilton quaternion x y z w.
+
+    Raises DataError, naming the line, where a value is not finite, time does not increase or a quaternion is not
+    of unit length.
+    """
+    checks = (
+        (np.isfinite(values).all(axis=1), "holds a value that is not finite; remove the line"),
+        (np.abs(values[:, :3]).max(axis=1, initial=0.0) < FARTHEST_M, _TOO_FAR),
+        (np.diff(t_ns, prepend=t_ns[:1] - 1) > 0, "is not later than the line before it; sort the file by time"),
+        (
+            np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < _UNIT_TOLERANCE,
+            "has a quaternion that is not of unit length; check the order of the columns",
+        ),
+    )
+    _check_lines(path, line_numbers, checks)
+    return se3(rotation_from_quaternion(values[:, 3:]), values[:, :3])
+
+
+def _check_lines(path: Path, line_numbers: list[int], checks: Iterable[tuple[BoolArray | np.bool, str]]) -> None:
+    for passed, complaint in checks:
+        if not passed.all():
+            raise DataError(f"{path}: line {line_numbers[int(np.argmin(passed))]} {complaint}")
+
+
+def _symmetric(upper: Array) -> Array:
+    """Return the matrices (N, 3, 3) of upper triangles (N, 6) row by row."""
+    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _finite(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory without the poses that are not finite, which readers of files reject."""
+    kept = np.isfinite(trajectory.T_world_imu).all(axis=(1, 2))
+    v_world, bias = (None if one is None else one[kept] for one in (trajectory.v_world, trajectory.bias))
+    return Trajectory(trajectory.t_ns[kept], trajectory.T_world_imu[kept], v_world, bias)
+
+
+def _rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: str) -> str:
+    """Return a file's text: the header, then each row's first entry and its values with 15 digits."""
+    lines = (
+        separator.join(([first] if first else []) + [f"{value:.15g}" for value in values]) for first, values in rows
+    )
+    return "\n".join([*([header] if header else []), *lines]) + "\n"
+
+
+def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
+    """Raise DataError where the trajectory alone shows that its quaternions are in the other order.
+
+    A trajectory inverted as a whole, or in its rotations alone, is named as such.
+
+    A vehicle moves in one direction of its own frame. If that holds in the other order and not as given, the order
+    is wrong; where both readings do as well (no turn, or a hand-held camera), a start at the identity decides:
+    read in the wrong order it is a start upside down.
+    """
+    positions, R_world_imu = T_world_imu[:, :3, 3], T_world_imu[:, :3, :3]
+    reread = other.reread(R_world_imu)
+    as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
+    remedy, inverted = max(_inverted(positions, R_world_imu), key=lambda reading: reading[1])
+    is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
+    # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is named.
+    if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
+        raise DataError(f"{path}: {remedy}")
+    starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
+    if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
+        raise DataError(f"{path}: {other.remedy}")
+
+
+def _inverted(positions: Array, R_world_imu: Array) -> tuple[tuple[str, float], ...]:
+    """Return what to do where poses (N, 3), (N, 3, 3) are inverted, in two ways, and how well each reading fits."""
+    R_imu_world = np.swapaxes(R_world_imu, 1, 2)
+    p_inverted = -np.einsum("nij,nj->ni", R_imu_world, positions)
+    return (
+        (
+            "the poses look like those of the world in the IMU frame: invert each one",
+            _concentration(p_inverted, R_imu_world),
+        ),
+        (
+            "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
+            _concentration(positions, R_imu_world),
+        ),
+    )
+
+
+def _concentration(positions: Array, R_world_imu: Array) -> float:
+    """Return the mean resultant length, 0 to 1, of the body-frame displacements: 1 where all point the same way.
+
+    Displacements are their own weights, so that noise at standstill does not count.
+    """
+    steps = np.diff(positions, axis=0)
+    total = np.linalg.norm(steps, axis=1).sum()
+    in_body = np.einsum("nji,nj->ni", R_world_imu[:-1], steps)
+    return float(np.linalg.norm(in_body.sum(axis=0)) / total) if total > 0.0 else 0.0
