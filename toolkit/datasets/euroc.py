@@ -24,7 +24,6 @@ from toolkit.datasets.io.euroc_calibration import (
     published,
     read_calibration,
 )
-from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
 from toolkit.datasets.io.fields import check_frame_count, observations
 from toolkit.datasets.io.image_pairs import (
     check_both_cameras,
@@ -37,7 +36,7 @@ from toolkit.datasets.io.image_pairs import (
     rig_of,
 )
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
-from toolkit.datasets.io.truth import stamps_within, truth_at, truth_near
+from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified, track_images

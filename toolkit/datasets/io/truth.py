@@ -1,23 +1,56 @@
-"""Ground truth of a recording: read from a TUM file, checked to belong to it, and taken at the stamps of its frames.
+"""Ground truth of a recording: read, checked to belong to it, and taken at the stamps of its frames.
 
-Columns are never reordered silently: where the order looks wrong an error is raised.
+A TUM file is given by the user; columns are never reordered silently: where the order looks wrong an error is raised.
+Of EuRoC recordings a truth lies beside the sensors, and of several the gyro chooses: of V1_01_easy two are in use, the
+original, whose orientation is off by degrees, and one computed again from the motion capture and the IMU (Geneva &
+Huang, "vicon2gt", 2020). Their names are alike; the rates of rotation of the second agree with the gyro, those of the
+first do not.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from toolkit.datasets.io.euroc_calibration import extrinsic
+from toolkit.datasets.io.tables import columns_of, read_table
+from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order
-from toolkit.datasets.trajectories.formats import check_order
-from toolkit.geometry import Array, IntArray, interpolate_poses
+from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order, turned
+from toolkit.datasets.trajectories.formats import check_order, checked_poses
+from toolkit.errors import DataError
+from toolkit.files.reading import is_regular
+from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence, Truth
 
 _KIND = "a truth file is TUM text, one pose a line"
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
 _LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
+# Long enough that the noise of single truth poses is small, short enough that the gyro's mean gives the rotation.
+_STEP_NS = NS_PER_S // 10
+# The rotation of a step is unknown where poses around it are farther apart than this.
+_MOST_STEPS = 5
+# Rates of two unrelated motions differ by at least the gyro's rates; those of a noisy motion capture by half of that.
+# Differences below the first number are the noise of a good motion capture at a standstill.
+_MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
+_STRANGER = (
+    ": its rotation differs from the gyro's, so it is of another recording, or its quaternions or the gyro are not in "
+    "the order, axes or units they are read in; do not rely on figures against it"
+)
+_AXES = "xyz"
+# Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
+_HEADINGS = (
+    (
+        tuple(f"p_RS_R_{a}" for a in _AXES) + tuple(f"q_RS_{a}" for a in "xyzw"),
+        tuple(f"{name}_{a}" for name in ("v_RS_R", "b_a_RS_S", "b_w_RS_S") for a in _AXES),
+    ),
+    (
+        tuple(f"p{a}" for a in _AXES) + tuple(f"q{a}" for a in "xyzw"),
+        tuple(f"{name}{a}" for name in ("v", "ba", "bw") for a in _AXES),
+    ),
+)
 
 
 def load_truth(path: Path) -> Truth:
@@ -70,3 +103,132 @@ def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | No
         return None
     t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
     return np.stack([np.interp(at_s, t_s, column) for column in values.T], axis=1)
+
+
+# Of EuRoC recordings -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The truth to use, and a sentence with its file and the reason."""
+
+    truth: Truth
+    reason: str
+
+
+def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> Choice:
+    """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
+
+    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged;
+    ``images`` says why tracks are not made of images, nothing where there are none.
+    """
+    choice = find_truth(root, mav0, imu)
+    if choice is None:
+        raise DataError(
+            f"{root}: no ground truth in mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it, "
+            "and the stereo tracks are simulated along it where there are no images; add one of them"
+            f"{f': {images}' if images else ''}"
+        )
+    return choice
+
+
+def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
+    """Return the truth of a recording as :func:`choose_truth`, or None where there is none."""
+    found = {path: _read(path, mav0) for path in _tables(root, mav0)}
+    if not found:
+        return None
+    scatter = {path: _rate_scatter_radps(truth, imu) for path, truth in found.items()}
+    ranked = sorted(scatter.items(), key=lambda item: item[1])
+    best, least = ranked[0]
+    if not np.isfinite(least):
+        raise DataError(
+            f"{best}: the truth and the IMU overlap by less than 0.2 s; check that both are of one recording and clock"
+        )
+    scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
+    among = "" if len(ranked) == 1 else ", the better of those in the folder"
+    stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * _turning_radps(found[best], imu)) else ""
+    reason = f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters}){stranger}"
+    return Choice(found[best], reason)
+
+
+def _tables(root: Path, mav0: Path | None) -> list[Path]:
+    # TUM-VI's motion capture, already moved to the IMU and its clock.
+    folders = () if mav0 is None else ("state_groundtruth_estimate0", "mocap0")
+    inside = [] if mav0 is None else [mav0 / folder / "data.csv" for folder in folders]
+    beside = [path for path in sorted(root.glob("*.csv")) if _heading(path) is not None]
+    return [*(path for path in inside if path.is_file()), *beside, *sorted(root.glob("*.tum"))]
+
+
+def _heading(path: Path) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+    columns = columns_of(path)
+    return next((heading for heading in _HEADINGS if columns.keys() >= set(heading[0])), None)
+
+
+def _read(path: Path, mav0: Path | None) -> Truth:
+    truth = load_truth(path) if path.suffix == ".tum" else _read_csv(path)
+    sensor_yaml = path.parent / "sensor.yaml"
+    if mav0 is None or path.parent.parent != mav0 or not sensor_yaml.is_file():
+        return truth
+    imu_yaml = mav0 / "imu0/sensor.yaml"
+    # Beside a camchain there need be none: the body is the IMU then.
+    T_body_imu = extrinsic(read_fields(imu_yaml)) if is_regular(imu_yaml) else np.eye(4)
+    T_sensor_imu = se3_inverse(extrinsic(read_fields(sensor_yaml))) @ T_body_imu
+    if np.array_equal(T_sensor_imu, np.eye(4)):
+        return truth
+    # Velocity and biases are the tracked sensor's own, not the IMU's.
+    return Truth(truth.t_ns, truth.T_world_imu @ T_sensor_imu)
+
+
+def _read_csv(path: Path) -> Truth:
+    """Read poses and, where all are there, velocities and biases; stamps stay whole numbers."""
+    pose, rest = _heading(path) or _HEADINGS[0]
+    complete = columns_of(path).keys() >= set(rest)
+    table = read_table(path, pose + rest if complete else pose)
+    T_world_imu = checked_poses(path, list(range(2, len(table.t_ns) + 2)), table.t_ns, table.values[:, :7])
+    if not complete:
+        return Truth(table.t_ns, T_world_imu)
+    return Truth(table.t_ns, T_world_imu, table.values[:, 7:10], table.values[:, 10:16])
+
+
+def _rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
+    """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed.
+
+    A truth whose axes are not the IMU's rotates about other axes than the gyro measures. Infinite where the two share
+    no 0.2 s.
+    """
+    sample_t_ns, gyro_radps = _usable(imu)
+    if not sample_t_ns.size:
+        return float("inf")
+    first, last = max(truth.t_ns[0], sample_t_ns[0]), min(truth.t_ns[-1], sample_t_ns[-1])
+    at_ns = np.arange(first, last + 1, _STEP_NS, dtype=np.int64)
+    if at_ns.size < 3:
+        return float("inf")
+    known = _without_gap(truth.t_ns, at_ns)
+    if not known.any():
+        return float("inf")
+    R_world_imu = interpolate_poses(truth.t_ns, truth.T_world_imu, at_ns)[:, :3, :3]
+    steps = so3_log(np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:])
+    rate_hz = NS_PER_S / _STEP_NS
+    off = (steps * rate_hz - np.diff(turned(sample_t_ns, gyro_radps, at_ns), axis=0) * rate_hz)[known]
+    return float(np.sqrt(((off - np.median(off, axis=0)) ** 2).mean()))
+
+
+def _turning_radps(truth: Truth, imu: ImuSamples) -> float:
+    """Return how much the gyro turns in the time of the truth, RMS about its median (rad/s)."""
+    t_ns, gyro_radps = _usable(imu)
+    shared = gyro_radps[(t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1])]
+    return float(np.sqrt(((shared - np.median(shared, axis=0)) ** 2).mean()))
+
+
+def _without_gap(t_ns: IntArray, at_ns: IntArray) -> BoolArray:
+    """Say of each step (N - 1,) between instants (N,) whether poses stand close about it: some have gaps of minutes."""
+    before = t_ns[np.searchsorted(t_ns, at_ns[:-1], side="right") - 1]
+    after = t_ns[np.minimum(np.searchsorted(t_ns, at_ns[1:]), t_ns.size - 1)]
+    return np.asarray(after - before <= _MOST_STEPS * _STEP_NS)
+
+
+def _usable(imu: ImuSamples) -> tuple[IntArray, Array]:
+    """Return stamps (S,) and rates (S, 3) without what the audit will repair: rows not finite, out of order, twice."""
+    finite = np.flatnonzero(np.isfinite(imu.gyro_radps).all(axis=1))
+    t_ns, first = np.unique(imu.t_ns[finite], return_index=True)
+    return t_ns, imu.gyro_radps[finite[first]]

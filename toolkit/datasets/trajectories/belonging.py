@@ -192,8 +192,8 @@ def turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Ar
         steps.mean_rates(reference.rates_t_ns, reference.rates_radps), steps.rates(R_world_body[within])
     ))  # fmt: skip
     turn, _ = nearest_rotation(measured.T @ rates)
-    as_given, turned = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
-    is_other = turned > _TURNED_CORRELATION and 1.0 - turned < _UNEXPLAINED_SHARE * (1.0 - as_given)
+    as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
+    is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
     return turn if is_other and np.linalg.norm(so3_log(turn)) > _OTHER_AXES_RAD else None
 
 
@@ -276,10 +276,7 @@ class _Steps(NamedTuple):
 
     def mean_rates(self, sample_t_ns: IntArray, samples_radps: Array) -> Array:
         """Return the means (M, 3) of samples (S, 3), taken as straight lines."""
-        sample_s, at_s = (sample_t_ns - self.t_ns[0]) / NS_PER_S, (self.t_ns - self.t_ns[0]) / NS_PER_S
-        areas = 0.5 * (samples_radps[1:] + samples_radps[:-1]) * np.diff(sample_s)[:, None]
-        turned = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
-        at_stamps = np.stack([np.interp(at_s, sample_s, axis) for axis in turned.T], axis=1)
+        at_stamps = turned(sample_t_ns, samples_radps, self.t_ns)
         means: Array = (at_stamps[self.end] - at_stamps[self.start]) / self._duration_s[:, None]
         return means
 
@@ -292,6 +289,14 @@ class _Steps(NamedTuple):
     def _duration_s(self) -> Array:
         duration_s: Array = (self.t_ns[self.end] - self.t_ns[self.start]) / NS_PER_S
         return duration_s
+
+
+def turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
+    """Return the integrals (N, 3) rad of rates (S, 3), taken as straight lines, from the first to stamps (N,)."""
+    sample_s, at_s = (sample_t_ns - sample_t_ns[0]) / NS_PER_S, (at_ns - sample_t_ns[0]) / NS_PER_S
+    areas = 0.5 * (rates_radps[1:] + rates_radps[:-1]) * np.diff(sample_s)[:, None]
+    reached = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+    return np.stack([np.interp(at_s, sample_s, axis) for axis in reached.T], axis=1)
 
 
 def _correlation(one: Array, other: Array) -> float:
