@@ -214,7 +214,7 @@ def _day_of(root: Path) -> _Day:
 
 
 def _calibration(file: Path) -> Fields:
-    """Read a file of names and numbers; what is none, as a date, is left out."""
+    """Read a file of names and numbers; entries that are no numbers, such as dates, are left out."""
     if not file.exists():
         raise DataError(
             f"{file}: is missing; the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} "

@@ -126,7 +126,7 @@ def _rig_to_text(rig: StereoRig) -> Text:
 
 def _plain(value: StereoRig | MotionNoise) -> Text:
     """Return the fields of a value with arrays as nested lists; Python writes floats so that they come back whole."""
-    # What a value has worked out of its fields, and keeps, is none of them.
+    # Cached properties of a value are no fields of it.
     parts = {field.name: getattr(value, field.name) for field in fields(value)}
     return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in parts.items()}
 

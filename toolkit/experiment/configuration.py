@@ -1,4 +1,4 @@
-"""A comparison as a file: a TOML file somebody wrote, or the manifest of a run that is to be repeated."""
+"""A comparison as a file: a TOML file, or the manifest of a run that is to be repeated."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -205,7 +205,7 @@ def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
 
 
 def is_on_request(reason: str) -> bool:
-    """Say whether a value is missing because nobody asked for it."""
+    """Say whether a value is missing because it was not requested."""
     return reason.startswith(_ON_REQUEST)
 
 

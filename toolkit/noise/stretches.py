@@ -184,7 +184,7 @@ class Adjusted:
         return TrackedWindow(self.window, np.arange(len(self.window.points))).with_sightings(sound).window
 
     def residuals(self, fewest_sightings: int) -> SoundResiduals:
-        """Return the residuals of the plausible sightings of tracks with so many or more of them."""
+        """Return the residuals of the plausible sightings of tracks with ``fewest_sightings`` or more of them."""
         sound = replace(self, window=self.by_sound_sightings())
         vision, seen = sound.vision, sound.window.sightings
         often = np.bincount(seen.point, minlength=len(sound.window.points))[seen.point] >= fewest_sightings

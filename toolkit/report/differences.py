@@ -31,7 +31,7 @@ _LONGEST = 40
 
 
 class ChangeRecord(Struct, frozen=True, kw_only=True):
-    """A thing that the two have otherwise, as text; empty where one has none."""
+    """An entry in which the two differ, as text; empty where one lacks it."""
 
     name: str
     before: str

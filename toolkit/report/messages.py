@@ -309,7 +309,7 @@ def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[s
 
 
 def _whose(affected: list[Row], rows: list[Row]) -> str:
-    """Name the rows affected: nobody where it is all, the estimator alone where it is all of its outputs."""
+    """Name the rows affected: no name where all are, the estimator alone where all of its outputs are."""
     if len(affected) == len(rows):
         return ""
     of_all, of_affected = Counter(row.estimator for row in rows), Counter(row.estimator for row in affected)

@@ -66,7 +66,7 @@ def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
 
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
-    """Return the errors (n,) px by kind, without the kinds the run has none of."""
+    """Return the errors (n,) px by kind, for the kinds that the run has."""
     found = {
         kind: available(errors_of, run, shown_output(run), comparison.sequence) for kind, errors_of in _KINDS.items()
     }
