@@ -31,7 +31,7 @@ from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.sequence import Sequence
 
-# A ratio must be so many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio of the
+# A ratio must be this many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio of the
 # rates of rotation, so that ratio has only an upper limit.
 RATIO_SIGMAS = 5.0
 # Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
@@ -112,7 +112,7 @@ def _is_off(ratio: Scalar, least: float, most: float) -> bool:
     return not least - margin <= ratio.value <= most + margin
 
 
-# A mean is reported from so many of its standard deviations on; the largest mean of a sound recording has 3 to 9.
+# A mean is reported from this many of its standard deviations on; the largest mean of a sound recording has 3 to 9.
 CONFLICT_SIGMAS = 10.0
 # Smallest deviation that is reported (rad/s, m/s, m/s^2); of a velocity, a share of the speed is added. The sound
 # recordings at hand have up to 0.05 rad/s, a tenth of the speed where wheels slip or depths are wrong, and 0.4 m/s^2.
@@ -127,8 +127,8 @@ LEAST_IN_STRETCH = 8
 LEAST_STRETCHES = 10
 # The specific force is compared with the gravity estimated within this time (s), before the gyro's drift rotates it.
 GRAVITY_S = 10.0
-# A velocity is the median of so many neighbours; its standard deviation is that of a single one times this factor, for
-# normal errors.
+# A velocity is the median of this many neighbours; its standard deviation is that of a single one times this factor,
+# for normal errors.
 _MEDIAN_OF, _MEDIAN_ERROR = 5, 0.536
 # The quartile of the absolute value of a normal variable, over its standard deviation.
 _LOWER_QUARTILE = 0.3186
@@ -317,7 +317,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: ForceBeside
 
 
 def _neighbours(values: Array, reach: int) -> Array:
-    """Return each value (n, ...) with so many on either side (n, ..., 2 reach + 1); the ends repeat."""
+    """Return each value (n, ...) with ``reach`` on either side (n, ..., 2 reach + 1); the ends repeat."""
     padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
     return np.asarray(sliding_window_view(padded, 2 * reach + 1, axis=0))
 
@@ -341,7 +341,7 @@ LEVEL, SYSTEMATIC = 1e-3, 0.06
 LARGEST_HIDDEN_STEP = 0.08
 # Below this speed the camera is taken to stand, and its speed is noise.
 STANDING_MPS = 0.05
-# Either side of a step has at least so many stretches.
+# Either side of a step has at least this many stretches.
 LEAST_STRETCHES_ASIDE = 2
 
 
@@ -406,7 +406,7 @@ def _largest_step(ratio: Array) -> tuple[int, Scalar]:
     return best, steps[best]
 
 
-# The parts before and after each of these shares of the recording are compared. A change must be beyond so many
+# The parts before and after each of these shares of the recording are compared. A change must be beyond this many
 # standard errors and a share of gravity, a larger one unless the errors of the tracks are independent. Beyond five
 # standard errors, parts of sound recordings at hand have 0.3 % at most, and simulated flights whose tracks drift from
 # image to image 0.8 %. Chosen with them in view.
@@ -498,14 +498,14 @@ def _read(t_s: Array, fallen: Array) -> tuple[float, float]:
     return size, error / float(np.sqrt(np.sum(since_s**2)))
 
 
-# An interval is a candidate beyond so many standard deviations of all and beyond this angle (rad). Single intervals of
-# sound recordings have up to 9 and 0.007 with an IMU, and up to 21 and 0.021 on drives, without a lasting rotation.
+# An interval is a candidate beyond this many standard deviations of all and beyond this angle (rad). Single intervals
+# of sound recordings have up to 9 and 0.007 with an IMU, and up to 21 and 0.021 on drives, without a lasting rotation.
 JUMP_SIGMAS, LEAST_JUMP_RAD = 12.0, 0.008
 # The intervals before and after it must be less than this share of it.
 ALONE = 0.5
-# The lasting rotation, over so many intervals before and after, must be within these shares of the jump, and so many
-# standard errors from zero. Real drives have shares of 1.26 to 1.43 where a jump was planted; three slips of the tracks
-# in 03 have 0.0, 0.4 and 2.1.
+# The lasting rotation, over this many intervals before and after, must be within these shares of the jump, and this
+# many standard errors from zero. Real drives have shares of 1.26 to 1.43 where a jump was planted; three slips of the
+# tracks in 03 have 0.0, 0.4 and 2.1.
 AROUND, STAYS_SIGMAS, SHARE = 60, 4.0, (0.5, 1.75)
 LEAST_AROUND = 10
 

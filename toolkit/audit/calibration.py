@@ -403,7 +403,7 @@ def _against_camera(evidence: Evidence) -> _Reading | None:
     return _median(intervals.w_radps - intervals.w_seen_radps, SYSTEMATIC_CAMERA, source)
 
 
-# A scale is reported beyond so many standard errors, by a jackknife, and this share. Beyond five standard errors,
+# A scale is reported beyond this many standard errors, by a jackknife, and this share. Beyond five standard errors,
 # tracks that drift cause 2.3 % for one axis of kitti00, 1.6 % in 8 s of a drive, and nothing in twenty other sound
 # recordings. Chosen with them in view.
 GYRO_SCALE_SIGMAS, GYRO_SCALE_SYSTEMATIC = 5.0, 0.05
@@ -476,7 +476,7 @@ def _inverse_slope(measured: Array, seen: Array) -> float:
     return 1.0 / found if found > 0.0 else np.inf
 
 
-# Limits of an axis: so many standard errors beyond what sound recordings at hand have (m). The velocities of cars are
+# Limits of an axis: this many standard errors beyond what sound recordings at hand have (m). The velocities of cars are
 # those of another point, or slip: 0.43 to 0.85 m along x in all seven.
 LEVER_SIGMAS, SYSTEMATIC_M = {"twist": 5.0, "imu": 4.0}, {"twist": 0.6, "imu": 0.015}
 # An axis along which the standard error of the position is larger than this (m) is not judged.

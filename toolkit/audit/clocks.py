@@ -36,11 +36,11 @@ SCATTER = 1.45
 # The unexplained variance must fall below this share of that without an offset, because slow turns may fit by chance.
 MOST_UNEXPLAINED = 0.9
 # The difference of two independent rates has the sum of their variances; a gyro's noise at standstill also has a shift
-# with the smallest difference. The variance must be below this share of the sum, without differences beyond so many
+# with the smallest difference. The variance must be below this share of the sum, without differences beyond this many
 # spreads.
 MOST_APART, GROSS_SPREADS = 0.8, 6.0
-# Limits of an offset of the truth's clock: so many standard errors and this time (s); a rate must cause as much at both
-# ends. Sound recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+# Limits of an offset of the truth's clock: this many standard errors and this time (s); a rate must cause as much at
+# both ends. Sound recordings have 9 +- 2 ms at most (0027), chosen with them in view.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 # The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
 SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
@@ -50,8 +50,8 @@ FEWEST = LEAST_INTERVALS + 10
 SLOPE_STEP = 0.1
 # Largest rate; beyond it, other parts of a motion fit as well.
 MOST_RATE = 0.1
-# Limits of the change of the offset between the halves: so many standard errors, and beyond them what sound recordings
-# at hand have (s): 14 ms at most on drives, 3 ms with an IMU. Chosen with them in view.
+# Limits of the change of the offset between the halves: this many standard errors, and beyond them what sound
+# recordings at hand have (s): 14 ms at most on drives, 3 ms with an IMU. Chosen with them in view.
 CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 # The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
 # k plus s times sample k + 1.
@@ -135,7 +135,7 @@ def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
 
 
 def _medians(values: Array, reached: IntArray) -> Array:
-    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, so many in each row (C,)."""
+    """Return the medians (C, d, 1) of those values (C, d, M) that are not NaN, of which a row has ``reached`` (C,)."""
     ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
     middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
     return np.asarray(0.5 * (middle[0] + middle[1]))

@@ -372,7 +372,7 @@ OVERLAP = 2
 LEAST_STRIDES = 20
 # Accuracy of such a change of velocity (m/s^2).
 LEAST_SPREAD = 0.1
-# Another order must be better than the given one by so many standard errors, and leave at most this share of what the
+# Another order must be better than the given one by this many standard errors, and leave at most this share of what the
 # given one leaves, because an order can also explain a part of other faults. In sound recordings the given order is the
 # best.
 AGAINST_GIVEN_ORDER, MOST_LEFT = 5.0, 0.7

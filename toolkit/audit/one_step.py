@@ -24,14 +24,14 @@ from toolkit.sequence import Sequence
 MOST_PX = 3.0
 # The limit is no less than this many times what the tracks' own scatter and the stated noise of the samples explain.
 TIMES_EXPLAINED = 2.0
-# Residuals beyond so many robust standard deviations, of mismatches and moving objects, are left out of the
-# correlation, which needs so many pairs.
+# Residuals beyond this many robust standard deviations, of mismatches and moving objects, are left out of the
+# correlation, which needs this many pairs.
 USUAL = 3.0
 LEAST_TRIPLES = 300
 # Limit of the correlation of neighbouring residuals. Errors with a white part and a random walk along the track have
 # the correlation -1 / (2 + w), where w is the walk's variance per frame over that of the white part; above the limit w
 # is more than 2. Simulated white tracks have -0.40 to -0.48, because the camera's motion is fitted to them, and real
-# ones 0.1 to 0.9. The correlation must be beyond the limit by so many standard errors.
+# ones 0.1 to 0.9. The correlation must be beyond the limit by this many standard errors.
 MOST_CORRELATION, CORRELATION_SIGMAS = -0.25, 5.0
 # Least standard deviation of whitened residuals; below it, tracks are exact.
 _NO_ERROR = 1e-6

@@ -103,10 +103,10 @@ def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
 def chance_bound(error: Array, formal: Array, stretches: float, usual: float) -> Array:
     """Return the bounds (m,) that estimates exceed by chance less often than ``LEVEL``.
 
-    ``error`` (m,) is the standard error of a jackknife over so many stretches, and ``formal`` (m,) that if errors of
-    intervals were independent. A few stretches determine their own scatter badly. Therefore a second bound is computed,
-    in which the inflation of the formal error is pooled with the ``usual`` inflation, and the smaller bound is
-    returned. Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
+    ``error`` (m,) is the standard error of a jackknife over stretches of the recording, and ``formal`` (m,) that if
+    errors of intervals were independent. A few stretches determine their own scatter badly. Therefore a second bound is
+    computed, in which the inflation of the formal error is pooled with the ``usual`` inflation, and the smaller bound
+    is returned. Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
     microarray experiments" (2004), section 3.
     """
     own_dof = max(stretches - 1.0, 0.0)

@@ -64,7 +64,7 @@ OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3, 5.0, 0.1], [2
 # Least share of the information on the camera's position that is taken to come from the data.
 LEAST_BY_DATA = 1e-3
 # The first unknowns are those of a rectified pair. The errors of the right image are fixed at zero, and estimated only
-# where one step from the converged calibration has them beyond so many standard errors. Few recordings need them; in
+# where one step from the converged calibration has them beyond this many standard errors. Few recordings need them; in
 # all others they would make focal length and baseline less certain.
 _RECTIFIED, RIGHT = RIGHT_SHIFT, slice(RIGHT_SHIFT, COMMON)
 RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}

@@ -166,7 +166,7 @@ def _cut_tracks(sequence: Sequence, repeated: BoolArray) -> Sequence:
 
 # Steps (px) that are tried. Smaller ones are not reported, because they add errors of less than 0.03 px.
 STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
-# Least number of sightings, and least share of rounded ones among the first so many (to look at the rest) and among
+# Least number of sightings, and least share of rounded ones among the first of these (to look at the rest) and among
 # all. In sound recordings at most an eighth of the coordinates are half-precision numbers by chance.
 LEAST_SIGHTINGS, SOME, NEARLY_ALL = 100, 0.9, 0.999
 # Rounding is a warning from this share of the stated standard deviation on.
@@ -226,18 +226,19 @@ def _share_half(uv_px: Array) -> float:
 SUSPECT_SHARE = 0.2
 # Under the right order at most this share is not positive: 1 % where it was measured.
 SOUND_SHARE = 0.05
-# Rows of a pair differ by noise alone: half of the differences are within so many standard deviations of a pixel.
+# Rows of a pair differ by noise alone: half of the differences are within this many standard deviations of a pixel.
 ROW_SIGMAS = 5.0
 # Least share of the sightings in tracks with exchanged rows, of which sound recordings at hand have none; and least
 # share of these among the sightings in tracks without disparity, or else the camera's motion may be wrong.
 LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
-# A track may have rows in the place of uL and uR if the mean of its disparities is within so many standard errors of
-# zero. Its distance from the epipolar lines is judged from so many pairs of neighbouring sightings on.
+# A track may have rows in the place of uL and uR if the mean of its disparities is within this many standard errors of
+# zero. Its distance from the epipolar lines is judged from this many pairs of neighbouring sightings on.
 TRACK_SIGMAS, LEAST_PAIRS = 4.0, 3
 # Inverse depths (1/m) along an epipolar line, from infinity to half a metre.
 _INVERSE_DEPTHS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 23)])
-# A uR that stands for a missing right image is in so many sightings at least, with so many values of uL, and is so many
-# times as frequent as any other uR. In the sound recordings at hand, one with halves of a pixel among them, it is 2.4.
+# A uR that stands for a missing right image is in this many sightings at least, with this many values of uL, and is
+# this many times as frequent as any other uR. In the sound recordings at hand, one with halves of a pixel among them,
+# it is 2.4.
 FEWEST_FILLED, FEWEST_PLACES, TIMES_AS_FREQUENT = 10, 5, 10
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
