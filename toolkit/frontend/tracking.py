@@ -7,7 +7,6 @@ left and right are not exchanged, and that the calibration fits the images.
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -72,7 +71,7 @@ def track_images(
     if kept is not None:
         return ImageTracks(**kept)
     bits = _bits_of(pairs)
-    _check_sides(pairs, rig, settings, bits)
+    _check_sides(_SideCheck(pairs, rig, settings, bits))
     found = _tracked(pairs, rig, settings, bits, progress)
     cache.save(key, vars(found))
     return found
@@ -80,7 +79,7 @@ def track_images(
 
 def matched_corners(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend) -> int:
     """Return how many corners of the left images of a few pairs are found in the same rows of the right ones."""
-    return _looked_at(pairs, rig, settings, _bits_of(pairs)).matched
+    return _SideCheck(pairs, rig, settings, _bits_of(pairs)).looked_at()[2]
 
 
 def read_pair(
@@ -169,60 +168,74 @@ def _without_repeats(
             yield images
 
 
-class _Matches(NamedTuple):
-    """Corners of a few pairs that were looked for in the partner, and found; the usable pairs by their places."""
+@dataclass(frozen=True, eq=False)
+class _SideCheck:
+    """Matches corners of a few pairs, each by itself, to see whether left and right belong together."""
 
-    places: tuple[int, ...]
-    wanted: int
-    matched: int
+    pairs: Sequence[StampedPair]
+    rig: RectifiedPair
+    settings: Frontend
+    bits: int
+
+    def looked_at(self) -> tuple[list[int], int, int]:
+        """Return the places of some usable pairs, and how many of their corners were looked for and found."""
+        usable, wanted, matched = list[int](), 0, 0
+        for place in np.unique(np.linspace(0, len(self.pairs) - 1, _LOOKED_AT).astype(int)).tolist():
+            images = read_pair(self.pairs[place], self.rig, self.bits)
+            if not isinstance(images, Unusable):
+                tracker = Tracker(self.rig, self.settings)
+                matched += _count(tracker.step(*images))
+                wanted += tracker.tried
+                usable.append(place)
+        return usable, wanted, matched
+
+    def exchanged(self, place: int) -> int:
+        """Return how many corners of a pair are found in the partner where left and right are exchanged."""
+        images = read_pair(self.pairs[place], self.rig, self.bits, (1, 0))
+        return 0 if isinstance(images, Unusable) else self._matched(images[1], images[0])
+
+    def matched_with(self, place: int, offset: int) -> int:
+        """Return how many corners of a left image are found in the right image of a pair so many pairs away."""
+        if not 0 <= place + offset < len(self.pairs):
+            return 0
+        pair = replace(self.pairs[place], right=self.pairs[place + offset].right)
+        images = read_pair(pair, self.rig, self.bits)
+        return 0 if isinstance(images, Unusable) else self._matched(*images)
+
+    def all_alike(self) -> bool:
+        """Say whether left and right image are one and the same in a few pairs, before any rectification."""
+        for pair in _some(self.pairs):
+            left, right = (read_image(path, self.bits, self.rig.raw_size_px) for path in (pair.left, pair.right))
+            if isinstance(left, Unusable) or isinstance(right, Unusable):
+                return False
+            if not (np.ptp(left) > 0 and np.array_equal(left, right)):
+                return False
+        return True
+
+    def _matched(self, left: Image, right: Image) -> int:
+        return _count(Tracker(self.rig, self.settings).step(left, right))
 
 
-def _looked_at(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> _Matches:
-    """Match the corners of a few pairs, each by itself."""
-    usable, wanted, matched = list[int](), 0, 0
-    for place in np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int)).tolist():
-        images = read_pair(pairs[place], rig, bits)
-        if isinstance(images, Unusable):
-            continue
-        tracker = Tracker(rig, settings)
-        matched += _count(tracker, *images)
-        wanted += tracker.tried
-        usable.append(place)
-    return _Matches(tuple(usable), wanted, matched)
+def _count(found: TrackedCorners | None) -> int:
+    return 0 if found is None else len(found.track_ids)
 
 
-def _exchanged(pair: StampedPair, rig: RectifiedPair, settings: Frontend, bits: int) -> int:
-    """Return how many corners of a pair are found in the partner where left and right are exchanged."""
-    images = read_pair(pair, rig, bits, (1, 0))
-    return 0 if isinstance(images, Unusable) else _count(Tracker(rig, settings), images[1], images[0])
-
-
-def _matched_with(
-    pairs: Sequence[StampedPair], place: int, offset: int, rig: RectifiedPair, settings: Frontend, bits: int
-) -> int:
-    """Return how many corners of a left image are found in the right image of a pair ``offset`` pairs later."""
-    if not 0 <= place + offset < len(pairs):
-        return 0
-    images = read_pair(replace(pairs[place], right=pairs[place + offset].right), rig, bits)
-    return 0 if isinstance(images, Unusable) else _count(Tracker(rig, settings), *images)
-
-
-def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> None:
+def _check_sides(check: _SideCheck) -> None:
     """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
-    folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
-    if _all_alike(pairs, rig, bits):
+    folders, settings = f"{check.pairs[0].left.parent} and {check.pairs[0].right.parent}", check.settings
+    if check.all_alike():
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
-    places, wanted, matched = _looked_at(pairs, rig, settings, bits)
+    places, wanted, matched = check.looked_at()
     least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
-    # At most this many tracks begin at a pair: where enough are found as called, none can find more by the factor.
+    # A pair begins so many tracks at most: where enough are found as called, no other way can find more by the factor.
     most = settings.max_tracks * len(places)
-    if most > least and sum(_exchanged(pairs[place], rig, settings, bits) for place in places) > least:
+    if most > least and sum(map(check.exchanged, places)) > least:
         raise DataError(
             f"{folders}: left and right images are exchanged; exchange the two, or turn the images back if all are "
             "upside down or mirrored"
         )
     if min(most, wanted) > least:
-        before, after = (sum(_matched_with(pairs, place, k, rig, settings, bits) for place in places) for k in (-1, 1))
+        before, after = (sum(check.matched_with(place, offset) for place in places) for offset in (-1, 1))
         if max(before, after) > least:
             which = "before" if before > after else "after"
             raise DataError(
@@ -248,20 +261,3 @@ def _too_strict(settings: Frontend) -> str:
     }
     named = [f"frontend.{name}={getattr(settings, name):.12g}" for name, is_so in stricter.items() if is_so]
     return f", or {' or '.join(named)} is too strict" if named else ""
-
-
-def _all_alike(pairs: Sequence[StampedPair], rig: RectifiedPair, bits: int) -> bool:
-    """Say whether left and right image are one and the same in a few pairs, before any rectification."""
-    return all(_alike(pair, rig, bits) for pair in _some(pairs))
-
-
-def _alike(pair: StampedPair, rig: RectifiedPair, bits: int) -> bool:
-    left, right = (read_image(path, bits, rig.raw_size_px) for path in (pair.left, pair.right))
-    if isinstance(left, Unusable) or isinstance(right, Unusable):
-        return False
-    return bool(np.ptp(left) > 0) and np.array_equal(left, right)
-
-
-def _count(tracker: Tracker, left: Image, right: Image) -> int:
-    found = tracker.step(left, right)
-    return 0 if found is None else len(found.track_ids)
