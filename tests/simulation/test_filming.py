@@ -11,11 +11,12 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.errors import OutputError
+from toolkit.frontend.cameras import Camera, Distortion
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
 from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
-from toolkit.simulation.filming import Filming, LensModel, errors_px, film
+from toolkit.simulation.filming import Filming, errors_px, film
 from toolkit.simulation.renderer import Eye, Floats, light
 from toolkit.simulation.surfaces import Panel, furnished_hall
 
@@ -44,32 +45,28 @@ def first_hit(panels: tuple[Panel, ...], origin: Array, towards: Array) -> Array
     return hit
 
 
-def pixel_of(point_cam: Array, lens: LensModel, K: Array, coefficients: Array) -> Array:
+def pixel_of(point_cam: Array, camera: Camera) -> Array:
     """Return where a camera shows a point (3,), by OpenCV's own projection."""
-    zero, point = np.zeros(3), point_cam.reshape(1, 1, 3)
-    if lens == "equidistant":
-        return np.ravel(cv2.fisheye.projectPoints(point, zero, zero, K, coefficients)[0])
-    return np.ravel(cv2.projectPoints(point, zero, zero, K, coefficients)[0])
+    project = cv2.fisheye.projectPoints if camera.distortion == "equidistant" else cv2.projectPoints
+    return np.ravel(project(point_cam.reshape(1, 1, 3), np.zeros(3), np.zeros(3), camera.K, camera.coefficients)[0])
 
 
 @pytest.mark.parametrize("model", ["none", "radtan", "equidistant"])
-def test_what_two_cameras_see_at_two_times_are_the_same_points(model: LensModel) -> None:
+def test_what_two_cameras_see_at_two_times_are_the_same_points(model: Distortion) -> None:
     """A point seen in one image has its grey value where the other shows it, unless something stands before it."""
     pair, panels = filming._Pair.of(FLIGHT, model), furnished_hall().at(0.0)
     poses = pose_at(2.0), pose_at(2.1) @ se3_inverse(FLIGHT.rig.T_imu_cam) @ pair.T_imu_cams[1]
-    eyes = [Eye.of(lens) for lens in pair.lenses]
-    images = [light(panels, eye, pose) for eye, pose in zip(eyes, poses, strict=True)]
-    fx, fy, cx, cy = pair.lenses[1].pinhole_px
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    eye = Eye.of(pair.camera)
+    images = [light(panels, eye, pose) for pose in poses]
     rng, differences, hidden = np.random.default_rng(1), [], 0
     for column, row in zip(rng.integers(100, 650, 160), rng.integers(60, 420, 160), strict=True):
-        ray = poses[0][:3, :3] @ np.array([eyes[0].x[row, column], eyes[0].y[row, column], 1.0])
+        ray = poses[0][:3, :3] @ np.array([eye.x[row, column], eye.y[row, column], 1.0])
         point = first_hit(panels, poses[0][:3, 3], ray)
         towards = point - poses[1][:3, 3]
         if np.linalg.norm(first_hit(panels, poses[1][:3, 3], towards) - point) > 0.01:
             hidden += 1
             continue
-        u, v = pixel_of(poses[1][:3, :3].T @ towards, model, K, pair.lenses[1].coefficients)
+        u, v = pixel_of(poses[1][:3, :3].T @ towards, pair.camera)
         if 1.0 < u < 750.0 and 1.0 < v < 478.0:
             differences.append(float(sampled(images[1], u, v)) - float(images[0][row, column]))
     assert len(differences) > 100

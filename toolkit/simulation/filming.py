@@ -21,15 +21,16 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.errors import OutputError
 from toolkit.files.writing import check_replaceable, replaced_directory
+from toolkit.frontend.cameras import Camera, Distortion
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
-from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig
+from toolkit.measurements import NS_PER_S, ImuNoise
 from toolkit.models import stereo
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
-from toolkit.simulation.renderer import Eye, Lens, LensModel, Sensor, exposed, light
+from toolkit.simulation.renderer import Eye, Sensor, exposed, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
 from toolkit.simulation.sensors import Imu
 from toolkit.simulation.surfaces import Floats, Surfaces, atlas, furnished_hall
@@ -46,14 +47,14 @@ _SWING, _SWING_S, _RIGHT_GAIN = 0.12, 7.0, 1.04
 _SHOTS = 5  # in an exposure that blurs
 # Imperfect mounting of a pair with lenses: the rotation of the right camera against the left one (rad).
 _TURNED_RAD = np.array([0.008, -0.005, 0.006])
-_COEFFICIENTS: dict[LensModel, tuple[float, ...]] = {
+_COEFFICIENTS: dict[Distortion, tuple[float, ...]] = {
     "none": (0.0, 0.0, 0.0, 0.0),
     "radtan": (-0.28, 0.07, 2e-4, 1e-4),
     "equidistant": (3e-3, 7e-4, -2e-3, 2e-4),
 }
 # A fisheye sees more on the same sensor.
 _FISHEYE_FOCAL = 0.72
-_EUROC_NAMES: dict[LensModel, str] = {
+_EUROC_NAMES: dict[Distortion, str] = {
     "none": "none",
     "radtan": "radial-tangential",
     "equidistant": "equidistant",
@@ -65,7 +66,7 @@ _MISMATCH_PX = 3.0
 class Filming:
     """How images are taken: lenses, exposure time (s, 0: no blur), and the number of flying crates."""
 
-    lens: LensModel = "none"
+    lens: Distortion = "none"
     exposure_s: float = 0.0
     moving: int = 0
 
@@ -147,24 +148,19 @@ def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Prog
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two cameras: their lenses and mounting poses (4, 4)."""
+    """Two cameras of one kind, and where they are mounted (4, 4)."""
 
-    lenses: tuple[Lens, Lens]
+    camera: Camera
     T_imu_cams: tuple[Array, Array]
 
     @classmethod
-    def of(cls, scenario: Scenario, model: LensModel) -> "_Pair":
+    def of(cls, scenario: Scenario, model: Distortion) -> "_Pair":
         """Return the cameras of a scenario: its rectified pair, or two with lenses, the right one slightly rotated."""
-        rig, coefficients = scenario.rig, np.array(_COEFFICIENTS[model])
-        scale = _FISHEYE_FOCAL if model == "equidistant" else 1.0
+        rig, scale = scenario.rig, _FISHEYE_FOCAL if model == "equidistant" else 1.0
         pinhole_px = (scale * rig.fx_px, scale * rig.fy_px, rig.cx_px, rig.cy_px)
-        lens = Lens(pinhole_px, model, coefficients, scenario.camera.size_px)
+        camera = Camera(pinhole_px, model, np.array(_COEFFICIENTS[model]), scenario.camera.size_px)
         turned = np.eye(3) if model == "none" else so3_exp(_TURNED_RAD)
-        return cls((lens, lens), (rig.T_imu_cam, _right_of(rig, turned)))
-
-
-def _right_of(rig: StereoRig, turned: Array) -> Array:
-    return rig.T_imu_cam @ se3(turned, np.array([rig.baseline_m, 0.0, 0.0]))
+        return cls(camera, (rig.T_imu_cam, rig.T_imu_cam @ se3(turned, np.array([rig.baseline_m, 0.0, 0.0]))))
 
 
 class _Crew:
@@ -176,7 +172,7 @@ class _Crew:
         self._trajectory, self._surfaces, self._pair, self._seed = trajectory, surfaces, pair, seed
         self._filming, self._sensor = filming, Sensor()
         atlas()  # before any thread asks for it
-        self._eyes = tuple(Eye.of(lens) for lens in pair.lenses)
+        self._eye = Eye.of(pair.camera)
         self._swing_rad = 2.0 * np.pi * float(self._rng(0, 2).uniform())
 
     def png(self, k: int, t_ns: int, side: int) -> bytes:
@@ -187,7 +183,7 @@ class _Crew:
 
         def shot(at_s: float) -> Floats:
             T_world_imu = self._trajectory.at(np.array([at_s])).T_world_imu[0]
-            return light(self._surfaces.at(at_s), self._eyes[side], T_world_imu @ self._pair.T_imu_cams[side])
+            return light(self._surfaces.at(at_s), self._eye, T_world_imu @ self._pair.T_imu_cams[side])
 
         gain = (1.0 + _SWING * np.sin(2.0 * np.pi * t_s / _SWING_S + self._swing_rad)) * (_RIGHT_GAIN if side else 1.0)
         seen = exposed(shot, t_s, self._filming.exposure_s, _SHOTS)
@@ -205,10 +201,10 @@ def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Pat
     """Write all files of a folder except its images."""
     stamps = sequence.frames_t_ns.tolist()
     names = "".join(f"{t},{t}.png\n" for t in stamps)
-    for camera, lens, T_imu_cam in zip(_CAMERAS, pair.lenses, pair.T_imu_cams, strict=True):
+    for camera, T_imu_cam in zip(_CAMERAS, pair.T_imu_cams, strict=True):
         (mav0 / camera / "data").mkdir(parents=True)
         (mav0 / camera / "data.csv").write_text(f"#timestamp [ns],filename\n{names}")
-        (mav0 / camera / "sensor.yaml").write_text(_camera_yaml(lens, T_imu_cam, scenario.camera.rate_hz))
+        (mav0 / camera / "sensor.yaml").write_text(_camera_yaml(pair.camera, T_imu_cam, scenario.camera.rate_hz))
     imu, sensor, truth = sequence.motion, scenario.motion, sequence.truth
     assert isinstance(imu, ImuSamples)
     assert isinstance(sensor, Imu)
@@ -249,11 +245,11 @@ def _sensor_yaml(kind: str, T_imu_sensor: Array) -> str:
     return f"%YAML:1.0\nsensor_type: {kind}\ncomment: simulated\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
 
 
-def _camera_yaml(lens: Lens, T_imu_cam: Array, rate_hz: float) -> str:
+def _camera_yaml(camera: Camera, T_imu_cam: Array, rate_hz: float) -> str:
     return _sensor_yaml("camera", T_imu_cam) + (
-        f"rate_hz: {rate_hz:g}\nresolution: [{lens.size_px[0]}, {lens.size_px[1]}]\ncamera_model: pinhole\n"
-        f"intrinsics: {list(lens.pinhole_px)}\ndistortion_model: {_EUROC_NAMES[lens.model]}\n"
-        f"distortion_coefficients: {lens.coefficients.tolist()}\n"
+        f"rate_hz: {rate_hz:g}\nresolution: {list(camera.size_px)}\ncamera_model: pinhole\n"
+        f"intrinsics: {list(camera.pinhole_px)}\ndistortion_model: {_EUROC_NAMES[camera.distortion]}\n"
+        f"distortion_coefficients: {camera.coefficients.tolist()}\n"
     )
 
 

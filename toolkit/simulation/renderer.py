@@ -7,14 +7,13 @@ occlusions are exact: a plane's inverse depth is linear in the ray (x, y, 1), an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
+from toolkit.frontend.cameras import Camera
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.simulation.surfaces import LEVELS, TEXEL_M, TEXELS, Atlas, Floats, Grey, Panel, atlas
 
-LensModel = Literal["none", "radtan", "equidistant"]
 _NEAREST_M = 0.05
 _NEARNESS_OF_NOTHING = 1e-6
 # The optics' own blur, as a Gaussian (px).
@@ -22,21 +21,8 @@ _OPTICS_PX = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
-    """A camera: (fx, fy, cx, cy) px, the model and coefficients (n,) of its distortion, and (width, height) px.
-
-    Models as in OpenCV and Kalibr: radial-tangential (Brown 1966), equidistant (Kannala & Brandt 2006).
-    """
-
-    pinhole_px: tuple[float, float, float, float]
-    model: LensModel
-    coefficients: Array
-    size_px: tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
 class Eye:
-    """The rays of a lens: x and y (height, width) where each pixel's ray meets the plane at depth 1."""
+    """The rays of a camera: x and y (height, width) where each pixel's ray meets the plane at depth 1."""
 
     x: Floats
     y: Floats
@@ -48,20 +34,18 @@ class Eye:
         return (self.x.min(axis=0), self.x.max(axis=0)), (self.y.min(axis=1), self.y.max(axis=1))
 
     @classmethod
-    def of(cls, lens: Lens) -> "Eye":
-        """Return the rays of a lens."""
+    def of(cls, camera: Camera) -> "Eye":
+        """Return the rays of a camera."""
         import cv2
 
-        width, height = lens.size_px
-        fx, fy, cx, cy = lens.pinhole_px
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        (width, height), (fx, fy, cx, cy) = camera.size_px, camera.pinhole_px
         pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), -1)
         flat = pixels.reshape(-1, 1, 2)
-        if lens.model == "equidistant":
-            plain = cv2.fisheye.undistortPoints(flat, K, lens.coefficients)
-        elif lens.model == "radtan":
+        if camera.distortion == "equidistant":
+            plain = cv2.fisheye.undistortPoints(flat, camera.K, camera.coefficients)
+        elif camera.distortion == "radtan":
             enough = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-            plain = cv2.undistortPoints(flat, K, lens.coefficients, criteria=enough)
+            plain = cv2.undistortPoints(flat, camera.K, camera.coefficients, criteria=enough)
         else:
             plain = (flat - [cx, cy]) / [fx, fy]
         rays = np.asarray(plain, dtype=np.float32).reshape(height, width, 2)
