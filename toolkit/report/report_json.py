@@ -14,7 +14,6 @@ from msgspec.structs import asdict
 
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
-from toolkit.experiment.contests import Contest, Question
 from toolkit.files.documents import number, numbers, of_attributes, read, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
@@ -41,7 +40,7 @@ from toolkit.report.messages import (
     remark_lines,
 )
 from toolkit.report.scores import REPEAT, Undecided
-from toolkit.report.verdict import verdict
+from toolkit.report.verdict import ContestRecord, contest_record, verdict
 from toolkit.sequence import Sequence
 
 TRUTH_FILE = "trajectories/truth.tum"
@@ -196,29 +195,6 @@ class AuditMessage(Struct, frozen=True, kw_only=True):
     detail: str
 
 
-class Rival(Struct, frozen=True, kw_only=True):
-    """A row of a contest; of the first one, its advantage is null."""
-
-    estimator: str
-    output: Output
-    value: Annotated[float, Meta(description="of the metric; over seeds the mean")]
-    ratio: Annotated[float | None, Meta(description="how many times as much it drifts, or errs, as the first")]
-    interval: Annotated[tuple[float, float] | None, Meta(description="99 % of the ratio; null with too few data")]
-
-
-class ContestRecord(Struct, frozen=True, kw_only=True):
-    """Rows ranked by an error, and whether any is better than all others by more than chance."""
-
-    question: Question
-    metric: Annotated[str, Meta(description="key of the error they are ranked by")]
-    by: Annotated[str, Meta(description="what the test is over: stretches of the path or of time, or seeds")]
-    rivals: Annotated[tuple[Rival, ...], Meta(description="from the least error up")]
-    leaders: Annotated[tuple[str, ...], Meta(description="estimators that may be the best; one where it is decided")]
-    winner: Annotated[
-        str | None, Meta(description="the only leader, unless its stated uncertainty is marked; else null")
-    ]
-
-
 VerdictText = Annotated[str, Meta(description="in words; absent before it was added")] | UnsetType
 Contests = (
     Annotated[tuple[ContestRecord, ...], Meta(description="who wins, or that nobody does; absent before it was added")]
@@ -345,7 +321,7 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         words=_messages(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
         frames=frames or UNSET,
-        contests=tuple(_contest(one) for one in comparison.contests),
+        contests=tuple(contest_record(one) for one in comparison.contests),
     )
 
 
@@ -363,28 +339,7 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
             verdicts=tuple(consistency_lines(over)),
             start=over.prior.source,
         ),
-        contests=tuple(_contest(one) for one in over.contests),
-    )
-
-
-def _contest(contest: Contest) -> ContestRecord:
-    found = (None, *contest.advantages)
-    return ContestRecord(
-        question=contest.question,
-        metric=contest.metric,
-        by=next((one.parts for one in contest.advantages if one is not None), "nothing: too few data"),
-        rivals=tuple(
-            Rival(
-                estimator=row.estimator,
-                output=row.output,
-                value=row.value(contest.metric) or 0.0,
-                ratio=None if one is None else rounded(one.ratio),
-                interval=None if one is None else (rounded(one.low), rounded(one.high)),
-            )
-            for row, one in zip(contest.rows, found, strict=True)
-        ),
-        leaders=tuple(row.estimator for row in contest.leaders),
-        winner=None if contest.winner is None else contest.winner.estimator,
+        contests=tuple(contest_record(one) for one in over.contests),
     )
 
 

@@ -4,10 +4,15 @@ Only differences that a paired test supports are called differences (:mod:`toolk
 """
 
 import math
+from typing import Annotated
 
+from msgspec import Meta, Struct
+
+from toolkit.estimate import Output
 from toolkit.experiment.comparison import NEES, Comparison, Row
-from toolkit.experiment.contests import COST, HELD_OUT, Contest, cheaper_near
-from toolkit.experiment.drift_test import CONFIDENCE, Advantage
+from toolkit.experiment.contests import COST, HELD_OUT, Contest, Question, cheaper_near
+from toolkit.experiment.drift_test import CONFIDENCE
+from toolkit.files.documents import rounded
 from toolkit.metrics import metrics_called
 from toolkit.report.text import listed, number
 
@@ -15,12 +20,37 @@ from toolkit.report.text import listed, number
 _NEAR, _SAVES = 1.25, 0.2
 
 
+class Rival(Struct, frozen=True, kw_only=True):
+    """A row of a contest; of the first one, its advantage is null."""
+
+    estimator: str
+    output: Output
+    value: Annotated[float, Meta(description="of the metric; over seeds the mean")]
+    ratio: Annotated[float | None, Meta(description="how many times as much it drifts, or errs, as the first")]
+    interval: Annotated[tuple[float, float] | None, Meta(description="99 % of the ratio; null with too few data")]
+
+
+class ContestRecord(Struct, frozen=True, kw_only=True):
+    """Rows ranked by an error, and whether any is better than all others by more than chance."""
+
+    question: Question
+    metric: Annotated[str, Meta(description="key of the error they are ranked by")]
+    by: Annotated[str, Meta(description="what the test is over: stretches of the path or of time, or seeds")]
+    rivals: Annotated[tuple[Rival, ...], Meta(description="from the least error up")]
+    leaders: Annotated[tuple[str, ...], Meta(description="estimators that may be the best; one where it is decided")]
+    winner: Annotated[
+        str | None, Meta(description="the only leader, unless its stated uncertainty is marked; else null")
+    ]
+
+
 def verdict(comparison: Comparison) -> str:
     """Return the verdict on a comparison in a few sentences."""
     contest = main_contest(comparison)
     if contest is None:
         return _of_few(comparison)
-    sentences = (_accuracy(contest, comparison.over_seeds), _limits(contest), _trust(comparison), _cost(contest))
+    runs = f"{len(comparison.seeds)} seeds" if comparison.over_seeds else "one run"
+    best = contest_text(contest_record(contest), runs, contest.rows[0].mark)
+    sentences = (best, _limits(contest), _trust(comparison), _cost(contest))
     return " ".join(filter(None, sentences))
 
 
@@ -31,11 +61,6 @@ def main_contest(comparison: Comparison) -> Contest | None:
     return next((by_question[question] for question in wanted if question in by_question), None)
 
 
-def advantage_text(found: Advantage) -> str:
-    """Return a factor with its interval, as in "2.2 times (99 %: 1.4 to 3.7)"."""
-    return f"{number(found.ratio)} times ({100 * CONFIDENCE:.0f} %: {number(found.low)} to {number(found.high)})"
-
-
 def _of_few(comparison: Comparison) -> str:
     """Return the verdict where fewer than two runs can be compared."""
     ended = [row.estimator for row in comparison.lines if row.answered and row.counts["ok"] == len(row.outcomes)]
@@ -44,36 +69,57 @@ def _of_few(comparison: Comparison) -> str:
     return f"Nothing to compare: only {listed(ended)} can be scored here. {_trust(comparison)}".strip()
 
 
-def _accuracy(contest: Contest, over_seeds: bool) -> str:
-    """Say who is most accurate, or that nobody is by more than chance, and how much worse another is."""
-    first, leaders = contest.rows[0], contest.leaders
-    name = metrics_called((contest.metric,))[0].column
-    if len(leaders) == 1 and first.mark:
-        return f"No winner: {first.estimator} leads ({name} {_with_unit(contest, first)}) but is {first.mark}."
+def contest_record(contest: Contest) -> ContestRecord:
+    """Return a contest as report.json has it."""
+    found = (None, *contest.advantages)
+    return ContestRecord(
+        question=contest.question,
+        metric=contest.metric,
+        by=next((one.parts for one in contest.advantages if one is not None), "nothing: too few data"),
+        rivals=tuple(
+            Rival(
+                estimator=row.estimator,
+                output=row.output,
+                value=row.value(contest.metric) or 0.0,
+                ratio=None if one is None else rounded(one.ratio),
+                interval=None if one is None else (rounded(one.low), rounded(one.high)),
+            )
+            for row, one in zip(contest.rows, found, strict=True)
+        ),
+        leaders=tuple(row.estimator for row in contest.leaders),
+        winner=None if contest.winner is None else contest.winner.estimator,
+    )
+
+
+def contest_text(contest: ContestRecord, runs: str, mark: str) -> str:
+    """Say who is best, or that nobody is by more than chance, and how much worse the next one is.
+
+    ``runs`` says over how many runs the contest is, as in "one run", and ``mark`` what the first row is marked as.
+    """
+    first, *others = contest.rivals
+    metric = metrics_called((contest.metric,))[0]
+    leaders = [one for one in contest.rivals if one.estimator in contest.leaders]
+
+    def value_of(one: Rival) -> str:
+        return f"{number(one.value)} {metric.unit}"
+
+    if len(leaders) == 1 and mark:
+        return f"No winner: {first.estimator} leads ({metric.column} {value_of(first)}) but is {mark}."
     if len(leaders) == 1:
         claim = "predicts withheld tracks best" if contest.metric == HELD_OUT else "is most accurate"
-        opening = f"{first.estimator} {claim} ({name} {_with_unit(contest, first)}"
+        text = f"{first.estimator} {claim} ({metric.column} {value_of(first)}, {runs})"
     else:
-        least = number(first.value(contest.metric) or 0.0)
-        given = f"{least} to {_with_unit(contest, leaders[-1])}"
-        opening = f"No clear winner between {listed(row.estimator for row in leaders)} ({name} {given}"
-    runs = f"{len(first.outcomes)} seeds" if over_seeds else "one run"
-    return f"{opening}, {runs}){_beaten(contest, over_seeds)}."
-
-
-def _beaten(contest: Contest, over_seeds: bool) -> str:
-    """Say how much worse the next row is that is worse by more than chance, and not nearly as good; or nothing."""
-    if not contest.worse:
-        return ""
-    far = _NEAR * (contest.rows[0].value(contest.metric) or 0.0)
-    worse = [(row, found) for row, found in contest.worse if (row.value(contest.metric) or 0.0) > far]
-    row, found = (worse or contest.worse)[0]
-    does = "errs" if over_seeds or contest.metric == HELD_OUT else "drifts"
-    return f"; {row.estimator} ({_with_unit(contest, row)}) {does} {advantage_text(found)} as much"
-
-
-def _with_unit(contest: Contest, row: Row) -> str:
-    return f"{number(row.value(contest.metric) or 0.0)} {metrics_called((contest.metric,))[0].unit}"
+        given = f"{number(first.value)} to {value_of(leaders[-1])}"
+        text = f"No clear winner between {listed(contest.leaders)} ({metric.column} {given}, {runs})"
+    # The next one that is worse by more than chance, if possible one that is not nearly as good.
+    worse = [one for one in others if one not in leaders]
+    next_one = next((one for one in worse if one.value > _NEAR * first.value), worse[0] if worse else None)
+    if next_one is None or next_one.ratio is None or next_one.interval is None:
+        return f"{text}."
+    does = "errs" if contest.metric == HELD_OUT or contest.by == "seeds" else "drifts"
+    low, high = map(number, next_one.interval)
+    factor = f"{number(next_one.ratio)} times ({100 * CONFIDENCE:.0f} %: {low} to {high})"
+    return f"{text}; {next_one.estimator} ({value_of(next_one)}) {does} {factor} as much."
 
 
 def _limits(contest: Contest) -> str:

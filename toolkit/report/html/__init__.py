@@ -1,8 +1,7 @@
 """The report as one HTML file that opens from disk: what run directories hold, laid side by side.
 
-Reading order: payload (what is shown of what :mod:`toolkit.report.run_directory` reads) with highlights (who is
-best) -> :func:`page_text` (one file made of page.html, style.css and the scripts in ``scripts``): nothing is fetched,
-and no text of a recording is code.
+Reading order: payload (what is shown of what :mod:`toolkit.report.run_directory` reads) -> :func:`page_text` (one file
+made of page.html, style.css and the scripts in ``scripts``): nothing is fetched, and no text of a recording is code.
 """
 
 import html

@@ -6,24 +6,24 @@ recording's points, as many as a screen can show, to keep the file small.
 
 import base64
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from msgspec import UNSET, to_builtins
 from msgspec.structs import asdict
 
-from toolkit.files.documents import number, numbers
+from toolkit.files import documents
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report import curves
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import look_numbers
-from toolkit.report.html.highlights import highlights
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
-from toolkit.report.text import unit_of
+from toolkit.report.text import listed, number, unit_of
+from toolkit.report.verdict import ContestRecord, contest_text
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -33,6 +33,15 @@ _MOST_OF_COMPONENTS = 400
 _MOST_LANDMARKS = 5000
 _MILLIMETRES = 3
 _LARGE_M = 1e7
+_TITLES = {
+    "accuracy at each frame": "Most accurate at each frame (causal)",
+    "accuracy in the end": "Most accurate in the end (final)",
+    "withheld tracks": "Best on withheld tracks",
+}
+_UNDECIDED = "no clear winner"
+_COST = "frame_cpu_ms_mean"
+# The processor time of one run scatters: nobody is called faster by less than this factor.
+_FASTER = 1.5
 
 
 def payload_of(runs: Sequence[Files]) -> Json:
@@ -274,6 +283,53 @@ def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
     }
 
 
+def highlights(contests: Sequence[ContestRecord], rows: Sequence[Json], runs: str) -> list[dict[str, str | None]]:
+    """Return the answers a reader looks for first: a question, the answer, its row or None, and why.
+
+    A contest's winner is the one that its document names; a row with a mark wins nothing. ``rows`` are those of the
+    page's table; ``runs`` says over how many runs a contest is, as in "one run".
+    """
+    found = []
+    for contest in contests:
+        outputs = (contest.rivals[0].output, "both")
+        first = contest.rivals[0].estimator
+        row = next((row for row in rows if row["estimator"] == first and row["output"] in outputs), None)
+        undecided = "no winner" if len(contest.leaders) == 1 else _UNDECIDED
+        found.append(
+            {
+                "question": _TITLES[contest.question],
+                "answer": contest.winner or undecided,
+                "row": None if row is None or contest.winner is None else row["id"],
+                "detail": contest_text(contest, runs, "" if row is None else row["mark"]),
+            }
+        )
+    return [*found, *_uncertainty(rows), *_fastest(rows)]
+
+
+def _uncertainty(rows: Sequence[Json]) -> Iterator[dict[str, str | None]]:
+    """Yield whose stated uncertainty can be trusted, where any is tested; that is no contest."""
+    tested = [row for row in rows if row["judged"]]
+    if tested:
+        sound = [row["estimator"] for row in tested if not row["mark"] and row["good"]]
+        marked = [f"{row['estimator']} is {row['mark']}" for row in tested if row["mark"]]
+        answer = listed(sound) if sound else "nobody's"
+        yield {"question": "Stated uncertainty to trust", "answer": answer, "row": None, "detail": listed(marked)}
+
+
+def _fastest(rows: Sequence[Json]) -> Iterator[dict[str, str | None]]:
+    """Yield who takes the least processor time, of the rows that ended well without a mark."""
+    able = [row for row in rows if row["good"] and not row["mark"] and row["metrics"].get(_COST) is not None]
+    cost_of: dict[str, float] = {row["estimator"]: row["metrics"][_COST] for row in able}
+    if len(cost_of) < 2:
+        return
+    (name, cost), (other, next_cost), *_ = sorted(cost_of.items(), key=lambda pair: pair[1])
+    detail = f"{number(cost)} ms of processor time a frame; next: {other}, {number(next_cost)} ms"
+    row = next(row["id"] for row in able if row["estimator"] == name)
+    if next_cost < _FASTER * cost:
+        name, row = _UNDECIDED, None
+    yield {"question": "Fastest", "answer": name, "row": row, "detail": detail}
+
+
 def evenly(count: int, most: int) -> IntArray:
     """Return at most ``most`` indices (n,) of 0 ... count - 1, evenly spread, the first and the last among them."""
     if count <= most:
@@ -306,7 +362,7 @@ def thinned(series: Mapping[str, Sequence[float | None]], leading: str) -> dict[
 
 def running_median(values: Sequence[float | None]) -> list[float | None]:
     """Return the median of the known values around each; None where there are none."""
-    return list(numbers(curves.running_median(_as_array(values))))
+    return list(documents.numbers(curves.running_median(_as_array(values))))
 
 
 def _as_array(values: Sequence[float | None]) -> Array:
@@ -320,4 +376,4 @@ def coordinates(points: Array) -> dict[str, list[float | None]]:
 
 
 def _metres(value: float) -> float | None:
-    return round(value, _MILLIMETRES) if abs(value) < _LARGE_M else number(value)
+    return round(value, _MILLIMETRES) if abs(value) < _LARGE_M else documents.number(value)

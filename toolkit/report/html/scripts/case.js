@@ -29,7 +29,7 @@ function highlightTiles(one) {
     const pointing = row ? { onpointerenter: () => pointAt(keyOf(row)), onpointerleave: () => pointAt(null) } : {};
     return el("div", { class: "tile", ...pointing },
       el("span", { class: "question", text: tile.question }), el("b", {}, row ? swatch(row) : null, tile.answer),
-      el("span", { text: tile.detail }), el("span", { class: "fine", text: tile.next }));
+      el("span", { text: tile.detail }));
   }));
 }
 
