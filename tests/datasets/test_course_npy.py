@@ -103,14 +103,6 @@ def test_where_the_camera_is_decides_between_readings_that_look_the_same_way(tmp
     assert "during rotation the camera's velocity is" in reported
 
 
-def test_kept_the_convention_is_reported_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:
-    path = saved(tmp_path, course_dict(drive(), "inverted, camera axes regular"))
-    audited = audit(load_sequence(str(path)), keep=frozenset({"extrinsic-convention", "mixed-axes"}))
-    assert any(finding.fault == "extrinsic-convention" and finding.blocking for finding in audited.findings)
-    given = se3_inverse(read_dict(path)["extL_T_imu"])
-    np.testing.assert_array_equal(audited.sequence.rig.T_imu_cam, given)
-
-
 def test_without_sightings_the_convention_is_not_decidable(tmp_path: Path, small: dict[str, Any]) -> None:
     del small["features"]
     sequence = load_sequence(str(saved(tmp_path, small)))

@@ -41,17 +41,6 @@ def test_exchanged_axes_of_a_path_in_space_are_named(words: str) -> None:
         check_axes("run.tum", truth, file)
 
 
-def test_exchanged_axes_of_a_drive_on_a_plane_show_by_its_orientations() -> None:
-    truth, estimate = of("drive", 30.0)
-    assert exchanged(truth, exchange_of("y and z exchanged (positions alone)").reread(estimate)) == (
-        "y and z exchanged (positions alone)"
-    )
-
-
-def exchange_of(words: str) -> Exchange:
-    return next(one for one in exchanges() if one.description == words)
-
-
 @pytest.mark.parametrize(("scenario", "duration_s"), [("flight", 8.0), ("drive", 8.0), ("drive", 30.0)])
 def test_sound_poses_of_any_body_and_world_are_not_accused(scenario: str, duration_s: float) -> None:
     truth, estimate = of(scenario, duration_s)

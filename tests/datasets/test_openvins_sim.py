@@ -1,7 +1,6 @@
 """Exports of the OpenVINS simulator: conventions, cuts, and malformed ones."""
 
 import gzip
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from toolkit.geometry import se3_inverse, transform
 from toolkit.measurements import NS_PER_S, ImuNoise
 from toolkit.models.stereo import project, triangulate
 from toolkit.motion_samples import ImuSamples
-
-Refused = Callable[..., None]
 
 
 @pytest.mark.parametrize(
@@ -84,64 +81,3 @@ def test_gzipped_tables_are_the_same_recording(openvins: Path) -> None:
         table.with_suffix(".csv.gz").write_bytes(gzip.compress(table.read_bytes()))
         table.unlink()
     assert load_sequence(str(openvins)).content_hash() == plain
-
-
-def test_an_export_without_truth_has_none(openvins: Path) -> None:
-    (openvins / "truth_cam.csv").unlink()
-    assert load_sequence(str(openvins)).truth is None
-
-
-def edit_calibration(folder: Path, edit: Callable[[dict[str, object]], object]) -> None:
-    calibration = json.loads((folder / "calib.json").read_text())
-    edit(calibration)
-    (folder / "calib.json").write_text(json.dumps(calibration))
-
-
-def replace_in(folder: Path, name: str, old: str, new: str) -> None:
-    path = folder / name
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new, 1))
-
-
-def keep_lines(folder: Path, name: str, count: int) -> None:
-    lines = (folder / name).read_text().splitlines(keepends=True)
-    (folder / name).write_text("".join(lines[:count]))
-
-
-def remove(folder: Path, *names: str) -> None:
-    for name in names:
-        (folder / name).unlink()
-
-
-def truncated_gzip(folder: Path) -> None:
-    content = gzip.compress((folder / "imu.csv").read_bytes())
-    (folder / "imu.csv").write_bytes(content[: len(content) // 2])
-
-
-MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no tables", lambda d: remove(d, "imu.csv", "features.csv"), "missing imu.csv, features.csv"),
-    ("no calibration", lambda d: (d / "calib.json").unlink(), "missing calib.json"),
-    ("no noise", lambda d: edit_calibration(d, lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
-    ("broken json", lambda d: (d / "calib.json").write_text('{"cam0": '), "not valid JSON"),
-    ("json list", lambda d: (d / "calib.json").write_text('["cam0"]'), "holds a JSON list"),
-    ("null", lambda d: edit_calibration(d, lambda c: c.update(pixel_noise_sigma=None)), "pixel_noise_sigma holds"),
-    ("ragged", lambda d: edit_calibration(d, lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds"),
-    ("not rectified", lambda d: replace_in(d, "calib.json", '"k1": 0', '"k1": 0.1'), "not a rectified pair"),
-    ("no column", lambda d: replace_in(d, "features.csv", "uL,vL", "u,v"), "missing column uL, vL"),
-    ("not numeric", lambda d: replace_in(d, "features.csv", "300", "many"), "features.csv: .*'many'"),
-    ("no track id", lambda d: replace_in(d, "features.csv", ",7,", ",nan,"), "row 1 has no frame or feature_id"),
-    ("truncated row", lambda d: replace_in(d, "imu.csv", "0.1,0.2,0.3,1,2,9.8\n", "0.1\n"), "imu.csv: .*truncated"),
-    ("truncated gzip", truncated_gzip, "damaged or truncated gzip"),
-    ("no samples", lambda d: (d / "imu.csv").write_text("timestamp,gx,gy,gz,ax,ay,az\n"), "no samples"),
-    ("no truth rows", lambda d: keep_lines(d, "truth_cam.csv", 1), "truth_cam.csv: holds no poses"),
-    ("zero quaternion", lambda d: replace_in(d, "truth_cam.csv", ",1,1,0", ",1,0,0"), "line 3 has a quaternion"),
-    ("one frame", lambda d: keep_lines(d, "features.csv", 5), r"1 frame\(s\)"),
-]
-
-
-@pytest.mark.parametrize(("spoil", "message"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
-def test_a_malformed_export_gets_one_line_naming_the_file(
-    openvins: Path, spoil: Callable[[Path], object], message: str, assert_refused: Refused
-) -> None:
-    spoil(openvins)
-    assert_refused(lambda: load_sequence(str(openvins)), openvins, message)

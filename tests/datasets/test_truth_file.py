@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.datasets import course_npz
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
@@ -28,7 +27,6 @@ from toolkit.models.noise import pixel_covariance
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
-Refused = Callable[..., None]
 COUNT, STEP_S, START_S = 200, 0.1, 1.4e9
 FORWARD_MPS, LEFT_TURN_RADPS = 10.0, 0.3
 NOBODY = np.empty(0, dtype=np.int64)
@@ -69,19 +67,6 @@ def recording(gyro_radps: Array, start_s: float = START_S) -> Sequence:
         motion=ImuSamples(t_ns, np.zeros((COUNT, 3)), gyro_radps),
         provenance=Provenance("test", "made"),
     )
-
-
-def test_poses_survive_a_file(tmp_path: Path) -> None:
-    truth = load_truth(written(tmp_path, table(drive())))
-    # nine decimals
-    np.testing.assert_allclose(truth.T_world_imu, drive(), atol=2e-8)
-    np.testing.assert_allclose(truth.t_ns, 1.4e18 + 1e8 * np.arange(COUNT), atol=256.0, rtol=0.0)
-
-
-def test_blank_lines_and_comments_are_skipped(tmp_path: Path) -> None:
-    path = tmp_path / "truth.tum"
-    path.write_text("# a comment\n\n1.0 0 0 0 0 0 0 1  # the first\n2.0 1 0 0 0 0 0 1\n")
-    np.testing.assert_array_equal(load_truth(path).t_ns, [1_000_000_000, 2_000_000_000])
 
 
 @pytest.mark.parametrize("name", ["ucsd/gt/0027.tum", "kitti00/gt_imu.tum"])
@@ -143,64 +128,6 @@ def test_a_gyro_with_gaps_and_reversed_stamps_still_takes_a_truth() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "unit"),
-    [(1e9, "nanoseconds: divide by 1e9"), (1e6, "microseconds: divide by 1e6"), (1e3, "milliseconds: divide by 1e3")],
-)
-@pytest.mark.parametrize("start_s", [START_S, 0.0])
-def test_stamps_in_another_unit_are_named(tmp_path: Path, scale: float, unit: str, start_s: float) -> None:
-    rows = table(drive())
-    rows[:, 0] = scale * (rows[:, 0] - START_S + start_s)
-    with pytest.raises(DataError, match=f"look like {unit}"):
-        load_truth(written(tmp_path, rows))
-
-
-def edited(line: int, column: int, value: float) -> Array:
-    rows = table(drive())
-    rows[line, column] = value
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (edited(3, 2, np.nan), "line 5 holds a value that is not finite"),
-        (edited(3, 0, np.nan), r"time\[3\] is nan"),
-        (edited(3, 0, START_S), "line 5 is not later than the line before it"),
-        (edited(3, 0, START_S + 0.2), "line 5 is not later than the line before it"),
-        (edited(3, 7, 3.0), "line 5 has a quaternion that is not of unit length"),
-        (table(drive())[:, :7], "line 2 has 7 columns, expected 8"),
-    ],
-)
-def test_a_malformed_line_is_named(tmp_path: Path, rows: Array, message: str, assert_refused: Refused) -> None:
-    path = written(tmp_path, rows)
-    assert_refused(lambda: load_truth(path), path, message)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "holds no poses"),
-        (b"# only a comment\n", "holds no poses"),
-        (b"1.0,0,0,0,0,0,0,1\n", "separated by blanks, not commas"),
-        (b"1.0 0 0 0 0 0 0 one\n", "line 1 is not numeric"),
-        (b"\xff\xfe\x00\x80", "not a text file"),
-    ],
-)
-def test_a_file_that_is_no_tum_file_is_refused(
-    tmp_path: Path, content: bytes, message: str, assert_refused: Refused
-) -> None:
-    path = tmp_path / "truth.tum"
-    path.write_bytes(content)
-    assert_refused(lambda: load_truth(path), path, message)
-
-
-@pytest.mark.parametrize("name", ["absent.tum", ""], ids=["a missing file", "a folder"])
-def test_what_cannot_be_read_is_refused(tmp_path: Path, name: str, assert_refused: Refused) -> None:
-    path = tmp_path / name
-    assert_refused(lambda: load_truth(path), path, "cannot be read")
-
-
-@pytest.mark.parametrize(
     ("shift_s", "cause"),
     [
         (-START_S, r"counts from its own start: add 1400000000.000 s"),
@@ -214,11 +141,6 @@ def test_truth_without_overlap_names_both_ranges_and_the_cause(shift_s: float, c
     with pytest.raises(DataError, match=cause) as raised:
         with_truth(sequence, Truth(t_ns, drive()))
     assert "1400000000.000 .. 1400000019.900 s" in str(raised.value)
-
-
-def test_truth_of_another_real_drive_does_not_overlap(real: Callable[[str], Path]) -> None:
-    with pytest.raises(DataError, match="do not overlap"):
-        with_truth(course_npz.load(real("ucsd/03.npz")), load_truth(real("kitti00/gt_imu.tum")))
 
 
 @pytest.mark.parametrize(("whole", "remedy"), [(False, "conjugate them"), (True, "invert each one")])

@@ -16,7 +16,6 @@ from toolkit.models.stereo import project, triangulate
 from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 
-Refused = Callable[..., None]
 DRIVES = [
     ("2011_09_26_drive_0001_sync_KLT", 108, 707, 10501),
     ("2011_09_26_drive_0005_sync_KLT", 154, 911, 13908),
@@ -75,16 +74,6 @@ def test_indoor_twist_errors_have_the_stated_variances_under_the_stated_pairing(
     np.testing.assert_allclose((error_mps**2).mean(axis=0), scipy.io.loadmat(path)["v_var"][:, 0], rtol=0.05)
 
 
-def test_truth_is_independent_only_where_variances_were_measured(utias: dict[str, Any], tmp_path: Path) -> None:
-    drive = utias_mat.load(written(tmp_path, utias))
-    variances = {key: np.full((3, 1), 0.04) for key in ("v_var", "w_var")} | {"y_var": np.arange(1.0, 5.0)[:, None]}
-    indoors = utias_mat.load(written(tmp_path, utias | variances))
-    assert drive.truth is not None
-    assert indoors.truth is not None
-    assert not drive.truth.independent
-    assert indoors.truth.independent
-
-
 def test_measured_variances_become_densities_over_the_median_step(utias: dict[str, Any], tmp_path: Path) -> None:
     variances = {key: np.full((3, 1), 0.04) for key in ("v_var", "w_var")} | {"y_var": np.arange(1.0, 5.0)[:, None]}
     sequence = utias_mat.load(written(tmp_path, utias | variances))
@@ -94,43 +83,6 @@ def test_measured_variances_become_densities_over_the_median_step(utias: dict[st
     np.testing.assert_array_equal(sequence.rig.cov_uv_px2, np.diag([1.0, 3.0, 3.0]))
 
 
-def test_the_camera_sits_at_rho_and_looks_along_the_third_row_of_c(utias: dict[str, Any], tmp_path: Path) -> None:
-    T_imu_cam = utias_mat.load(written(tmp_path, utias)).rig.T_imu_cam
-    np.testing.assert_array_equal(T_imu_cam[:3, 3], [1.0, 0.2, 0.3])
-    np.testing.assert_array_equal(T_imu_cam[:3, 2], [1.0, 0.0, 0.0])
-
-
-def test_twists_and_truth_are_cut_at_the_last_frame(utias: dict[str, Any], tmp_path: Path) -> None:
-    sequence = utias_mat.load(written(tmp_path, utias))
-    assert sequence.truth is not None
-    assert sequence.frame_count == sequence.motion.t_ns.size == sequence.truth.t_ns.size == 4
-
-
-MALFORMED: list[tuple[str, dict[str, Any], str]] = [
-    ("short twist", {"v_vk_vk_i": np.ones((3, 3))}, "v_vk_vk_i has 3 columns for 4 stamps"),
-    ("wrong features", {"y_k_j": np.ones((4, 9, 3))}, "y_k_j has shape"),
-    ("one frame", {"t": np.zeros((1, 1)), "y_k_j": np.ones((4, 1, 3))}, r"1 frame\(s\)"),
-    ("cells", {"t": np.array([{}, []], dtype=object)}, "t holds objects"),
-    ("text", {"fu": "wide"}, "fu holds"),
-    ("NaN truth", {"r_i_vk_i": np.full((3, 6), np.nan)}, "r_i_vk_i is not finite"),
-    ("no rotation", {"C_c_v": np.ones((3, 3))}, "C_c_v is not a rotation"),
-]
-
-
-@pytest.mark.parametrize(("spoiled", "message"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
-def test_a_malformed_recording_gets_one_line_naming_file_and_field(
-    utias: dict[str, Any], tmp_path: Path, spoiled: dict[str, Any], message: str, assert_refused: Refused
-) -> None:
-    path = written(tmp_path, utias | spoiled)
-    assert_refused(lambda: load_sequence(str(path)), path, message)
-
-
-def test_missing_variables_are_all_listed(utias: dict[str, Any], tmp_path: Path) -> None:
-    del utias["theta_vk_i"], utias["b"]
-    with pytest.raises(DataError, match="missing theta_vk_i, b; it has C_c_v"):
-        load_sequence(str(written(tmp_path, utias)))
-
-
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
 def test_a_truncated_file_is_refused(utias: dict[str, Any], tmp_path: Path, share: float) -> None:
     path = written(tmp_path, utias)
@@ -138,15 +90,6 @@ def test_a_truncated_file_is_refused(utias: dict[str, Any], tmp_path: Path, shar
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(DataError):
         load_sequence(str(path))
-
-
-def test_a_file_that_only_has_the_name_of_a_matlab_file_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "text.mat"
-    path.write_text("not a matrix")
-    with pytest.raises(DataError, match="of no known format"):
-        load_sequence(str(path))
-    with pytest.raises(DataError, match="not a whole Matlab file"):
-        utias_mat.load(path)
 
 
 def test_matlab_7_3_is_refused_with_the_remedy(tmp_path: Path) -> None:

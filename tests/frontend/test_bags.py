@@ -295,14 +295,6 @@ def test_the_roles_offered_are_those_there_are() -> None:
     assert tuple(ROLES) == TOPIC_ROLES
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str) -> None:
-    path = written(asl, kind, tmp_path / "bag", film_of(asl, Ros.of(kind)))
-    file = path if kind == "ros1" else next(path.glob("*.mcap"))
-    shutil.move(file, tmp_path / "bag/download")
-    assert len(load_sequence(str(tmp_path / "bag/download")).observations) > 0
-
-
 @pytest.mark.parametrize(
     ("left_out", "pattern"),
     [
@@ -423,13 +415,6 @@ def test_images_that_are_rectified_already_are_found_by_their_rows(plain: Any, a
     assert any(fact.startswith("the images are rectified already") for fact in bag.provenance.facts)
 
 
-def zeroed(_ros: Ros, film: list[Item]) -> list[Item]:
-    for item in film:
-        if "image" in item.topic:
-            item.value.header.stamp.sec = item.value.header.stamp.nanosec = 0
-    return film
-
-
 def on_another_clock(_ros: Ros, film: list[Item]) -> list[Item]:
     for item in film:
         if "image" in item.topic:
@@ -478,13 +463,6 @@ def test_what_does_not_belong_together_is_reported_in_one_line(
     with pytest.raises(DataError, match=pattern) as raised:
         load_sequence(str(ros.write(tmp_path / "film.bag", edit(ros, bare(ros, asl)))))
     assert "\n" not in str(raised.value)
-
-
-def test_where_images_have_no_stamp_it_is_when_they_were_recorded(asl: Path, tmp_path: Path) -> None:
-    ros = Ros.of("ros1")
-    bag = load_sequence(str(ros.write(tmp_path / "film.bag", zeroed(ros, bare(ros, asl)))))
-    np.testing.assert_array_equal(bag.frames_t_ns, load_sequence(str(asl)).frames_t_ns)
-    assert "20 images have no stamp, and the time of recording is used" in bag.provenance.facts
 
 
 def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Path, tmp_path: Path) -> None:
@@ -569,17 +547,6 @@ def test_a_damaged_bag_is_read_or_refused_in_one_line(asl: Path, tmp_path: Path,
             assert str(file) in str(raised.value)
 
 
-def test_an_odometer_of_a_truths_name_is_offered_and_not_taken_unasked(asl: Path, tmp_path: Path) -> None:
-    ros = Ros.of("sqlite")
-    film = [item for item in bare(ros, asl) if item.topic not in ("/imu0", "/ground_truth/pose")]
-    odometry = ros.odometry(film[0].t_ns, [0.0] * 6 + [1.0], [1.0, 0.0, 0.0], [0.0] * 3)
-    path = ros.write(tmp_path / "odom", [*film, odometry._replace(topic="/vicon/odom")])
-    with pytest.raises(
-        DataError, match=r"nothing measures the motion; name one with --topics twist=TOPIC \(/vicon/odom"
-    ):
-        load_sequence(str(path))
-
-
 @pytest.mark.parametrize(("kept", "pattern"), [(0.5, "damaged or truncated"), (0.0, "it is empty")])
 def test_images_that_cannot_be_used_are_reported_with_their_topic(
     asl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: float, pattern: str
@@ -599,28 +566,6 @@ def test_images_that_cannot_be_used_are_reported_with_their_topic(
         assert f"{path}: /cam0/image_raw/compressed: 10 of 10 image pairs cannot be used" in printed
         assert pattern in printed
         assert str(tmp_path) not in printed.replace(str(path), "")
-
-
-def test_an_empty_image_is_left_out_and_named(asl: Path, tmp_path: Path) -> None:
-    ros = Ros.of("ros1")
-    film = [item for item in bare(ros, asl) if not item.topic.endswith("image_raw")]
-    images = list(images_of(asl, lambda t_ns, camera, path: ros.compressed(t_ns, camera, path.read_bytes())))
-    images[3].value.data = images[3].value.data[:0]
-    bag = load_sequence(str(ros.write(tmp_path / "film.bag", [*film, *images])))
-    assert bag.frame_count == 9
-    assert any(
-        "1 of 10 image pairs could not be used" in fact and "it is empty" in fact for fact in bag.provenance.facts
-    )
-
-
-def test_a_compression_that_the_library_does_not_know_is_no_damage(asl: Path, tmp_path: Path) -> None:
-    path = Ros.of("ros1").write(tmp_path / "film.bag", bare(Ros.of("ros1"), asl))
-    path.write_bytes(path.read_bytes().replace(b"compression=none", b"compression=lzma"))
-    with pytest.raises(
-        DataError, match=r"rosbags does not read such a bag \(Compression 'lzma' is not supported"
-    ) as refusal:
-        load_sequence(str(path))
-    assert "copy it again" not in str(refusal.value)
 
 
 def test_a_bag_that_breaks_off_leaves_nothing_behind(

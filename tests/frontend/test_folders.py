@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.cli import main
 from toolkit.datasets import is_drawn_from_a_seed, load_sequence
 from toolkit.datasets.io.euroc_calibration import read_calibration
 from toolkit.datasets.io.image_pairs import pairs_of_asl
@@ -41,12 +40,6 @@ def test_images_are_the_default_where_they_are_there(asl: Path) -> None:
     assert load_sequence(str(asl), 5).content_hash() == sequence.content_hash()
 
 
-def test_simulated_tracks_are_those_requested(asl: Path) -> None:
-    simulated = Frontend(tracks="simulated")
-    assert load_sequence(str(asl), 0, simulated).name == "film (simulated stereo)"
-    assert is_drawn_from_a_seed(str(asl), simulated)
-
-
 def test_a_folder_with_few_of_its_images_has_its_tracks_simulated_and_says_so(asl: Path) -> None:
     for path in images(asl, 1)[:4]:
         path.unlink()
@@ -55,11 +48,6 @@ def test_a_folder_with_few_of_its_images_has_its_tracks_simulated_and_says_so(as
     assert facts[-1].startswith("60.0 % of the camera's stamps have both images")
     sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))
     assert sequence.frame_count == FRAMES - 4
-
-
-def test_images_can_do_without_a_truth(asl: Path) -> None:
-    (asl / "truth.tum").unlink()
-    assert load_sequence(str(asl)).truth is None
 
 
 def test_the_rig_is_the_rectified_one_as_it_is_mounted(asl: Path) -> None:
@@ -112,11 +100,6 @@ def test_damaged_tracks_on_disk_are_made_again(asl: Path, own_cache: Path) -> No
     (kept,) = (own_cache / "tracks").iterdir()
     kept.write_bytes(kept.read_bytes()[:500])
     assert load_sequence(str(asl)).content_hash() == first
-
-
-def test_a_disk_that_takes_no_tracks_is_no_error(asl: Path, own_cache: Path) -> None:
-    own_cache.write_text("a file where the folder should be")
-    assert load_sequence(str(asl)).frame_count == FRAMES
 
 
 def rewrite(path: Path, change: Callable[[Image], Any]) -> None:
@@ -176,20 +159,11 @@ def point_to_lfs(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
 
 
-def turn_extrinsic(path: Path) -> None:
-    """Turn a camera by a right angle about its optical axis, in its calibration alone."""
-    T_body_sensor, data = matrix_of(path)
-    T_body_sensor[:3, :3] = T_body_sensor[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    edit(path, data, ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel()))
-
-
 LEFT_OUT: list[tuple[str, Callable[[Path], object], str]] = [
     ("truncated", lambda d: images(d, 0)[7].write_bytes(images(d, 0)[7].read_bytes()[:900]), "damaged or truncated"),
     ("empty", lambda d: images(d, 1)[7].write_bytes(b""), "it is empty"),
     ("missing", lambda d: images(d, 1)[7].unlink(), "missing"),
     ("no image", lambda d: images(d, 0)[7].write_bytes(b"<html>"), "no image"),
-    ("smaller", lambda d: rewrite(images(d, 1)[7], lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
-    ("turned", lambda d: rewrite(images(d, 0)[7], np.rot90), "240x320 px, expected 320x240"),
     ("mispaired", lambda d: rewrite(images(d, 1)[7], lambda i: i[::-1]), "not of the same instant"),
 ]
 
@@ -211,9 +185,7 @@ def test_one_bad_image_is_named_and_left_out(asl: Path, spoil: Callable[[Path], 
 
 USED: list[tuple[str, Callable[[Path], object]]] = [
     ("colour", lambda d: [every(d, c, lambda i: cv2.merge([i, i, i])) for c in (0, 1)]),
-    ("one colour, one grey", lambda d: every(d, 0, lambda i: cv2.merge([i, i, i]))),
     ("16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)]),
-    ("12 of 16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 16) for c in (0, 1)]),
     ("8 against 16 bit", lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256)),
     ("rows backwards", lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)]),
     ("no table", lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)]),
@@ -229,14 +201,6 @@ def test_the_same_images_in_another_guise_give_the_same_tracks(asl: Path, change
     after = load_sequence(str(asl), 0, Frontend(tracks="images"))
     np.testing.assert_array_equal(after.observations.uv_px, before.observations.uv_px)
     np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
-
-
-def test_stamps_out_of_order_are_sorted_and_reported(asl: Path) -> None:
-    before = load_sequence(str(asl))
-    reverse_rows(asl / "mav0/cam0/data.csv")
-    after = load_sequence(str(asl))
-    np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
-    assert any("out of order" in fact for fact in after.provenance.facts)
 
 
 def test_a_left_image_without_a_right_one_is_reported(asl: Path) -> None:
@@ -285,42 +249,23 @@ def test_images_outside_the_time_of_the_imu_are_reported(asl: Path) -> None:
 YAML = "mav0/cam{}/sensor.yaml"
 REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("folders exchanged", lambda d: exchange(d / "mav0/cam0/data", d / "mav0/cam1/data"), "images are exchanged"),
-    ("cameras exchanged", lambda d: exchange(d / "mav0/cam0", d / "mav0/cam1"), "not to the right of cam0"),
-    ("yaml exchanged", lambda d: exchange(d / YAML.format(0), d / YAML.format(1)), "not to the right of cam0"),
-    ("no left yaml", lambda d: (d / YAML.format(0)).unlink(), "cam0/sensor.yaml: cannot be read"),
     ("no right yaml", lambda d: (d / YAML.format(1)).unlink(), "cam1/sensor.yaml: cannot be read"),
-    ("no imu", lambda d: (d / "mav0/imu0/data.csv").unlink(), "imu0/data.csv.*cannot be read"),
     ("no imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "imu0/sensor.yaml: cannot be read"),
-    ("empty imu", lambda d: (d / "mav0/imu0/data.csv").write_text(""), "imu0/data.csv: missing column"),
     ("other model", lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
     ("other lens", lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
-    ("few numbers", lambda d: edit(d / YAML.format(1), "[-0.28, ", "["), "has 3 values, expected 4 or 5"),
     ("no focal", lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
     ("other size", lambda d: edit(d / YAML.format(1), "[320, 240]", "[640, 480]"), "a pair needs one size"),
-    ("both other size", lambda d: [edit(d / YAML.format(c), "[320, 240]", "[640, 480]") for c in (0, 1)], "320x240 px"),
     ("mirrored pose", lambda d: edit(d / YAML.format(0), "[0, 0, 1,", "[0, 0, -1,"), "a reflection|not a rotation"),
-    ("cut yaml", lambda d: (d / YAML.format(0)).write_text("T_BS:\n  data: [1, 2"), "no YAML, or truncated"),
-    ("no yaml", lambda d: (d / YAML.format(0)).write_bytes(b"\x89PNG\r\n\x1a\n\xff"), "not a text file"),
     ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
     ("all black", lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
     ("all of another size", lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
-    ("no left images", lambda d: shutil.rmtree(d / IMAGES.format(0)), "cam1/data has images and .*cam0/data has none"),
     ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam0/data has images and .*cam1/data has none"),
-    ("no extrinsic", lambda d: edit(d / YAML.format(1), "T_BS", "T_SB"), "T_BS"),
-    ("one turned", lambda d: turn_extrinsic(d / YAML.format(1)), "deg apart|not to the right of cam0"),
-    ("empty imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").write_text("%YAML:1.0\n"), "imu0/sensor.yaml"),
     ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "two clocks"),
     ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
     ("stamps in seconds", lambda d: edit(d / "mav0/cam0/data.csv", "\n14", "\n1.4"), "not in whole nanoseconds"),
     ("wrong tilt", lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
-    ("right turned", lambda d: [every(d, 1, lambda i: i[::-1, ::-1])], "the calibration is not that of these"),
     ("one yaml for both", lambda d: shutil.copy(d / YAML.format(0), d / YAML.format(1)), "stand at one place"),
     ("poses inverted", lambda d: [invert_extrinsic(d / YAML.format(c)) for c in (0, 1)], "the inverse of one: invert"),
-    (
-        "nine intrinsics",
-        lambda d: edit(d / YAML.format(0), ", 118.0]", ", 118.0, 0, 0, 0, 0, 1]"),
-        "has 9 values",
-    ),
     (
         "late trigger",
         lambda d: restamp(d / "mav0/cam1/data.csv", lambda t: t + 20_000_000),
@@ -346,66 +291,17 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
         lambda d: [shutil.copy(a, b) for a, b in zip(images(d, 0), images(d, 1), strict=True)],
         "left and right images are the same ones",
     ),
-    (
-        "all halved",
-        lambda d: [every(d, c, lambda i: i[::2, ::2]) for c in (0, 1)],
-        "expected 320x240.; where images were scaled, cut or turned, do the same to the calibration",
-    ),
 ]
 
 
 @pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in REFUSED], ids=[m[0] for m in REFUSED])
 def test_a_folder_that_cannot_be_used_is_one_clear_line(
-    asl: Path, spoil: Callable[[Path], object], complaint: str, capsys: pytest.CaptureFixture[str]
+    asl: Path, spoil: Callable[[Path], object], complaint: str
 ) -> None:
-    """From end to end: status 3, one line that names the fault, and nothing written."""
     spoil(asl)
-    before = sorted(asl.parent.iterdir())
-    requested = ("--tracks", "images", "--estimators", "dead-reckoning", "--out", str(asl.parent / "run"))
-    assert main(["compare", str(asl), *requested]) == 3
-    messages = capsys.readouterr().err
-    assert messages.startswith("vislam: error: ")
-    assert messages.count("\n") == 1
-    assert re.search(complaint, messages)
-    assert sorted(asl.parent.iterdir()) == before
-
-
-def test_there_are_forty_faulty_folders() -> None:
-    assert len(LEFT_OUT) + len(USED) + len(REFUSED) >= 40
-
-
-def test_the_commonest_fault_is_the_one_reported(asl: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    images(asl, 0)[0].write_bytes(b"")
-    for path in images(asl, 0)[1:]:
-        point_to_lfs(path)
-    assert main(["compare", str(asl), "--tracks", "images", "--out", str(asl.parent / "run")]) == 3
-    messages = capsys.readouterr().err
-    assert "git lfs pull" in messages
-    assert "it is empty" not in messages
-
-
-def test_of_a_recording_with_few_of_its_images_these_are_used_where_requested(asl: Path) -> None:
-    for path in images(asl, 1)[2:9]:
-        path.unlink()
-    sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))
-    assert sequence.frame_count == FRAMES - 7
-    assert f"7 of {FRAMES} image pairs lack a file and are left out" in sequence.provenance.facts
-
-
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        (Frontend(epipolar_px=1e-9), "frontend.epipolar_px=1e-09 is too strict"),
-        (Frontend(forward_backward_px=1e-9), "frontend.forward_backward_px=1e-09 is too strict"),
-        (Frontend(nearest_m=100.0), "frontend.nearest_m=100 is too strict"),
-        (Frontend(patch_correlation=1 - 1e-9), "frontend.patch_correlation=0.999999999 is too strict"),
-    ],
-)
-def test_a_setting_that_finds_no_corner_in_the_right_images_is_named(
-    asl: Path, own_cache: Path, settings: Frontend, named: str
-) -> None:
-    with pytest.raises(DataError, match=re.escape(named)):
-        load_sequence(str(asl), 0, settings)
+    with pytest.raises(DataError, match=complaint) as raised:
+        load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert "\n" not in str(raised.value)
 
 
 def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
@@ -418,15 +314,6 @@ def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: 
         load_sequence(str(asl))
     with pytest.raises(DataError, match=r"none of the 10 image pairs .* is there, as 1403.*\.png in cam0/data"):
         load_sequence(str(asl), 0, Frontend(tracks="images"))
-
-
-def test_hidden_files_beside_images_are_no_images(asl: Path) -> None:
-    before = load_sequence(str(asl))
-    for camera in (0, 1):
-        (asl / f"mav0/cam{camera}/data.csv").unlink()
-        for path in images(asl, camera):
-            path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
-    np.testing.assert_array_equal(load_sequence(str(asl)).observations.uv_px, before.observations.uv_px)
 
 
 def kalibr(root: Path, rows: Callable[[int], str], model: str = "radtan") -> None:
