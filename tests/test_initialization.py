@@ -20,7 +20,7 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 from toolkit.simulation.scenes import Scene
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
 
-SEEDS = range(5)
+SEEDS = range(3)
 
 
 def unstarted(sequence: Sequence) -> Sequence:
@@ -53,19 +53,6 @@ def test_a_simulated_start_is_within_three_of_its_sigmas_and_small(scenario, til
     assert (np.abs(errors[observable]) < 3.0 * sigmas[observable]).all()
     assert np.linalg.norm(errors[:3]) < tilt_rad
     assert np.linalg.norm(errors[6:9]) < speed_mps
-
-
-@pytest.mark.parametrize("scenario", [DRIVE_IMU, FLIGHT], ids=["drive", "flight"])
-def test_the_starts_covariance_is_no_smaller_than_the_errors_it_makes(scenario):
-    """Normalised errors squared, meant to average 1 or less: the start counts the window for a ninth only."""
-    squares = []
-    for seed in SEEDS:
-        sequence = simulate(replace(scenario, duration_s=3.0), seed)
-        prior = start_from_measurements(unstarted(sequence))
-        observable = np.r_[6:15]
-        squares.append(np.square(errors_in_body(prior, sequence)[observable]) / np.diag(prior.cov)[observable])
-    # 45 squares of a normal variable average 1 +- 0.21.
-    assert np.mean(squares) < 1.6
 
 
 # Heading and position are the gauge; what is left of an error (15,) are two tilts, velocity and biases.

@@ -1,6 +1,5 @@
 """The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew has the same estimates."""
 
-import re
 from dataclasses import replace
 
 import gtsam
@@ -11,9 +10,8 @@ from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphExtension
-from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, X
 from toolkit.sequence import Sequence
@@ -25,16 +23,6 @@ from toolkit.simulation.faults import moving_vehicles
 def setup_of(sequence: Sequence) -> Setup:
     assert sequence.prior is not None
     return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-
-
-def answers(sequence: Sequence, rebuilt_at: int | None = None) -> list[Estimate]:
-    """Return fixed-lag's estimate at each frame, its tree built anew before one of them."""
-    estimator, estimates = FixedLag(setup_of(sequence), 0.5), []
-    for packet in sequence.packets():
-        if packet.index == rebuilt_at:
-            assert estimator._tree.rebuild().log == []
-        estimates.append(estimator.step(packet))
-    return estimates
 
 
 def position_of(window: FixedLagTree, k: int) -> Array:
@@ -72,18 +60,6 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
     assert np.linalg.norm(exact.atPoint3(X(7)) - start.atPoint3(X(7))) > 1.0
 
 
-def test_landmarks_that_the_past_ties_together_are_eliminated_a_dozen_in_a_clique():
-    """Nearly every such clique has nearly all that is left: copied in each, that costs more than the arithmetic."""
-    sequence = simulate(replace(DRIVE_IMU, duration_s=3.0), seed=0)
-    estimator = FixedLag(replace(setup_of(sequence), settings=Settings(outliers=POLICIES["none"])), 1.0)
-    for packet in sequence.packets():
-        estimator.step(packet)
-    cliques = [label.partition(":") for label in re.findall(r'label="(.*?)"', estimator._tree._isam.dot())]
-    eliminated_of_tied = [len(re.findall(r"l\d+", own)) for own, _, left in cliques if "l" in left]
-    assert len(eliminated_of_tied) > 3
-    assert set(eliminated_of_tied) == {12}
-
-
 def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_cholesky():
     """As with a good IMU after minutes: a clique of two such states is beyond the condition that GTSAM allows one."""
     window, stiff = FixedLagTree(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
@@ -100,21 +76,6 @@ def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_ch
     exact = start.retract(everything.linearize(start).optimizeDensely())
     # A condition of 1e12 leaves four digits of sixteen; the positions are some metres.
     np.testing.assert_allclose(position_of(window, 5), exact.atPoint3(X(5)), atol=1e-3)
-
-
-SCENARIOS = [
-    replace(s, duration_s=duration_s, camera=replace(s.camera, max_tracks=40))
-    for s, duration_s in ((DRIVE, 4.0), (DRIVE_IMU, 4.0), (FLIGHT, 2.0))
-]
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-def test_a_tree_built_anew_in_mid_run_leaves_every_later_answer_as_it_was(scenario):
-    """To rounding: a window's normal equations have a condition of up to 1e9, which leaves seven digits of a sigma."""
-    sequence = simulate(scenario, 0)
-    for one, other in zip(answers(sequence), answers(sequence, rebuilt_at=sequence.frame_count // 2), strict=True):
-        off = se3_log(se3_inverse(one.T_world_imu) @ other.T_world_imu)
-        assert (np.abs(off) < 1e-6 * np.sqrt(np.diagonal(one.cov)[:6])).all()
 
 
 @pytest.mark.parametrize(("tracks", "seed", "depth_m"), [(2, 1, 3.0), (3, 2, 8.0)])
@@ -182,19 +143,6 @@ def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
     ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 45 m of odometry that is good to 0.1 m: what vehicles take vision to is not more than a metre off.
     assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0
-
-
-def test_the_condition_of_a_landmark_shows_that_its_depth_is_unknown():
-    factors, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for i, sigma_m in ((1, 1.0), (2, 1e5)):
-        at.insert(L(i), np.zeros(3))
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, sigma_m]))
-        turned = gtsam.Rot3.Rx(0.5).matrix()
-        factors.add(gtsam.LinearContainerFactor(gtsam.JacobianFactor(L(i), turned, np.zeros(3), noise)))
-    conditions = indeterminate.landmark_conditions(factors, at)
-    assert conditions[L(1)] < 1.0 + 1e-9
-    assert conditions[L(2)] > indeterminate.MOST_CONDITION
-    assert indeterminate.undetermined(factors, at) == [L(2)]
 
 
 class BrokenOff:

@@ -1,7 +1,6 @@
 """The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is reported."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -11,7 +10,7 @@ from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.models import stereo
-from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate
 
@@ -59,22 +58,6 @@ def test_it_reaches_the_minimum_of_gtsams_own_optimizer(problem):
     assert solution.error == pytest.approx(reference.error(), rel=1e-6)
 
 
-def test_the_minimum_has_no_gradient(problem):
-    solution = solve(problem.graph, problem.start, EXACT)
-    keys = list(problem.start.keys())
-    gradient = problem.graph.linearize(solution.values).gradientAtZero()
-    steepest = max(np.abs(gradient.at(key)).max() for key in keys)
-    began = problem.graph.linearize(problem.start).gradientAtZero()
-    # Six orders below where it began; the rest is what the stopping rule leaves.
-    assert steepest < 1e-6 * max(np.abs(began.at(key)).max() for key in keys)
-
-
-def test_the_error_never_rises_with_more_iterations(problem):
-    errors = [solve(problem.graph, problem.start, Stopping(1e-12, n)).error for n in range(1, 8)]
-    assert all(later <= earlier for earlier, later in pairwise(errors))
-    assert errors[0] < problem.graph.error(problem.start)
-
-
 def test_stopped_early_it_says_that_it_has_not_converged(problem):
     solution = solve(problem.graph, problem.start, Stopping(1e-12, 1))
     assert not solution.converged
@@ -87,26 +70,10 @@ def test_a_start_at_the_minimum_converges_at_once(problem):
     assert solution.iterations == 1
 
 
-def test_the_start_is_left_as_it_was(problem):
-    before = problem.graph.error(problem.start)
-    solve(problem.graph, problem.start, Stopping())
-    assert problem.graph.error(problem.start) == before
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_start_that_is_not_a_number_is_refused(problem, bad):
     some_landmark = int(problem.packets[0].frame.track_ids[0])
     problem.start.update(L(some_landmark), np.array([bad, 0.0, 5.0]))
-    with pytest.raises(EstimatorError, match="not a number"):
-        solve(problem.graph, problem.start, Stopping())
-
-
-def test_a_measurement_that_is_not_a_number_is_refused(problem):
-    frame = problem.packets[0].frame
-    uvs_px = frame.uvs_px.copy()
-    uvs_px[0, 0] = np.nan
-    for factor in StereoFactors(problem.rig).of(replace(frame, uvs_px=uvs_px), 0):
-        problem.graph.add(factor)
     with pytest.raises(EstimatorError, match="not a number"):
         solve(problem.graph, problem.start, Stopping())
 
@@ -142,12 +109,3 @@ def test_a_direction_nothing_measures_is_left_alone():
     assert solution.converged
     assert solution.error == pytest.approx(0.0, abs=1e-12)
     assert np.abs(solution.values.atPose3(X(0)).matrix() - np.eye(4)).max() < 0.5
-
-
-def test_one_linear_step_solves_a_linear_problem():
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorVector(B(0), np.array([1.0, 2.0, 3.0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-2)))
-    start.insert(B(0), np.zeros(3))
-    solution = solve(graph, start, EXACT)
-    np.testing.assert_allclose(solution.values.atVector(B(0)), [1.0, 2.0, 3.0], atol=1e-6)
-    assert solution.converged

@@ -155,13 +155,6 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
     np.testing.assert_allclose(far.poses, near.poses, atol=1e-5)
 
 
-def test_what_is_lost_at_points_is_the_loss(scene):
-    poses, points, seen = scene
-    vision = Vision.at(poses, points, seen, CAMERA)
-    alone = [Vision.at(poses, points, seen.of_points(np.array([i])), CAMERA).losses.sum() for i in range(POINTS)]
-    np.testing.assert_allclose(vision.loss_of_points, alone, rtol=1e-12)
-
-
 @pytest.mark.parametrize("seed", [0, 2])
 def test_few_tracks_of_low_disparity_do_not_stall_it(run_estimator, seed):
     """Landmarks that overshot to behind cameras had refused every step of the window, and it drifted by 0.3 m."""

@@ -52,12 +52,6 @@ def test_joint_covariance_is_that_of_the_whole_information_matrix(tree, keys):
     np.testing.assert_allclose(joint_cov(tree, keys), expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_joint_covariance_is_that_of_gtsam_marginals(tree):
-    keys = [X(2), V(2), B(2)]
-    marginals = gtsam.Marginals(tree.getFactorsUnsafe(), tree.calculateBestEstimate())
-    np.testing.assert_allclose(joint_cov(tree, keys), joint_cov(marginals, keys), rtol=1e-9, atol=1e-12)
-
-
 def test_covariance_of_a_state_has_its_velocity_in_the_body_frame(tree):
     model = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
     keys = model.keys(1)

@@ -6,8 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from toolkit.estimate import Estimate
-from toolkit.geometry import se3_exp, se3_inverse, se3_log
+from toolkit.geometry import se3_exp
 from toolkit.measurements import Packet
 from toolkit.models.factors import joint_cov
 from toolkit.models.motion import motion_model, predicted
@@ -127,20 +126,3 @@ def gauge(belief: Belief) -> np.ndarray:
     if belief.layout.velocity is not None:
         directions[belief.layout.velocity, 3] = to_body @ np.cross(up, belief.v_world)
     return directions
-
-
-@each_motion
-def test_without_a_motion_a_belief_stays_as_it_is(scenario):
-    sequence, _ = recorded(scenario)
-    belief = some_belief(sequence)
-    assert predicted(belief, motion_model(sequence.noise, sequence.gravity_world), None) is belief
-
-
-@each_motion
-def test_a_belief_takes_over_what_an_estimate_states(scenario):
-    sequence, _ = recorded(scenario)
-    belief, other = some_belief(sequence), some_belief(sequence, seed=1)
-    assert belief.at(Estimate(0, other.T_world_imu)).bias is belief.bias
-    taken = belief.at(other.estimate(0))
-    assert np.abs(se3_log(se3_inverse(taken.T_world_imu) @ other.T_world_imu)).max() < 1e-15
-    np.testing.assert_array_equal(taken.cov, other.cov)

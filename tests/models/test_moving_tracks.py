@@ -156,10 +156,3 @@ def test_where_fewer_than_half_agree_none_is_refused():
     out, counts = checked(shifted(sequence, struck, off_px))
     assert counts.undecided_frames >= 1
     assert out[struck].mean() < 0.05
-
-
-def test_frames_without_tracks_are_no_hindrance():
-    sequence = simulated()
-    dark = (sequence.observations.frame > 10) & (sequence.observations.frame < 20)
-    out, _ = checked(replace(sequence, observations=sequence.observations.select(~dark)))
-    assert out.mean() < 0.005

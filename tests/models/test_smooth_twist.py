@@ -9,7 +9,7 @@ from toolkit.measurements import TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.models.twist import SmoothTwist, smooth_factor, twist_change_cov
+from toolkit.models.twist import SmoothTwist, smooth_factor
 
 NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
 DT_S = 0.1
@@ -121,10 +121,3 @@ def test_the_smoothers_factor_is_the_filters_model() -> None:
     cov = np.block([[marginal.at(i, j) for j in keys] for i in keys])
     # variances of 1e-4 to 1e2, one linearisation point
     np.testing.assert_allclose(model.estimate_cov(cov, end.T_world_imu[:3, :3]), end.cov, atol=1e-9, rtol=1e-7)
-
-
-def test_two_short_intervals_spread_as_one_long_one() -> None:
-    rest = Belief(SmoothTwist.layout, np.eye(4), np.zeros(3), np.zeros(6), np.zeros((12, 12)))
-    np.testing.assert_allclose(
-        predicted(predicted(rest)).cov[3:6, 3:6], twist_change_cov(NOISE, 2.0 * DT_S)[3:6, 3:6], rtol=1e-9
-    )

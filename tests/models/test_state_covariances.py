@@ -17,8 +17,7 @@ from toolkit.models.factors import L, X, joint_cov, linear_factor
 from toolkit.models.state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.models.twist import TwistModel
-from toolkit.settings import Settings, Window
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=5.0)}
 
@@ -71,12 +70,6 @@ def assert_marginals(cov: Array, expected: dict[int, Array]) -> None:
         np.testing.assert_allclose(cov[k] / np.outer(sigmas, sigmas), marginal / np.outer(sigmas, sigmas), atol=1e-6)
 
 
-@pytest.mark.parametrize("scenario", ["drive", "flight"])
-def test_every_state_of_a_run_has_gtsams_marginal(scenario, smoothed):
-    problem = smoothed(scenario)
-    assert_marginals(problem.run.final.cov, problem.marginals)
-
-
 @pytest.mark.parametrize(
     ("scenario", "refused", "most_tied"),
     [("drive", "_dissected", 5), ("flight", "_dissected", 5), ("drive", "_in_time", 50), ("flight", "_in_time", 50)],
@@ -89,33 +82,6 @@ def test_every_state_has_gtsams_marginal_in_any_order(scenario, refused, most_ti
     cov, log = problem.covariances()
     assert log == ()
     assert_marginals(cov, problem.marginals)
-
-
-@pytest.mark.parametrize(
-    ("scenario", "standing", "first"),
-    [("drive", 150, "_dissected"), ("drive", 5, "_in_time"), ("flight", 150, "_in_time")],
-)
-def test_the_order_of_time_comes_first_with_an_imu_and_where_landmarks_are_seen_for_long(
-    scenario, standing, first, smoothed, monkeypatch
-):
-    tried, problem = [], smoothed(scenario)
-    for name in ("_dissected", "_in_time"):
-        order = getattr(state_covariances, name)
-        monkeypatch.setattr(state_covariances, name, lambda *given, n=name, o=order: tried.append(n) or o(*given))
-    monkeypatch.setattr(state_covariances, "_STANDING", standing)
-    problem.covariances()
-    assert tried == [first]
-
-
-@pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
-def test_the_newest_state_of_a_window_that_never_leaves_has_the_batchs_covariance(scenario, run_estimator):
-    """Both linearised near the same values; the window keeps its Huber weights, so a quarter is allowed."""
-    sequence = simulate(replace(scenario, duration_s=1.5), 5)
-    never = Settings(window=Window(lag_s=2.0))
-    newest = run_estimator("fixed-lag", sequence, settings=never).causal.cov[-1]
-    smoothed = run_estimator("batch", sequence).final.cov[-1]
-    sigma_ratio = np.sqrt(np.diag(newest)[:6] / np.diag(smoothed)[:6])
-    np.testing.assert_allclose(sigma_ratio, 1.0, atol=0.25)
 
 
 def test_covariances_that_rounding_spoils_are_not_shown(run_estimator, monkeypatch):

@@ -47,7 +47,7 @@ def errors_of(sequence: Sequence) -> tuple[GapTwists, Array, Array]:
     return gaps, rms[0], rms[1]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_over_a_gap_a_noisy_twist_comes_closer_to_the_true_one_and_states_its_error(seed: int) -> None:
     sequence = gappy(seed, 6.0)
     gaps, measured, improved = errors_of(sequence)

