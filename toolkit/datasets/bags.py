@@ -20,12 +20,12 @@ from toolkit.datasets.io import bag_reader, ros_values
 from toolkit.datasets.io.bag_calibration import Mounted, Source, mounted, source_of
 from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Held, Message, Topic
 from toolkit.datasets.io.bag_topics import Chosen, choose
-from toolkit.datasets.io.fields import check_frame_count, observations
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_only, pairs_of_asl, rig_of
+from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
 from toolkit.datasets.io.truth import truth_near, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
-from toolkit.frontend import ImageRecording, StampedPair, matched_corners, track_images
+from toolkit.frontend import ImageRecording, StampedPair, matched_corners
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
@@ -70,22 +70,22 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
     try:
         with spool.errors_named():
             read = _read(path, frontend, spool, progress)
-            tracks = track_images(read.pairs, read.mounted.pair, frontend, progress)
+        filmed = ImageRecording(read.pairs, read.mounted.pair, spool)
+        seen = seen_in(path, filmed, read.mounted.T_imu_left, frontend, progress)
     finally:
         spool.close()
-    check_frame_count(path, tracks.t_ns.size)
     remarks = (*bag_reader.parts_beside(path), *read.remarks)
-    facts = (*facts_of(tracks, len(read.pairs)), *remarks, *read.chosen.facts, *read.mounted.facts)
+    facts = (*seen.facts, *remarks, *read.chosen.facts, *read.mounted.facts)
     sequence = Recording(
         name=path.resolve().stem,
-        rig=rig_of(read.mounted.pair, read.mounted.T_imu_left),
+        rig=seen.rig,
         noise=read.mounted.noise,
-        frames_t_ns=tracks.t_ns,
-        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
+        frames_t_ns=seen.frames_t_ns,
+        observations=seen.observations,
         motion=read.motion,
         provenance=Provenance("bags", f"{path}: stereo tracks from the images", facts),
     )
-    return sequence if read.truth is None else with_truth(sequence, truth_near(read.truth, tracks.t_ns))
+    return sequence if read.truth is None else with_truth(sequence, truth_near(read.truth, seen.frames_t_ns))
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,11 +20,10 @@ from toolkit.datasets.io.fields import (
     Fields,
     camera_matrix,
     check_frame_count,
-    observations,
     rectified_observations,
     stamps_ns,
 )
-from toolkit.datasets.io.image_pairs import facts_of, rig_of
+from toolkit.datasets.io.image_pairs import pinhole_of, seen_in
 from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
@@ -35,7 +34,6 @@ from toolkit.frontend import (
     StampedPair,
     already_rectified,
     rectified,
-    track_images,
 )
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
@@ -97,14 +95,11 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     try:
         pairs, size_px = _spooled(parts, spool, progress)
         pair = _pair(parts, size_px)
-        with spool.errors_named():
-            tracks = track_images(pairs, pair, frontend, progress)
+        T_imu_left = se3_inverse(parts.fields.rigid("extL_T_imu"))
+        seen = seen_in(path, ImageRecording(pairs, pair, spool), T_imu_left, frontend, progress)
     finally:
         spool.close()
-    check_frame_count(path, tracks.t_ns.size)
-    seen = observations(tracks.frame, tracks.track_id, tracks.corners_px)
-    rig = rig_of(pair, se3_inverse(parts.fields.rigid("extL_T_imu")))
-    return replace(_sequence(parts, rig, seen, facts_of(tracks, len(pairs))), frames_t_ns=tracks.t_ns)
+    return replace(_sequence(parts, seen.rig, seen.observations, seen.facts), frames_t_ns=seen.frames_t_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +148,7 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
 def _rig(parts: _Parts) -> StereoRig:
     left = camera_matrix(parts.path, "K_l", parts.fields.constant("K_l", 3, 3))
     T_imu_cam = se3_inverse(parts.fields.rigid("extL_T_imu"))
-    pinhole_px = (left[0, 0], left[1, 1], left[0, 2], left[1, 2])
-    return StereoRig(*pinhole_px, _baseline_m(parts.fields), T_imu_cam, pixel_covariance(2))
+    return StereoRig(*pinhole_of(left), _baseline_m(parts.fields), T_imu_cam, pixel_covariance(2))
 
 
 def _baseline_m(fields: Fields) -> float:
@@ -238,7 +232,7 @@ def _check_image(path: Path, key: str, image: Any) -> None:
 def _pair(parts: _Parts, size_px: tuple[int, int]) -> RectifiedPair:
     """Return the cameras as a rectified pair; where they differ in K alone, the images are made alike."""
     matrices = [camera_matrix(parts.path, key, parts.fields.constant(key, 3, 3)) for key in ("K_l", "K_r")]
-    left, right = (Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), "none", np.zeros(4), size_px) for K in matrices)
+    left, right = (Camera(pinhole_of(K), "none", np.zeros(4), size_px) for K in matrices)
     baseline_m = _baseline_m(parts.fields)
     if np.array_equal(matrices[0], matrices[1]):
         return already_rectified(left.pinhole_px, baseline_m, size_px)

@@ -24,22 +24,21 @@ from toolkit.datasets.io.euroc_calibration import (
     published,
     read_calibration,
 )
-from toolkit.datasets.io.fields import check_frame_count, observations
+from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import (
     check_both_cameras,
     check_one_clock,
     check_one_trigger,
-    facts_of,
     image_folder,
     images_in,
     pairs_of_asl,
-    rig_of,
+    seen_in,
 )
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
-from toolkit.frontend import ImageRecording, rectified, track_images
+from toolkit.frontend import ImageRecording, rectified
 from toolkit.geometry import Array
 from toolkit.measurements import StereoRig
 from toolkit.motion_samples import ImuSamples
@@ -127,11 +126,10 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     mav0 = _with_images(layout)
     imu, calibration = _imu(layout), read_calibration(layout.root, mav0)
     filmed, remarks = _filmed(layout, mav0, imu, calibration)
-    tracks = track_images(filmed.pairs, filmed.rig, frontend, progress)
-    check_frame_count(layout.root, tracks.t_ns.size)
+    seen = seen_in(layout.root, filmed, calibration.T_imu_left, frontend, progress)
     choice = find_truth(layout.root, mav0, imu)
     facts = (
-        *facts_of(tracks, len(filmed.pairs)),
+        *seen.facts,
         *remarks,
         *(() if choice is None else (choice.reason,)),
         *(calibration.source, calibration.noise_source),
@@ -139,13 +137,13 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     simulated = is_simulated(layout.root)
     sequence = Sequence(
         name=layout.root.name,
-        rig=rig_of(filmed.rig, calibration.T_imu_left),
+        rig=seen.rig,
         noise=calibration.noise,
-        frames_t_ns=tracks.t_ns,
-        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
+        frames_t_ns=seen.frames_t_ns,
+        observations=seen.observations,
         motion=imu,
         provenance=Provenance("euroc", f"{path}: {RENDERED if simulated else REAL}", facts),
-        truth=None if choice is None else truth_near(choice.truth, tracks.t_ns),
+        truth=None if choice is None else truth_near(choice.truth, seen.frames_t_ns),
     )
     return with_scene_errors(sequence) if simulated else sequence
 

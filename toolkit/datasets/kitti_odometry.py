@@ -12,23 +12,25 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.fields import stamps_ns
 from toolkit.datasets.io.image_pairs import (
     UNPACK_IMAGES,
     Listed,
     check_both_cameras,
     check_several_stamps,
-    facts_of,
+    first_with_images,
     has_folders,
+    image_size,
     images_in,
     images_only,
     pairs_by_name,
-    rig_of,
+    pinhole_of,
+    seen_in,
 )
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
+from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.models.noise import unmeasured_motion
 from toolkit.motion_samples import NoSamples
@@ -87,19 +89,18 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     pair = _pair(layout)
     stamps, how = _stamps(layout)
     listed = _listed(layout, stamps)
-    tracks = track_images(listed.pairs, pair, frontend, progress)
-    check_frame_count(layout.root, tracks.t_ns.size)
     left = _projections(layout)[0]
     T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
-    truth = _truth(layout, stamps, tracks.t_ns)
-    facts = (NO_MOTION, *facts_of(tracks, len(listed.pairs)), *listed.remarks, *how, *_aside(pair))
+    seen = seen_in(layout.root, ImageRecording(listed.pairs, pair), T_FLU_CAM @ T_cam0_left, frontend, progress)
+    truth = _truth(layout, stamps, seen.frames_t_ns)
+    facts = (NO_MOTION, *seen.facts, *listed.remarks, *how, *_aside(pair))
     return Sequence(
         name=layout.root.name,
-        rig=rig_of(pair, T_FLU_CAM @ T_cam0_left),
+        rig=seen.rig,
         noise=unmeasured_motion(),
-        frames_t_ns=tracks.t_ns,
-        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
-        motion=NoSamples(tracks.t_ns),
+        frames_t_ns=seen.frames_t_ns,
+        observations=seen.observations,
+        motion=NoSamples(seen.frames_t_ns),
         provenance=Provenance("kitti-odometry", f"{path}: stereo tracks from the images", facts),
         truth=truth,
     )
@@ -123,14 +124,14 @@ def _pair(layout: _Layout) -> RectifiedPair:
         raise DataError(f"{layout.root / 'calib.txt'}: {rows} are the same, so there is no baseline; give each its own")
     if not baseline_m > 0.0:
         raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
-    fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
-    size_px = size_of(_first_readable(layout))
+    pinhole_px, size_px = pinhole_of(left), image_size(layout.left, layout.right)
+    cx_px, cy_px = pinhole_px[2:]
     if not all(_BORDER < c / size < 1.0 - _BORDER for c, size in zip((cx_px, cy_px), size_px, strict=True)):
         raise DataError(
             f"{layout.root / 'calib.txt'}: its principal point, {cx_px:g} {cy_px:g}, is not that of images of "
             f"{size_px[0]}x{size_px[1]} px; where these were scaled or cut, do the same to P0 to P3"
         )
-    return already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
+    return already_rectified(pinhole_px, float(baseline_m), size_px)
 
 
 def _aside(pair: RectifiedPair) -> tuple[str, ...]:
@@ -166,8 +167,8 @@ def _layout(path: Path) -> _Layout | None:
     """Return the first pair of folders that both have images, else the first of which one has."""
     root = path.resolve()
     layouts = [_Layout(root, root / left, root / right, row) for left, right, row in _FOLDERS]
-    there = [(bool(images_in(one.left)), bool(images_in(one.right))) for one in layouts]
-    return next((one for how in (all, any) for one, both in zip(layouts, there, strict=True) if how(both)), None)
+    place = first_with_images([(one.left, one.right) for one in layouts])
+    return None if place is None else layouts[place]
 
 
 def _projections(layout: _Layout) -> tuple[Array, Array]:
@@ -200,18 +201,6 @@ def _projections(layout: _Layout) -> tuple[Array, Array]:
     if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6):
         raise DataError(f"{file}: {wanted[0]} and {wanted[1]} differ in more than the baseline; they are not rectified")
     return left, right
-
-
-def _first_readable(layout: _Layout) -> Path:
-    """Return the first image that can be read, or the first, whose fault is then told."""
-    found = images_in(layout.left) or images_in(layout.right)
-    for path in found[:10]:
-        try:
-            size_of(path)
-        except DataError:
-            continue
-        return path
-    return found[0]
 
 
 def _stamps(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:

@@ -17,24 +17,25 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, observations, rigid
+from toolkit.datasets.io.fields import Fields, rigid
 from toolkit.datasets.io.image_pairs import (
     UNPACK_IMAGES,
     Listed,
     check_both_cameras,
     check_one_clock,
     check_several_stamps,
-    facts_of,
+    first_with_images,
     has_folders,
     image_folder,
-    images_in,
+    image_size,
     images_only,
     pairs_by_stamps,
-    rig_of,
+    pinhole_of,
+    seen_in,
 )
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified, size_of, track_images
+from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
 from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise
 from toolkit.models.noise import twist_noise, unmeasured_motion
@@ -102,19 +103,18 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     """
     layout = _whole(path)
     mounted, listed = _mounted(layout), _listed(layout)
-    tracks = track_images(listed.pairs, mounted.pair, frontend, progress)
-    check_frame_count(layout.root, tracks.t_ns.size)
+    seen = seen_in(layout.root, ImageRecording(listed.pairs, mounted.pair), mounted.T_imu_left, frontend, progress)
     packets = _read_packets(layout.root / "oxts")
     if packets is not None:
-        check_one_clock(layout.root, tracks.t_ns, packets.t_ns, "the oxts packets")
-    motion, noise, how = _motion(packets, tracks.t_ns)
-    facts = (how, *_incomplete(packets), *facts_of(tracks, len(listed.pairs)), *listed.remarks, mounted.source)
+        check_one_clock(layout.root, seen.frames_t_ns, packets.t_ns, "the oxts packets")
+    motion, noise, how = _motion(packets, seen.frames_t_ns)
+    facts = (how, *_incomplete(packets), *seen.facts, *listed.remarks, mounted.source)
     return Sequence(
         name=layout.root.name,
-        rig=rig_of(mounted.pair, mounted.T_imu_left),
+        rig=seen.rig,
         noise=noise,
-        frames_t_ns=tracks.t_ns,
-        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
+        frames_t_ns=seen.frames_t_ns,
+        observations=seen.observations,
         motion=motion,
         provenance=Provenance("kitti-raw", f"{path}: stereo tracks from the images", facts),
         truth=None if packets is None else _truth(packets),
@@ -124,8 +124,8 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
 def _layout(path: Path) -> _Layout | None:
     """Return the first pair of cameras that both have images, else the first of which one has."""
     layouts = [_Layout(path.resolve(), sides) for sides in _SIDES]
-    there = [tuple(bool(images_in(one.images(side))) for side in (0, 1)) for one in layouts]
-    return next((one for how in (all, any) for one, both in zip(layouts, there, strict=True) if how(both)), None)
+    place = first_with_images([(one.images(0), one.images(1)) for one in layouts])
+    return None if place is None else layouts[place]
 
 
 def _whole(path: Path) -> _Layout:
@@ -148,16 +148,7 @@ def _listed(layout: _Layout) -> Listed:
 
 
 def _mounted(layout: _Layout) -> _PairMounting:
-    found = images_in(layout.images(0)) or images_in(layout.images(1))
-    size_px = next((size for size in map(_size_or_none, found[:10]) if size is not None), None)
-    return _mounting(_day_of(layout.root), layout.sides, size_of(found[0]) if size_px is None else size_px)
-
-
-def _size_or_none(path: Path) -> tuple[int, int] | None:
-    try:
-        return size_of(path)
-    except DataError:
-        return None
+    return _mounting(_day_of(layout.root), layout.sides, image_size(layout.images(0), layout.images(1)))
 
 
 def _motion(packets: _Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSamples, MotionNoise, str]:
@@ -260,26 +251,25 @@ def _mounting(day: _Day, sides: tuple[str, str], size_px: tuple[int, int]) -> _P
 
 def _already(cameras: Fields, sides: tuple[str, str], size_px: tuple[int, int], T_rect_imu: Array) -> _PairMounting:
     left, right = (cameras.constant(f"P_rect_{side}", 12).reshape(3, 4) for side in sides)
-    fx, fy, cx, cy = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
-    if not (fx > 0.0 and fy > 0.0):
+    pinhole_px = pinhole_of(left)
+    if not min(pinhole_px[:2]) > 0.0:
         raise DataError(f"{cameras.path}: P_rect_{sides[0]} has no positive focal lengths; copy the file again")
-    baseline_m = float((left[0, 3] - right[0, 3]) / fx)
+    baseline_m = float((left[0, 3] - right[0, 3]) / pinhole_px[0])
     if not baseline_m > 0.0:
         raise DataError(
             f"{cameras.path}: by P_rect_{sides[0]} and P_rect_{sides[1]} the right camera is not to the right of the "
             "left one; copy the file again"
         )
     T_left_rect = se3(np.eye(3), np.linalg.inv(left[:, :3]) @ left[:, 3])
-    pair = already_rectified((fx, fy, cx, cy), baseline_m, size_px)
+    pair = already_rectified(pinhole_px, baseline_m, size_px)
     return _PairMounting(pair, se3_inverse(T_left_rect @ T_rect_imu), "images rectified as the data set has them")
 
 
 def _camera(cameras: Fields, side: str) -> Camera:
-    K = cameras.constant(f"K_{side}", 9).reshape(3, 3)
-    pinhole = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    if not (pinhole[0] > 0.0 and pinhole[1] > 0.0):
+    pinhole_px = pinhole_of(cameras.constant(f"K_{side}", 9).reshape(3, 3))
+    if not min(pinhole_px[:2]) > 0.0:
         raise DataError(f"{cameras.path}: K_{side} has no positive focal lengths; copy the file again")
-    return Camera(pinhole, "radtan", cameras.constant(f"D_{side}", 5), _size(cameras, f"S_{side}"))
+    return Camera(pinhole_px, "radtan", cameras.constant(f"D_{side}", 5), _size(cameras, f"S_{side}"))
 
 
 def _size(cameras: Fields, key: str) -> tuple[int, int]:

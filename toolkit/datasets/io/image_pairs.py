@@ -3,28 +3,31 @@
 Checks before any image is read: both cameras are there, stamps differ, and they lie in the motion's time.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import check_frame_count, probable_unit_of_ns
+from toolkit.datasets.io.fields import check_frame_count, observations, probable_unit_of_ns
 from toolkit.datasets.io.tables import read_stamps
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.frontend import ImageTracks, RectifiedPair, StampedPair
+from toolkit.frontend import ImageRecording, ImageTracks, Pinhole, RectifiedPair, StampedPair, size_of
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import StereoRig
 from toolkit.models.noise import pixel_covariance
-from toolkit.settings import Tracks
+from toolkit.progress import Progress
+from toolkit.sequence import Observations
+from toolkit.settings import Frontend, Tracks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 UNPACK_IMAGES = f"unpack them there ({', '.join(SUFFIXES)} are read)"
 # Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
 _SAME_INSTANT_NS = 1_000_000
-# Pairs left out that are listed by name.
-_NAMED = 10
+# Pairs left out that are listed by name, and images that are opened to find the size of all.
+_NAMED, _OPENED = 10, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,15 +176,55 @@ def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[in
     return {number: int(numbers[off.argmin()]) for number, off in off_ns.items() if off.min() <= reach_ns}
 
 
-def rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
-    """Return the rig of rectified images; ``T_imu_left`` (4, 4) is where the left camera is mounted."""
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What image pairs make of a recording: stamps (K,) of its frames, sightings, rig, and what to know of them."""
+
+    frames_t_ns: IntArray
+    observations: Observations
+    rig: StereoRig
+    facts: tuple[str, ...]
+
+
+def seen_in(root: Path, filmed: ImageRecording, T_imu_left: Array, frontend: Frontend, progress: Progress) -> Seen:
+    """Track image pairs; ``T_imu_left`` (4, 4) is where the left camera is mounted, before it is rectified.
+
+    Raises DataError where the images cannot be used, or fewer than two pairs can.
+    """
+    tracks = filmed.tracks(frontend, progress)
+    check_frame_count(root, tracks.t_ns.size)
+    sightings = observations(tracks.frame, tracks.track_id, tracks.corners_px)
+    return Seen(tracks.t_ns, sightings, _rig_of(filmed.rig, T_imu_left), _facts_of(tracks, len(filmed.pairs)))
+
+
+def first_with_images(pairs: Sequence[tuple[Path, Path]]) -> int | None:
+    """Return which pair of folders is the first that both have images, else the first of which one has."""
+    there = [[bool(images_in(folder)) for folder in pair] for pair in pairs]
+    return next((place for how in (all, any) for place, both in enumerate(there) if how(both)), None)
+
+
+def image_size(left: Path, right: Path) -> tuple[int, int]:
+    """Return the size (width, height) px of the first image that can be opened; DataError has the first one's fault."""
+    found = images_in(left) or images_in(right)
+    for path in found[:_OPENED]:
+        with suppress(DataError):
+            return size_of(path)
+    return size_of(found[0])
+
+
+def pinhole_of(P: Array) -> Pinhole:
+    """Return fx, fy, cx, cy (px) of a projection (3, 4) or a camera matrix (3, 3)."""
+    return float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2])
+
+
+def _rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
     T_imu_rect = T_imu_left.copy()
     T_imu_rect[:3, :3] = T_imu_left[:3, :3] @ pair.R_rect_cam.T
     pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
     return StereoRig(*pinhole_px, pair.baseline_m, T_imu_rect, pixel_covariance(2))
 
 
-def facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
+def _facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
     """Return what a reader must know of the tracks of ``pairs`` pairs, and which of these were left out."""
     used = tracks.t_ns.size
     a_frame = np.bincount(tracks.frame, minlength=used)
