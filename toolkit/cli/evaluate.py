@@ -74,7 +74,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from toolkit.evaluation.scoring import Terms
     from toolkit.evaluation.standings import evaluate
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.report.evaluation_files import check_evaluation_directory, write_evaluation
+    from toolkit.report.evaluation import check_evaluation_directory, write_evaluation
 
     (ranked_by,), columns = _metrics((options.metric,)), _metrics(options.columns)
     if options.out is not None:
@@ -93,7 +93,7 @@ def evaluate(options: argparse.Namespace) -> int:
 def _shown(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argparse.Namespace) -> str:
     from toolkit.evaluation.document import evaluation_document
     from toolkit.files.documents import to_text
-    from toolkit.report import evaluation_text as texts
+    from toolkit.report import evaluation as texts
     from toolkit.report.text import width_of_output
 
     if options.json:

@@ -1,8 +1,8 @@
 """Everything a comparison leaves behind: tables, text, JSON, trajectories, figures, a page; nothing is run here.
 
-Reading order: text (words, numbers, tables) -> comparison_table, verdict, messages -> comparison_text -> scores,
-records, curves, report_json and manifest (the JSON documents) -> camera_frames -> run_directory, which writes and reads
-a run directory. figures/ draws, html/ makes the page of run directories, both with the colours
-of looks; differences compares two, export passes one on. gate, evaluation_text (with evaluation_files), card,
-verify_text and citations show the results of other commands; schemas writes docs/schemas.
+Reading order: text -> comparison_table, verdict, messages -> comparison_text -> scores, card, report_json and manifest
+(each JSON document with the function that fills it; records lists all of them) -> run_directory, which writes and reads
+a run directory. curves has what is drawn; figures/ draws it, camera_frames takes images of the recording, html/ makes
+the page of run directories. differences compares two, export passes one on. gate, evaluation, verify_text and citations
+show the results of other commands.
 """

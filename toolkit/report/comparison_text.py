@@ -36,59 +36,36 @@ from toolkit.report.verdict import verdict
 # Notes below the printed table, and lines of them with the verdict's; the report has all notes.
 _MOST_NOTES, _MOST_LINES = 3, 7
 
-_READ_BEFORE = """\
-Causal and held-out describe what an estimator is given. Before its first packet, the same for all: with raw IMU
-samples the start, where the recording has none, is found from about the first 1.5 s of sightings that are not
-withheld, so causal answers of that time use a little of their future; and the audit looks for faults in the whole
-recording, withheld tracks included. Its findings are above."""
-_MARKED = """\
+_HOW_TO_READ_ONE = """\
+Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
+estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like.
+A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
+read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
+the matched pairs and the coverage above the table, or in it where the rows differ. `metrics.json` has every metric,
+and for each one that is missing the reason."""
+_HOW_TO_READ_MANY = """\
+Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
+means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
+quartiles over all runs. The runs that did not end well are named above and are in no mean; the median over all runs in
+the notes has them, each as infinitely bad.
+
+The NEES band is the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided 95 %
+chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their errors,
+so the share itself scatters widely from one set of seeds to another. `ekf` and other filters that neglect correlations
+stay above it by design (docs/metrics.md)."""
+_HOW_TO_READ = """\
 `overconfident` or `timid` beside how a run ended: its errors, or without a truth its innovations, are larger or smaller
 than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that rejected many;
 `contradicted`: the corrections by its tracks have one direction, by more than its covariance allows. The notes have the
 figures.
 
 The verdict names a winner only where a paired test supports it: over seeds by the seeds, of one run by the drift over
-up to 40 stretches of the path, or by withheld tracks in ten stretches of time. Each interval has 99 %."""
-_HOW_TO_READ_ONE = f"""\
-Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
-estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like.
-A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
-read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
-the matched pairs and the coverage above the table, or in it where the rows differ.
+up to 40 stretches of the path, or by withheld tracks in ten stretches of time. Each interval has 99 %.
 
-{_MARKED}
-
-{_READ_BEFORE}
-
-{{metrics}}
-
-`metrics.json` has every metric, and for each one that is missing the reason."""
-
-_OUTSIDE_BY_DESIGN = """\
-Some estimators may stay outside their band, and are compared all the same. A decoupled filter, like the seed report's,
-treats its map as exact when it corrects the pose and neglects that the errors of both are correlated: it counts the
-same information again and again, and its covariance shrinks whatever the error does. A plain joint filter keeps the
-correlations, but linearises one landmark at many different estimates of the same pose, and so reduces the variance of
-its heading and position, which nothing measured. The rungs after it correct this: for them, being outside the band is a
-defect of the estimator or of its noise."""
-_HOW_TO_READ_MANY = f"""\
-Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
-means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
-quartiles over all runs.
-
-{_MARKED}
-
-{_READ_BEFORE}
-
-- **ok of N**: how many runs ended well. The others are named above and are in no mean; the median over all runs in the
-  notes has them, each as infinitely bad.
-- **std**: the standard deviation of the first metric over the seeds.
-- **NEES band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
-  95 % chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their
-  errors, so the share itself scatters widely from one set of seeds to another.
-{{metrics}}
-
-{_OUTSIDE_BY_DESIGN}"""
+Causal and held-out describe what an estimator is given. Before its first packet, the same for all: with raw IMU
+samples the start, where the recording has none, is found from about the first 1.5 s of sightings that are not
+withheld, so causal answers of that time use a little of their future; and the audit looks for faults in the whole
+recording, withheld tracks included. Its findings are above."""
 
 
 def comparison_text(comparison: Comparison, columns: Columns = None, width: Width = WIDTH) -> str:
@@ -123,7 +100,6 @@ def _line_count(entries: list[str]) -> int:
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
     """Return the report; ``captions`` maps the file names of the figures, beside the report, to their captions."""
     seeds = f", {len(comparison.seeds)} seeds" if comparison.over_seeds else ""
-    how_to_read = _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE
     parts = [
         f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
         *(f"{in_markdown(line)}." for line in header_lines(comparison)),
@@ -141,7 +117,9 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         "## Figures",
         *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
         "## How to read the table",
-        how_to_read.format(metrics=_meanings(comparison)),
+        _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE,
+        _HOW_TO_READ,
+        "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison)),
         "`vislam report` with the path of this folder makes an interactive page of it.",
     ]
     return "\n\n".join(parts) + "\n"
@@ -149,11 +127,6 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
 
 def _figure(name: str, caption: str) -> str:
     return f"![{caption}](figures/{name})\n\n*{caption}*"
-
-
-def _meanings(comparison: Comparison) -> str:
-    """Return a line for each metric of the table."""
-    return "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison))
 
 
 def audit_text(audited: Audit, width: Width = WIDTH) -> str:
