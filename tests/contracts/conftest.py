@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import scipy.io
 
+from tests.datasets.test_own_tables import written
 from toolkit.datasets import vislam_recording
 from toolkit.datasets.trajectories import FORMATS
 from toolkit.estimate import Trajectory
+from toolkit.geometry import se3
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -35,16 +37,34 @@ def valid_files(workshop: Path) -> dict[str, Files]:
     saved = {}
     for sequence in (drive, flight):
         vislam_recording.save(sequence, workshop / sequence.name)
-        saved[f"vislam {sequence.name}"] = {f.name: f.read_bytes() for f in (workshop / sequence.name).iterdir()}
+        saved[f"vislam {sequence.name}"] = _contents(workshop / sequence.name)
     return {
         **saved,
-        "course": _course(drive),
-        "course npy": _course_npy(drive),
-        "own tables": _own_tables(flight),
+        **_course(drive),
+        "own tables": _contents(written(flight, workshop / "own")),
         "utias": _utias(drive),
         "openvins": _openvins(flight),
         "lean euroc": _lean(flight),
     }
+
+
+def _contents(folder: Path) -> Files:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def _course(sequence: Sequence) -> dict[str, Files]:
+    """Return a recording as the course writes it now and before."""
+    rig, stamps, count = sequence.rig, sequence.frames_t_ns / 1e9, sequence.frame_count
+    v, w = np.split(sequence.motion.values[:count], 2, axis=1)
+    T_imu_right = rig.T_imu_cam @ se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
+    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
+    features, b, T_imu_cam = _corners(sequence), np.array(rig.baseline_m), rig.T_imu_cam
+    before = {"time_stamps": stamps, "features": features, "linear_velocity": v.T, "angular_velocity": w.T}
+    now = {"v_t": v, "w_t": w, "timestamps": stamps, "features": features, "K_l": K, "K_r": K}
+    npz, npy = io.BytesIO(), io.BytesIO()
+    np.savez(npz, **before, K=K, b=b, imu_T_cam=T_imu_cam)
+    np.save(npy, np.array({**now, "extL_T_imu": T_imu_cam, "extR_T_imu": T_imu_right}, dtype=object), allow_pickle=True)
+    return {"course": {"": npz.getvalue()}, "course npy": {"": npy.getvalue()}}
 
 
 def _corners(sequence: Sequence) -> np.ndarray:
@@ -54,60 +74,6 @@ def _corners(sequence: Sequence) -> np.ndarray:
     features = np.full((4, track.max() + 1, sequence.frame_count), -1.0)
     features[:, track, seen.frame] = seen.uv_px[:, [0, 2, 1, 2]].T
     return features
-
-
-def _course(sequence: Sequence) -> Files:
-    rig, count = sequence.rig, sequence.frame_count
-    v, w = sequence.motion.values[:count, :3].T, sequence.motion.values[:count, 3:].T
-    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
-    out = io.BytesIO()
-    np.savez(
-        out,
-        time_stamps=sequence.frames_t_ns / 1e9,
-        features=_corners(sequence),
-        linear_velocity=v,
-        angular_velocity=w,
-        K=K,
-        b=np.array(rig.baseline_m),
-        imu_T_cam=rig.T_imu_cam,
-    )
-    return {"": out.getvalue()}
-
-
-def _course_npy(sequence: Sequence) -> Files:
-    rig, count = sequence.rig, sequence.frame_count
-    T_imu_right = rig.T_imu_cam.copy()
-    T_imu_right[:3, 3] += rig.baseline_m * rig.T_imu_cam[:3, 0]
-    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
-    values = {
-        "v_t": sequence.motion.values[:count, :3],
-        "w_t": sequence.motion.values[:count, 3:],
-        "timestamps": sequence.frames_t_ns / 1e9,
-        "features": _corners(sequence),
-        **{"K_l": K, "K_r": K, "extL_T_imu": rig.T_imu_cam, "extR_T_imu": T_imu_right},
-    }
-    out = io.BytesIO()
-    np.save(out, np.array(values, dtype=object), allow_pickle=True)
-    return {"": out.getvalue()}
-
-
-def _own_tables(sequence: Sequence) -> Files:
-    rig, seen, motion = sequence.rig, sequence.observations, sequence.motion
-    tracks = [
-        f"{sequence.frames_t_ns[k]},{track},{_row(*uv_px)}"
-        for k, track, uv_px in zip(seen.frame, seen.track_id, seen.uv_px, strict=True)
-    ]
-    imu = [f"{t},{_row(*values)}" for t, values in zip(motion.t_ns, motion.values, strict=True)]
-    numbers = {key: getattr(rig, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")}
-    calibration = {**numbers, "T_imu_cam": rig.T_imu_cam.tolist()}
-    lines = [f"{key} = {value}" for key, value in calibration.items()]
-    lines += ["[noise]", *(f"{key} = {value}" for key, value in vars(sequence.noise).items())]
-    return {
-        "tracks.csv": "\n".join(["t_ns,track_id,uL,uR,v", *tracks]).encode(),
-        "imu.csv": "\n".join(["t_ns,ax,ay,az,gx,gy,gz", *imu]).encode(),
-        "rig.toml": "\n".join(lines).encode(),
-        "truth.tum": FORMATS["tum"].text(_trajectory(sequence)).encode(),
-    }
 
 
 def _utias(sequence: Sequence) -> Files:
