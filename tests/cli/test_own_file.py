@@ -24,22 +24,17 @@ def my_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def scores(capsys: pytest.CaptureFixture[str]) -> dict[str, dict]:
-    return {run["estimator"]: run for run in json.loads(capsys.readouterr().out)["runs"]}
-
-
-@pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(capsys, workers: str) -> None:
-    words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--workers", workers]
-    assert main([*words, "--json"]) == 0
-    found = scores(capsys)
-    assert list(found) == ["dead-reckoning", "my-filter"]
-    assert found["my-filter"]["metrics"]["ate_se3_m"] == found["dead-reckoning"]["metrics"]["ate_se3_m"]
-
-
-def test_python_takes_a_file_among_names() -> None:
+def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(my_filter: Path, capsys) -> None:
+    for workers in ("1", "2"):
+        words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--workers", workers]
+        assert main([*words, "--json"]) == 0
+        found = {run["estimator"]: run["metrics"]["ate_se3_m"] for run in json.loads(capsys.readouterr().out)["runs"]}
+        assert found == dict.fromkeys(["dead-reckoning", "my-filter"], found["my-filter"])
     result = toolkit.compare("drive", ["dead-reckoning", "my_filter.py"], max_frames=12, workers=1)
     assert set(result.runs) == {"dead-reckoning", "my-filter"}
+    entry = find("my_filter.py")
+    my_filter.unlink()
+    assert callable(entry.load())  # what was read runs, whatever becomes of the file
 
 
 def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path, capsys) -> None:
@@ -56,12 +51,6 @@ def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path,
         "results: over (4 of 4 runs were there)",
         "results: over (2 of 4 runs were there)",
     ]
-
-
-def test_what_was_read_runs_whatever_becomes_of_the_file(my_filter: Path) -> None:
-    entry = find("my_filter.py")
-    my_filter.unlink()
-    assert callable(entry.load())
 
 
 def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter: Path, capsys) -> None:
