@@ -12,12 +12,11 @@ the window. Three faults are recovered from, and the log lists them:
 from dataclasses import replace
 
 import gtsam
-import numpy as np
 
 from filters.kalman.thinning import Thinned
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphBuilder
-from filters.smoothing.indeterminate import Recovery, behind_camera
+from filters.smoothing.indeterminate import Recovery
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -38,7 +37,6 @@ class FixedLag:
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
-        self._rig = setup.rig
         self._tree = FixedLagTree(self._lag_ns)
         self._builder = GraphBuilder(setup)
         self._stamps_ns: list[int] = []
@@ -61,7 +59,7 @@ class FixedLag:
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
         self._note(recovery)
         newest = self._read(packet)
-        self._drop_landmarks(packet, newest)
+        self._drop_landmarks(t_ns)
         return newest
 
     def finish(self) -> Finished:
@@ -96,18 +94,11 @@ class FixedLag:
         self._builder.update(newest, self._in_window)
         return newest
 
-    def _drop_landmarks(self, packet: Packet, newest: Estimate) -> None:
-        """Drop landmarks behind the camera before they are linearised there, and those later sightings contradict."""
-        seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
-        points = np.array([self._in_window[i] for i in seen]).reshape(-1, 3)
-        rows = np.flatnonzero(behind_camera(points, newest.T_world_imu, self._rig))
-        log = {seen[row]: "fell behind the camera" for row in rows}
-        contradicted = self._builder.contradicted() & self._last_seen_ns.keys()
-        log |= dict.fromkeys(contradicted, "was inconsistent with its next sightings")
-        if log:
-            recovery = self._tree.drop(log.keys())
-            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
-            self._note(Recovery(lines + recovery.log, log.keys() | recovery.dropped))
+    def _drop_landmarks(self, newest_ns: int) -> None:
+        seen = {i: self._in_window[i] for i, t_ns in self._last_seen_ns.items() if t_ns == newest_ns}
+        why = {i: reason for i, reason in self._builder.to_drop(seen).items() if i in self._last_seen_ns}
+        if why:
+            self._note(self._tree.drop(why.keys()).after(why))
 
     def _note(self, recovery: Recovery) -> None:
         """Log a recovery, and forget the points of the landmarks that it dropped."""

@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
-from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
+from filters.smoothing.indeterminate import Recovery, with_covariances
 from filters.smoothing.isam2_tree import Isam2Tree, linearised_badly
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Stopping, solve
@@ -66,7 +66,7 @@ class Isam2:
         self._relinearise(points, estimate)
         seen = {i: points[i] for i in extension.landmark_ids if i in points}
         self._builder.update(estimate, seen)
-        self._drop_landmarks(seen, estimate, packet)
+        self._drop_landmarks(seen, packet)
         return estimate
 
     def finish(self) -> Finished:
@@ -97,17 +97,10 @@ class Isam2:
         cov = self._builder.motion.state_cov(self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
-    def _drop_landmarks(self, seen: dict[int, Array], estimate: Estimate, packet: Packet) -> None:
-        """Drop landmarks behind the camera, where a sighting has no gradient, and those later sightings contradict."""
-        points = np.array(list(seen.values())).reshape(-1, 3)
-        behind = behind_camera(points, estimate.T_world_imu, self._rig).tolist()
-        log = {i: "fell behind the camera" for i, is_behind in zip(seen, behind, strict=True) if is_behind}
-        contradicted = {i for i in self._builder.contradicted() if self._tree.has(L(i))}
-        log |= dict.fromkeys(contradicted, "was inconsistent with its next sightings")
-        if log:
-            recovery = self._tree.drop(map(L, log))
-            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
-            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
+    def _drop_landmarks(self, seen: dict[int, Array], packet: Packet) -> None:
+        why = {i: reason for i, reason in self._builder.to_drop(seen).items() if self._tree.has(L(i))}
+        if why:
+            self._note(packet, self._tree.drop(map(L, why)).after(why))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Log a recovery; a landmark that it dropped is started again from its next sighting."""

@@ -15,7 +15,7 @@ import numpy as np
 from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, RefusedTracks, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, se3_inverse, transform
 from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
@@ -66,10 +66,19 @@ class GraphBuilder:
         self.belief = self.belief.at(newest)
         self._landmarks.move(points)
 
-    def contradicted(self) -> set[int]:
-        """Return the landmarks to drop after a packet, because later sightings of their tracks contradict them."""
+    def to_drop(self, seen: Mapping[int, Array]) -> dict[int, str]:
+        """Return which landmarks to drop after a packet, of which it has ``seen`` some at (3,) m, and why.
+
+        Behind the camera a sighting has no gradient. Those that later sightings of their tracks contradict are dropped
+        whether or not they are seen.
+        """
         assert self._refused is not None
-        return self._refused_tracks.contradicted(*self._refused, self.belief.T_world_imu)
+        points = np.array(list(seen.values())).reshape(-1, 3)
+        _, depth_m = stereo.images(transform(se3_inverse(self.belief.T_world_imu), points), self._rig)
+        behind = [i for i, m in zip(seen, depth_m.tolist(), strict=True) if m <= 0.0]
+        why = dict.fromkeys(behind, "fell behind the camera")
+        contradicted = self._refused_tracks.contradicted(*self._refused, self.belief.T_world_imu)
+        return why | dict.fromkeys(contradicted, "was inconsistent with its next sightings")
 
     def forget(self, landmark_ids: set[int]) -> None:
         """Drop landmarks that have left the graph; if seen again, they are started again."""

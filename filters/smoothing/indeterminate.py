@@ -21,8 +21,7 @@ import gtsam
 import numpy as np
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, BoolArray, se3_inverse, transform
-from toolkit.measurements import StereoRig
+from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
 from toolkit.models.state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
@@ -44,11 +43,10 @@ class Recovery(NamedTuple):
     log: list[str]
     dropped: set[int]
 
-
-def behind_camera(points: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
-    """Say which points (N, 3) m in the world are not in front of the camera of a pose (4, 4)."""
-    T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
-    return np.asarray(transform(T_cam_world, points)[:, 2] <= 0.0)
+    def after(self, why: Mapping[int, str]) -> "Recovery":
+        """Return the recovery with the landmarks whose drop, each for its reason, it followed."""
+        lines = [f"landmark {i} {reason} and was dropped" for i, reason in sorted(why.items())]
+        return Recovery(lines + self.log, why.keys() | self.dropped)
 
 
 def variable_named(refusal: RuntimeError) -> int:
