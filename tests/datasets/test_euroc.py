@@ -11,7 +11,7 @@ import pytest
 
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
-from toolkit.datasets.io.yaml_fields import read_fields
+from toolkit.datasets.io.fields import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.measurements import ImuMotion, ImuNoise
 from toolkit.models.stereo import project, triangulate

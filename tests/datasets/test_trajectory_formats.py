@@ -8,7 +8,7 @@ import pytest
 from evo.tools import file_interface as evo
 
 from toolkit.datasets.trajectories import FORMATS, read_poses
-from toolkit.datasets.trajectories.rows import read_rows, stamp_text
+from toolkit.datasets.trajectories.formats import read_rows, stamp_text
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3, so3_exp

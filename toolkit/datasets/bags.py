@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from toolkit.datasets.io import bag_reader, ros_values
-from toolkit.datasets.io.bag_calibration import Mounted, Source, mounted, source_of
-from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Held, Message, Topic
-from toolkit.datasets.io.bag_topics import Chosen, choose
+from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Held, Message, Topic, choose
 from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
+from toolkit.datasets.io.ros_values import Mounted, Source, mounted, source_of
 from toolkit.datasets.io.truth import truth_near, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError

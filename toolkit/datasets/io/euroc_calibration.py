@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, rigid
-from toolkit.datasets.io.yaml_fields import read_fields
+from toolkit.datasets.io.fields import Fields, read_fields, rigid
 from toolkit.errors import DataError
 from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 from toolkit.geometry import Array, se3_inverse

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import extrinsic
+from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.tables import columns_of, read_table
-from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order, turned
 from toolkit.datasets.trajectories.formats import check_order, checked_poses

@@ -1,6 +1,6 @@
 """Trajectories in the files that other programs read and write; poses are ``T_world_imu`` in all of them.
 
-``formats`` has the formats as a table, ``rows`` their lines as cells; ``belonging`` checks that a file is of a
+``formats`` has the formats as a table; ``belonging`` checks that a file is of a
 recording, in its clock, units and axes.
 """
 
