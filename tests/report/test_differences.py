@@ -124,19 +124,3 @@ def test_other_recordings_are_independent_draws_and_may_be_chance(messages) -> N
     tested = [one for one in found["metrics"] if one["p"] is not None]
     assert tested
     assert not any(one["beyond_chance"] for one in tested)
-
-
-def test_chance_is_unknown_from_one_run(messages) -> None:
-    found = messages("one", "seeds")
-    assert all(one["p"] is None for one in found["metrics"])
-    assert {"name": "dead-reckoning causal", "before": "ok", "after": "3 of 3 ok"} in found["ends"]
-    assert {one["output"] for one in found["metrics"]} == {"causal"}  # the final answer repeats it
-
-
-def test_what_is_no_run_is_reported_in_one_line(runs, capsys) -> None:
-    assert main(["diff", str(runs / "one"), str(runs)]) == 3
-    assert main(["diff", str(runs / "one"), str(runs / "one"), "--columns", "ate_se_m"]) == 2
-    printed = capsys.readouterr().err
-    assert "is not a run directory" in printed
-    assert "did you mean ate_se3_m?" in printed
-    assert printed.count("\n") == 2

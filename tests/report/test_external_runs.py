@@ -1,6 +1,7 @@
 """A trajectory file becomes a run at the frames, or one line says why it is not of this recording."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,6 @@ from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-# The roll that brings the scalar of a quaternion in a format's order to the place of the mistaken one.
-MISTAKEN = {"tum": 1, "euroc": -1, "openvins": 1}
 FREQUENT_NS = 10_000_000
 
 
@@ -52,10 +51,6 @@ def refusal(folder: Path, trajectory: Trajectory, recording: Sequence, name: str
     return message
 
 
-def turned(trajectory: Trajectory, rotations: Array) -> Trajectory:
-    return Trajectory(trajectory.t_ns, se3(rotations, trajectory.positions))
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_truth_in_any_format_is_without_error_and_says_what_it_cannot_tell(
     tmp_path: Path, recording: Sequence, name: str
@@ -83,35 +78,6 @@ def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording
     np.testing.assert_allclose(run.final.positions, truth.positions[1:-1], atol=1e-3)
     scores = score_run(run, "final", recording).values
     assert scores["pairs"] == recording.frame_count - 2
-
-
-@pytest.mark.parametrize("name", MISTAKEN)
-def test_a_wrong_order_of_quaternions_is_named(tmp_path: Path, recording: Sequence, name: str) -> None:
-    truth = truth_of(recording)
-    mistaken = np.roll(quaternion_from_rotation(truth.T_world_imu[:, :3, :3]), MISTAKEN[name], axis=1)
-    message = refusal(tmp_path, turned(truth, rotation_from_quaternion(mistaken)), recording, name)
-    assert f"the quaternions look w {'last' if name == 'euroc' else 'first'}" in message
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_rotations_of_the_world_to_the_imu_are_named(tmp_path: Path, recording: Sequence, name: str) -> None:
-    truth = truth_of(recording)
-    message = refusal(tmp_path, turned(truth, np.swapaxes(truth.T_world_imu[:, :3, :3], 1, 2)), recording, name)
-    assert "those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them" in message
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_poses_of_the_camera_are_named(tmp_path: Path, recording: Sequence, name: str) -> None:
-    truth = truth_of(recording)
-    of_camera = Trajectory(truth.t_ns, truth.T_world_imu @ recording.rig.T_imu_cam)
-    assert "the poses look like the left camera's" in refusal(tmp_path, of_camera, recording, name)
-
-
-def test_poses_in_exchanged_axes_are_named_where_a_truth_shows_them(tmp_path: Path) -> None:
-    recording = simulate(replace(FLIGHT, duration_s=10.0), seed=2)
-    truth = truth_of(recording)
-    exchanged = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], truth.positions[:, [0, 2, 1]]))
-    assert "with y and z exchanged (positions alone)" in refusal(tmp_path, exchanged, recording)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -146,20 +112,6 @@ def test_milliseconds_at_a_high_rate_are_named_beside_the_recording(tmp_path: Pa
     assert "they fit only in another unit of time; multiply the stamps by 0.001" in message
 
 
-@pytest.mark.parametrize(
-    ("shift_s", "cause"),
-    [(-1.6e9, "counts from its own start: add"), (7200, "as time zones are"), (5000, "another drive or clock")],
-)
-def test_another_clock_is_named_with_both_ranges(
-    tmp_path: Path, recording: Sequence, shift_s: float, cause: str
-) -> None:
-    truth = truth_of(recording)
-    shifted = Trajectory(truth.t_ns + round(shift_s * 1e9), truth.T_world_imu)
-    message = refusal(tmp_path, shifted, recording)
-    assert cause in message
-    assert "they do not overlap" in message
-
-
 def test_kitti_rows_are_the_frames_all_of_them_or_those_compared(tmp_path: Path, recording: Sequence) -> None:
     truth = truth_of(recording)
     for rows in (recording.frame_count, 20):
@@ -170,15 +122,6 @@ def test_kitti_rows_are_the_frames_all_of_them_or_those_compared(tmp_path: Path,
     few = Trajectory(truth.t_ns[:21], truth.T_world_imu[:21])
     message = refusal(tmp_path, few, recording, "kitti")
     assert f"21 rows, but a KITTI file has one for every frame, and there are {recording.frame_count};" in message
-
-
-def test_positions_in_millimetres_are_named_with_the_ratio(tmp_path: Path, recording: Sequence) -> None:
-    """Against the truth, or without it against the measured speeds, which an IMU has not."""
-    truth = truth_of(recording)
-    far = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], 1000.0 * truth.positions))
-    blind = [replace(recording, truth=None)] if isinstance(recording.motion, TwistSamples) else []
-    for known in (recording, *blind):
-        assert "it is in millimetres: divide its positions by 1000" in refusal(tmp_path, far, known)
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 1.3])
@@ -192,3 +135,53 @@ def test_another_scale_is_remarked_on_without_a_truth(tmp_path: Path, recording:
     assert (found is None) == (scale == 1.0)
     if found is not None:
         assert float(found[1]) == pytest.approx(scale, rel=0.02)  # the noise of the tracks lengthens vision's steps
+
+
+def _turned(trajectory: Trajectory, rotations: Array) -> Trajectory:
+    return Trajectory(trajectory.t_ns, se3(rotations, trajectory.positions))
+
+
+def _rolled(given: Trajectory, places: int) -> Trajectory:
+    quaternions = np.roll(quaternion_from_rotation(given.T_world_imu[:, :3, :3]), places, axis=1)
+    return _turned(given, rotation_from_quaternion(quaternions))
+
+
+def _later(given: Trajectory, shift_s: float) -> Trajectory:
+    return Trajectory(given.t_ns + round(shift_s * 1e9), given.T_world_imu)
+
+
+MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str]] = {
+    "w first": (lambda given, _: _rolled(given, 1), "tum", "the quaternions look w first"),
+    "w last": (lambda given, _: _rolled(given, -1), "euroc", "the quaternions look w last"),
+    "world to IMU": (
+        lambda given, _: _turned(given, np.swapaxes(given.T_world_imu[:, :3, :3], 1, 2)),
+        "openvins",
+        "those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
+    ),
+    "camera": (
+        lambda given, recording: Trajectory(given.t_ns, given.T_world_imu @ recording.rig.T_imu_cam),
+        "kitti",
+        "the poses look like the left camera's",
+    ),
+    "millimetres": (
+        lambda given, _: Trajectory(given.t_ns, se3(given.T_world_imu[:, :3, :3], 1000.0 * given.positions)),
+        "tum",
+        "it is in millimetres: divide its positions by 1000",
+    ),
+    "own clock": (lambda given, _: _later(given, -1.6e9), "tum", "counts from its own start: add"),
+    "time zone": (lambda given, _: _later(given, 7200.0), "tum", "as time zones are"),
+    "another drive": (lambda given, _: _later(given, 5000.0), "tum", "another drive or clock"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_with_its_remedy(tmp_path: Path, recording: Sequence, mistake: str) -> None:
+    make, name, expected = MISTAKES[mistake]
+    assert expected in refusal(tmp_path, make(truth_of(recording), recording), recording, name)
+
+
+def test_poses_in_exchanged_axes_are_named_where_a_truth_shows_them(tmp_path: Path) -> None:
+    recording = simulate(replace(FLIGHT, duration_s=10.0), seed=2)
+    truth = truth_of(recording)
+    exchanged = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], truth.positions[:, [0, 2, 1]]))
+    assert "with y and z exchanged (positions alone)" in refusal(tmp_path, exchanged, recording)

@@ -16,7 +16,6 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
-from toolkit.report import figures
 from toolkit.report.curves import (
     COLOURS,
     Components,
@@ -27,7 +26,7 @@ from toolkit.report.curves import (
     onto_truth,
     truth_during,
 )
-from toolkit.report.figures import FigureChoice, FigureFormat, bands, drawn, from_above, over_time, reprojection, save
+from toolkit.report.figures import FigureChoice, FigureFormat, bands, from_above, over_time, reprojection, save
 from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
@@ -212,14 +211,6 @@ def test_a_panel_whose_values_leave_the_figure_says_how_large_they_become() -> N
     assert [axes.get_title(loc="right") for axes in figure.axes] == ["67 % in band", "67 % in band, up to 7e+05"]
 
 
-def test_all_panels_of_a_map_share_a_scale_of_colours(comparison: Comparison) -> None:
-    (one,) = from_above.draw_trajectories(comparison)
-    titles = [axes.get_title(loc="left") for axes in one.figure.axes]
-    assert titles[:3] == ["steady", "astray (diverged)", "late"]
-    assert one.figure.axes[3].get_ylabel() == "position error [m]"
-    assert list(from_above.draw_trajectories(replace(comparison, outcomes=comparison.outcomes[3:]))) == []
-
-
 def straight(offset_m: float, widening_m: float = 0.0) -> PathFromAbove:
     t_ns = np.arange(101)
     return PathFromAbove(t_ns, np.stack([t_ns.astype(float), offset_m + widening_m * t_ns / 100.0], axis=1))
@@ -276,16 +267,6 @@ def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Compari
     assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes if axes.axison)
     labels = {text.get_text().partition(":")[0] for text in legend.get_texts()}
     assert labels >= set(fourteen.estimators)
-
-
-def test_few_figures_come_first_and_all_when_requested(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
-    def named(name: str) -> Callable[[Comparison], Iterator[NamedFigure]]:
-        return lambda _: iter([NamedFigure(name, "", Figure())])
-
-    monkeypatch.setattr(figures, "_FEW", (named("one"),))
-    monkeypatch.setattr(figures, "_MORE", (named("another"),))
-    names = {choice: [figure.name for figure in drawn(comparison, choice)] for choice in CHOICES}
-    assert names == {"few": ["one"], "all": ["one", "another"], "none": []}
 
 
 @pytest.mark.parametrize("kind", BEGINS)

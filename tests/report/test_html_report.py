@@ -15,8 +15,8 @@ from toolkit.estimate import STATUS_MEANING, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.metrics import Scores
-from toolkit.report.html import json_in_html, page_text, write_html
-from toolkit.report.html.payload import evenly, highlights, payload_of, running_median, with_peaks
+from toolkit.report.html import json_in_html, page_text
+from toolkit.report.html.payload import highlights, payload_of, running_median, with_peaks
 from toolkit.report.records import schema_files
 from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.report.verdict import ContestRecord, Rival
@@ -87,33 +87,11 @@ def test_tracks_are_aligned_as_the_metric_says(case: Json, estimator: str) -> No
     assert rmse_m == pytest.approx(one["metrics"]["ate_se3_m"], abs=2e-3)  # drawn to the millimetre
 
 
-def test_a_failed_run_is_shown_without_a_track_and_with_reasons(case: Json) -> None:
-    one = row(case, "broken")
-    assert one["status"] == "failed"
-    assert one["track"] is None
-    assert all(one["notes"][key] for key, value in one["metrics"].items() if value is None)
-
-
-def test_the_same_estimator_has_one_colour_in_every_run(run_directory: Path, comparison: Comparison) -> None:
-    runs = [read_run(run_directory)] * 2
-    first, second = payload_of(runs)["cases"]
-    colours = [one["colour"] for one in first["rows"]]
-    assert colours == [one["colour"] for one in second["rows"]]
-    assert len({*colours}) == len({one["estimator"] for one in first["rows"]})
-    assert not {one["id"] for one in first["rows"]} & {one["id"] for one in second["rows"]}
-
-
 @pytest.mark.usefixtures("unrendered")
 def test_without_truth_there_is_a_page_too(without_truth: Comparison, tmp_path: Path) -> None:
     (case,) = payload_of([read_run(written(without_truth, tmp_path / "run"))])["cases"]
     assert case["truth"] is None
     assert case["error"]["what"].startswith("difference from")
-
-
-def test_it_works_on_another_machine(run_directory: Path, tmp_path: Path, page: str) -> None:
-    shutil.copytree(run_directory, tmp_path / "moved" / "made-up")
-    write_html([tmp_path / "moved" / "made-up"], tmp_path / "out.html")
-    assert (tmp_path / "out.html").read_text() == page
 
 
 def test_nothing_is_fetched(page: str) -> None:
@@ -166,14 +144,6 @@ def test_the_running_median_ignores_a_single_spike_and_what_is_missing() -> None
     values[20], values[3], values[4] = 900.0, None, None
     assert running_median(values) == [2.0] * 40
     assert running_median([None, None]) == [None, None]
-
-
-@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (5, 5), (10_000, 1500)])
-def test_evenly_spread_indices_reach_both_ends(count: int, most: int) -> None:
-    kept = evenly(count, most)
-    assert kept.size == min(count, most)
-    assert kept.tolist()[:1] == [0][:count]
-    assert kept.tolist()[-1:] == [count - 1][:count]
 
 
 def _row(name: str, **said: object) -> Json:

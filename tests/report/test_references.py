@@ -91,21 +91,6 @@ def entry(directory: Path) -> dict[str, dict[str, object]]:
     return found
 
 
-@pytest.mark.parametrize(("name", "ate_yaw_m"), [("udel_gore_rect_s0", 0.017), ("euroc_V1_01_easy_rect_s0", 0.010)])
-def test_the_estimates_beside_the_real_exports_are_as_good_as_openvins_is(
-    real: Callable[[str], Path], name: str, ate_yaw_m: float
-) -> None:
-    source = str(real(f"openvins_sim/{name}"))
-    sequence = load_sequence(source)
-    (run,) = reference_runs(load_references(source), sequence)
-    values = score_run(run, "causal", sequence).values
-    # three decimals as published with the exports; a quaternion read the other way round is 100 degrees off
-    assert values["ate_yaw_m"] == pytest.approx(ate_yaw_m, abs=1e-3)
-    assert values["ate_se3_deg"] is not None
-    assert values["ate_se3_deg"] < 0.5
-    assert values["coverage_percent"] == 100.0
-
-
 def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> None:
     comparison, directory = compared(export)
     assert [(row.estimator, row.output, row.status) for row in comparison.rows if row.estimator == NAME] == [
@@ -119,17 +104,6 @@ def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> 
         assert metrics[key] is None
         assert notes[key] == "not run here"
     assert f"{NAME}: read from a file of the recording, not run here" in report_text(comparison, {})
-
-
-def test_its_figures_and_files_have_names_without_blanks_and_brackets(export: Path) -> None:
-    comparison, directory = compared(export, max_frames=10)
-    write_run(comparison, directory, MadeBy("vislam compare", Configuration(), choice="all"))
-    report = (directory / "report.md").read_text()
-    for name in ("figures/top_openvins_est.txt.png", "trajectories/openvins_est.txt_causal.tum"):
-        assert (directory / name).is_file()
-    assert "(figures/top_openvins_est.txt.png)" in report
-    manifest = json.loads((directory / "manifest.json").read_text())
-    assert (manifest["estimators"], manifest["references"]) == (["dead-reckoning"], [NAME])
 
 
 def test_one_of_another_clock_stays_and_says_so(export: Path) -> None:
@@ -176,3 +150,18 @@ def test_without_truth_the_others_are_not_measured_against_it(without_truth: Com
     assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
     (times,) = over_time.draw_frame_times(mixed)
     assert len(times.figure.axes[0].get_lines()) == 2 * len(without_truth.runs)
+
+
+@pytest.mark.parametrize(("name", "ate_yaw_m"), [("udel_gore_rect_s0", 0.017), ("euroc_V1_01_easy_rect_s0", 0.010)])
+def test_the_estimates_beside_the_real_exports_are_as_good_as_openvins_is(
+    real: Callable[[str], Path], name: str, ate_yaw_m: float
+) -> None:
+    source = str(real(f"openvins_sim/{name}"))
+    sequence = load_sequence(source)
+    (run,) = reference_runs(load_references(source), sequence)
+    values = score_run(run, "causal", sequence).values
+    # three decimals as published with the exports; a quaternion read the other way round is 100 degrees off
+    assert values["ate_yaw_m"] == pytest.approx(ate_yaw_m, abs=1e-3)
+    assert values["ate_se3_deg"] is not None
+    assert values["ate_se3_deg"] < 0.5
+    assert values["coverage_percent"] == 100.0

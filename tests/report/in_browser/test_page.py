@@ -114,24 +114,6 @@ def test_no_page_is_wider_than_its_screen(
     assert page.run("return document.querySelector('.table-frame').scrollWidth") > 390
 
 
-def test_several_runs_stand_side_by_side_and_below_each_other_on_a_phone(page: Page, several: Path) -> None:
-    def edges() -> list[tuple[float, float]]:
-        boxes = page.run(
-            "return [...document.querySelectorAll('.cases > .case')].map((c) => c.getBoundingClientRect())"
-        )
-        return [(box["left"], box["top"]) for box in boxes]
-
-    page.open(several, WIDE)
-    left, right = edges()
-    assert right[0] > left[0]
-    assert right[1] == left[1]
-    assert len(page.all("tbody tr")) == 8
-    page.open(several, PHONE)
-    upper, lower = edges()
-    assert lower[0] == upper[0]
-    assert lower[1] > upper[1]
-
-
 def test_whatever_can_be_used_has_a_name_and_a_visible_focus(page: Page, single: Path) -> None:
     page.open(single)
     page.click(".summary .quiet")

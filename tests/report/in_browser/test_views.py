@@ -120,24 +120,6 @@ def test_the_wheel_zooms_only_where_that_is_requested(page: Page, single: Path) 
     assert page.picture("canvas[data-view='top']") != before
 
 
-def test_two_fingers_zoom(page: Page, single: Path) -> None:
-    page.open(single, PHONE)
-    canvas = page.into_view("canvas[data-view='top']")
-    before = page.picture("canvas[data-view='top']")
-    box = page.run("const b = arguments[0].getBoundingClientRect(); return [b.left + b.width / 2, b.top + 100]", canvas)
-
-    def touch(kind: str, *offsets: int) -> None:
-        points = [{"x": box[0] + dx, "y": box[1], "id": i} for i, dx in enumerate(offsets)]
-        page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    touch("touchStart", -20, 20)
-    for spread in range(25, 90, 10):
-        touch("touchMove", -spread, spread)
-    touch("touchEnd")
-    assert page.picture("canvas[data-view='top']") != before
-    assert page.run("return window.visualViewport.scale") == 1  # the view was zoomed, not the page
-
-
 def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     page.open(single)
     figures = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart^='Position error']")
