@@ -5,9 +5,9 @@ depth; Civera, Davison and Montiel 2008). With it every measurement of every vie
 q, points at infinity (no disparity) need no special treatment, and Gauss-Newton converges from far away.
 
 Each track is first solved robustly: Levenberg-Marquardt on all of its views with Huber's weights. Leaving view i out
-then means subtracting its share from the normal equations and taking one Gauss-Newton step, (H - H_i) d = -(g - g_i).
-That is linear in the number of sightings, but view i still influences the weights, so tracks of at most 40 views are
-solved again from there without view i; in a longer one its influence is negligible.
+then means subtracting its contribution to the normal equations and taking one Gauss-Newton step, (H - H_i) d = -(g -
+g_i). That is linear in the number of sightings, but view i still influences the weights, so tracks of at most 40 views
+are solved again from there without view i; in a longer one its influence is negligible.
 """
 
 from collections.abc import Iterator
@@ -93,8 +93,8 @@ class Views:
         seen = self.project(points)
         return PredictedSightings(self.pixels(seen).T, seen.in_front)
 
-    def shares(self, points: Array) -> Array:
-        """Return each view's share (10, N) of its track's problem: H, g and cost, linearised at the point (3, M).
+    def contributions(self, points: Array) -> Array:
+        """Return each view's part (10, N) of its track's problem: H, g and cost, linearised at the point (3, M).
 
         The weights are Huber's.
         """
@@ -107,14 +107,14 @@ class Views:
             length = np.where(visible, length, _BEHIND_SIGMAS)
             residual, slope = np.where(visible, residual, 0.0), np.where(visible, slope, 0.0)
         weighted = slope * (visible * np.minimum(1.0, _HUBER_SIGMAS / np.maximum(length, _HUBER_SIGMAS)))
-        shares = np.empty((10, length.size))
+        contributions = np.empty((10, length.size))
         for row, (i, j) in enumerate(_UPPER):
-            shares[row] = _dot(weighted[:, i], slope[:, j])
+            contributions[row] = _dot(weighted[:, i], slope[:, j])
         for i in range(3):
-            shares[_G][i] = -_dot(weighted[:, i], residual)
+            contributions[_G][i] = -_dot(weighted[:, i], residual)
         robust = _HUBER_SIGMAS * (length - 0.5 * _HUBER_SIGMAS)
-        shares[_COST] = np.where(length <= _HUBER_SIGMAS, 0.5 * length**2, robust)
-        return shares
+        contributions[_COST] = np.where(length <= _HUBER_SIGMAS, 0.5 * length**2, robust)
+        return contributions
 
     def _slope(self, seen: _Projections) -> Array:
         """Return the derivatives (3, 3, N) of pixels by the point."""
@@ -157,9 +157,9 @@ class Views:
             per_view["sqrt_information"] = self.sqrt_information.take(other, axis=-1)
         return replace(self, track=np.repeat(np.arange(rows.size), count), first=first, **per_view)
 
-    def summed(self, shares: Array) -> Array:
-        """Sum the views' shares (..., N) to one per track (..., M)."""
-        return np.add.reduceat(shares, self.first, axis=-1)
+    def summed(self, contributions: Array) -> Array:
+        """Sum the views' contributions (..., N) to one per track (..., M)."""
+        return np.add.reduceat(contributions, self.first, axis=-1)
 
 
 def _dot(first: Array, second: Array) -> Array:
@@ -266,9 +266,9 @@ def _median_by_track(views: Views, values: Array) -> Array:
 
 
 def _without_each(views: Views, points: Array) -> Array:
-    """Return for each view its track's point (3, N) one Gauss-Newton step after the view's share is taken out."""
-    shares = views.shares(points)
-    rest = np.take(views.summed(shares), views.track, axis=1) - shares
+    """Return for each view its track's point (3, N) one Gauss-Newton step after the view is taken out."""
+    contributions = views.contributions(points)
+    rest = np.take(views.summed(contributions), views.track, axis=1) - contributions
     step = _damped_step(rest, np.full(views.track.size, _LEAST_DAMPING))
     return np.asarray(np.take(points, views.track, axis=1) - step)
 
@@ -276,10 +276,10 @@ def _without_each(views: Views, points: Array) -> Array:
 def _solve(views: Views, points: Array, iterations: int) -> Array:
     """Minimise the robust cost of every track (3, M) at once, each with a damping of its own (Levenberg-Marquardt)."""
     damping = np.full(points.shape[1], _DAMPING)
-    sums = views.summed(views.shares(points))
+    sums = views.summed(views.contributions(points))
     for _ in range(iterations):
         moved = points - _damped_step(sums, damping)
-        sums_moved = views.summed(views.shares(moved))
+        sums_moved = views.summed(views.contributions(moved))
         better = sums_moved[_COST] <= sums[_COST]
         points, sums = np.where(better, moved, points), np.where(better, sums_moved, sums)
         damping = np.where(better, np.maximum(0.1 * damping, _LEAST_DAMPING), 10.0 * damping)
