@@ -287,7 +287,9 @@ class Stamped:
         table = rows.numbers(max(rows.width, self._width) if self.may_go_on else self._width, self.columns)
         t_ns = self._stamps(rows, table[:, 0])
         pose = [1 + self.order.index(column) for column in range(7)]
-        T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, pose])
+        # A view where nothing is moved: a copy lies in another order, in which sums may differ in the last bit.
+        values = table[:, 1:8] if pose == [*range(1, 8)] else table[:, pose]
+        T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, values)
         stated = StatedApart(_symmetric(table[:, 8:14]), _symmetric(table[:, 14:20])) if self.has_covariances else None
         return PosesFile(rows.path, self.name, t_ns, T_world_imu, self.other_order, stated)
 
