@@ -1,4 +1,4 @@
-"""NEES: exact draws are consistent, wrong covariances are not, and the world it is evaluated in is the right one."""
+"""NEES of the whole state: exact draws are consistent, wrong covariances are not, in the right world."""
 
 from dataclasses import replace
 
@@ -139,3 +139,85 @@ def test_the_band_is_that_of_the_tables():
     assert np.array(nees_band(6)) * 6 == pytest.approx([1.24, 14.4], abs=0.05)
     assert np.array(nees_band(2, 50)) * 100 == pytest.approx([74.2, 129.6], abs=0.1)
     assert chi2_quantile(0.95, 3) == pytest.approx(7.815, abs=1e-3)
+
+
+# Velocity and biases
+
+STATE_KEYS = ("nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean")
+STATE_SIGMA = np.repeat([0.002, 0.03, 0.05, 0.02, 0.001], 3)  # rotation, position, velocity, both biases
+BLOCKS = {"nees_vel_mean": np.s_[6:9], "nees_accel_bias_mean": np.s_[9:12], "nees_gyro_bias_mean": np.s_[12:15]}
+
+
+def covariance() -> np.ndarray:
+    mix = np.eye(15) + 0.3 * np.tri(15, k=-1)
+    return np.diag(STATE_SIGMA) @ mix @ mix.T @ np.diag(STATE_SIGMA)
+
+
+@pytest.fixture
+def states(make_sequence, drive):
+    made = make_sequence(drive(POSES), track_count=3, motion="imu")
+    rng = np.random.default_rng(4)
+    truth = replace(made.truth, v_world=rng.normal(0, 5, (POSES, 3)), bias=rng.normal(0, 0.1, (POSES, 6)))
+    prior = Prior(truth.T_world_imu[0], np.zeros(3), np.zeros(6), covariance(), "test")
+    return replace(made, truth=truth, prior=prior)
+
+
+def drawn_states(states, make_run, scale=1.0, T_new_old=None):
+    """Return a run whose errors are drawn_states from ``scale`` times what it states, in a world of its own."""
+    truth, cov = states.truth, covariance()
+    T_new_old = np.eye(4) if T_new_old is None else T_new_old
+    error = np.random.default_rng(7).standard_normal((POSES, 15)) @ np.linalg.cholesky(scale * cov).T
+    poses = truth.T_world_imu @ se3_inverse(se3_exp(error[:, :6]))
+    poses[0] = truth.T_world_imu[0]  # the pose by which a world of its own is placed
+    v_world = truth.v_world - (poses[:, :3, :3] @ error[:, 6:9, None])[..., 0]
+    trajectory = Trajectory(
+        states.frames_t_ns,
+        T_new_old @ poses,
+        v_world=v_world @ T_new_old[:3, :3].T,
+        bias=truth.bias - error[:, 9:],
+        cov=np.broadcast_to(cov, (POSES, 15, 15)),
+    )
+    return make_run(states.frames_t_ns, trajectory.T_world_imu, causal=trajectory, final=trajectory)
+
+
+def values(run, states):
+    scores = score(Evaluation(run, "final", states))
+    return [scores.values[key] for key in STATE_KEYS], [scores.notes.get(key, "") for key in STATE_KEYS]
+
+
+@pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
+def test_errors_drawn_from_what_is_stated_have_nees_one(states, make_run, scale):
+    # Four sigma of a mean of N chi-square variables of three degrees of freedom, over these: 7 % at 4000.
+    found, _ = values(drawn_states(states, make_run, scale), states)
+    assert found == pytest.approx([scale] * 3, rel=4.0 * np.sqrt(2.0 / (3 * POSES)))
+
+
+@pytest.mark.parametrize("key", STATE_KEYS)
+def test_each_block_is_checked_by_its_own_covariance(states, make_run, key):
+    """One block stated four times too small in variance shows in its own figure alone."""
+    run, cov = drawn_states(states, make_run), np.array(covariance())
+    block, others = BLOCKS[key], [other for other in STATE_KEYS if other != key]
+    cov[block] *= 0.5
+    cov[:, block] *= 0.5
+    stated = replace(run.final, cov=np.broadcast_to(cov, (POSES, 15, 15)))
+    before = dict(zip(STATE_KEYS, values(run, states)[0], strict=True))
+    after = dict(zip(STATE_KEYS, values(replace(run, final=stated), states)[0], strict=True))
+    assert after[key] == pytest.approx(4.0 * before[key], rel=1e-9)
+    assert [after[other] for other in others] == [before[other] for other in others]
+
+
+def test_a_state_without_them_says_so(states, make_run, make_sequence, drive):
+    """A state of nine has a gyro bias; one of six nothing but the pose; a truth may have poses alone."""
+    run = drawn_states(states, make_run)
+    kept = [*range(6), *range(12, 15)]
+    cov = np.broadcast_to(covariance()[np.ix_(kept, kept)], (POSES, 9, 9))
+    nine = replace(run.final, v_world=None, cov=cov)
+    found, notes = values(replace(run, final=nine), states)
+    assert found[0] is None and found[2] is None and found[1] == pytest.approx(1.0, rel=0.1)
+    assert "no part of the state" in notes[0] and "no part of the state" in notes[2]
+    six = replace(run.final, cov=np.broadcast_to(covariance()[:6, :6], (POSES, 6, 6)))
+    assert values(replace(run, final=six), states) == ([None] * 3, ["the covariance is that of the pose alone"] * 3)
+    bare = replace(states, truth=Truth(states.truth.t_ns, states.truth.T_world_imu))
+    found, notes = values(run, bare)
+    assert found == [None] * 3
+    assert notes == [f"the ground truth has no {what}" for what in ("velocity", "biases", "biases")]
