@@ -7,7 +7,7 @@ import numpy as np
 from toolkit.audit.robust import Scalar, median_error
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3_exp, se3_inverse
-from toolkit.measurements import NS_PER_S
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.noise import white_sigma
 from toolkit.motion_samples import ImuSamples, NoSamples, TwistSamples
@@ -217,3 +217,11 @@ def is_from_scatter(density: Array, values: Array, t_ns: IntArray) -> bool:
     """Say whether a density (3,) of white noise looks as if estimated from the scatter of the samples (S, 3)."""
     root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
     return bool((density > FROM_SCATTER * white_sigma(values) * root_dt).all())
+
+
+def stated_densities(noise: MotionNoise) -> Array:
+    """Return the stated densities (6,) of the white noise of linear and angular samples."""
+    if isinstance(noise, TwistNoise):
+        return np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
+    assert isinstance(noise, ImuNoise)
+    return np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,18 +19,39 @@ from toolkit.audit.intervals import (
     ratio_of_speeds,
     rotation_ratio,
     speed_ratio,
+    stated_densities,
 )
 from toolkit.audit.one_step import median_one_step_px
 from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, BoolArray, se3
-from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise, is_measured
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionKind, TwistNoise, is_measured
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.models.noise import white_sigma
 from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.sequence import Sequence
 
-COORDINATES = ("uL", "uR", "v")
-CHANNELS = {"twist": ("velocity", "rate of rotation"), "imu": ("accelerometer", "gyro")}
+
+class Sensor(NamedTuple):
+    """One of the two sensors of a kind of motion: the names of a value and of all, its columns, and their unit."""
+
+    name: str
+    plural: str
+    columns: slice
+    unit: str
+
+
+_LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
+SENSORS: dict[MotionKind, tuple[Sensor, ...]] = {
+    "none": (),
+    "twist": (
+        Sensor("velocity", "velocities", _LINEAR, "m/s"),
+        Sensor("rate of rotation", "rates of rotation", _ANGULAR, "rad/s"),
+    ),
+    "imu": (
+        Sensor("accelerometer", "accelerometer", _LINEAR, "m/s^2"),
+        Sensor("gyro", "gyro", _ANGULAR, "rad/s"),
+    ),
+}
 
 
 def not_finite(evidence: Evidence) -> Symptom | None:
@@ -41,9 +63,9 @@ def not_finite(evidence: Evidence) -> Symptom | None:
     if bad_sightings + bad_samples == 0:
         return None
     uv_px, values = sequence.observations.uv_px, sequence.motion.values
-    empty = _empty(uv_px[:, [0, 2]], (COORDINATES[0], COORDINATES[2]))
+    empty = _empty(uv_px[:, [0, 2]], ("uL", "v"))
     if sequence.motion_kind != "none":
-        names = (f"{sensor} {axis}" for sensor in CHANNELS[sequence.motion_kind] for axis in "xyz")
+        names = (f"{sensor.name} {axis}" for sensor in SENSORS[sequence.motion_kind] for axis in "xyz")
         empty += _empty(values, tuple(names))
     detail = f"{bad_sightings} sighting(s) and {bad_samples} motion sample(s) are not finite"
     detail += f" ({', '.join(empty)} in all of them)" if empty else ""
@@ -179,7 +201,6 @@ MOST_REPEATED = 0.2
 LEAST_OF_AXIS_S = 1.0
 # Median speed and rate of the camera below which the vehicle may stand, or drive straight ahead.
 CAMERA_STANDING_MPS, STRAIGHT_RADPS = 0.1, 0.01
-IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
 
 def stuck_samples(evidence: Evidence) -> Symptom | None:
@@ -196,32 +217,29 @@ def stuck_samples(evidence: Evidence) -> Symptom | None:
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
     step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
     least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
-    if sequence.motion_kind == "twist" and (never := _never_moves(evidence)) is not None:
-        return never
     if sequence.motion_kind == "twist":
+        if (never := _never_moves(evidence)) is not None:
+            return never
         moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
         repeated = {"odometry": _in_long_runs(values, _least_of_odometry(values, least, step_s)) & moves_and_turns}
     else:
-        repeated = {name: _in_long_runs(values[:, columns], least) for name, columns in IMU_SENSORS.items()}
-    stuck_axes = _stuck_axes(values, repeated, step_s) if sequence.motion_kind == "imu" else None
-    if stuck_axes is not None:
-        return stuck_axes
+        repeated = {one.name: _in_long_runs(values[:, one.columns], least) for one in SENSORS["imu"]}
+        if (stuck_axes := _stuck_axes(values, repeated, step_s)) is not None:
+            return stuck_axes
     stuck = np.logical_or.reduce(list(repeated.values()))
     if not stuck.any():
         return None
-    seconds = {name: float(rows.sum()) * step_s for name, rows in repeated.items()}
-    too_many = stuck.mean() > MOST_REPEATED
-    return Symptom(
-        count=int(stuck.sum()),
-        detail=", ".join(f"the {name} repeats one value for {time:.3g} s" for name, time in seconds.items() if time),
-        treatment=(
-            "too long to be bridged: check the driver and the cables"
-            if too_many
-            else "repeated samples are dropped; the others bridge the gap"
-        ),
-        remedy=None if too_many else keep_samples(sequence, ~stuck),
-        spoils_vision=bool(too_many),
-    )
+    detail = _repeats(repeated, step_s)
+    if stuck.mean() > MOST_REPEATED:
+        why = "too long to be bridged: check the driver and the cables"
+        return Symptom(int(stuck.sum()), detail, why, remedy=None, spoils_vision=True)
+    why = "repeated samples are dropped; the others bridge the gap"
+    return Symptom(int(stuck.sum()), detail, why, keep_samples(sequence, ~stuck))
+
+
+def _repeats(rows: Mapping[str, BoolArray], step_s: float) -> str:
+    seconds = {name: float(here.sum()) * step_s for name, here in rows.items()}
+    return ", ".join(f"the {name} repeats one value for {time:.3g} s" for name, time in seconds.items() if time)
 
 
 def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
@@ -238,19 +256,16 @@ def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
 
 def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Symptom | None:
     """Report single axes of an IMU (S, 6) that repeat one value while the other axes of the sensor do not."""
-    least, found = max(LEAST_RUN, round(LEAST_OF_AXIS_S / max(step_s, 1e-6))), list[tuple[str, BoolArray]]()
-    for name, columns in IMU_SENSORS.items():
-        for axis, column in zip("xyz", values[:, columns].T, strict=True):
-            repeats = _in_long_runs(column[:, None], least) & ~whole[name] & ~_at_an_end(column)
-            found += [(f"{name} {axis}", repeats)] if repeats.any() else []
+    least, found = max(LEAST_RUN, round(LEAST_OF_AXIS_S / max(step_s, 1e-6))), dict[str, BoolArray]()
+    for sensor in SENSORS["imu"]:
+        for axis, column in zip("xyz", values[:, sensor.columns].T, strict=True):
+            repeats = _in_long_runs(column[:, None], least) & ~whole[sensor.name] & ~_at_an_end(column)
+            found |= {f"{sensor.name} {axis}": repeats} if repeats.any() else {}
     if not found:
         return None
-    return Symptom(
-        count=int(np.logical_or.reduce([rows for _, rows in found]).sum()),
-        detail=", ".join(f"the {name} repeats one value for {rows.sum() * step_s:.3g} s" for name, rows in found),
-        treatment="the true values are unknown: check the driver and the cables (real samples have noise)",
-        remedy=None,
-    )
+    why = "the true values are unknown: check the driver and the cables (real samples have noise)"
+    count = int(np.logical_or.reduce(list(found.values())).sum())
+    return Symptom(count, _repeats(found, step_s), why, remedy=None)
 
 
 def _at_an_end(column: Array) -> BoolArray:
@@ -268,24 +283,18 @@ def _never_moves(evidence: Evidence) -> Symptom | None:
     camera, values = evidence.camera_motion, evidence.sequence.motion.values
     if not len(values) or camera.known.sum() < LEAST_RUN:
         return None
-    speed_mps = float(np.median(np.linalg.norm(camera.v_mps[camera.known], axis=1)))
-    rate_radps = float(np.median(np.linalg.norm(camera.w_radps[camera.known], axis=1)))
-    findings = []
-    if not values[:, :3].any() and speed_mps > CAMERA_STANDING_MPS:
-        findings.append(f"all {len(values)} velocities are zero while the camera moves at {speed_mps:.2g} m/s (median)")
-    if not values[:, 3:].any() and rate_radps > STRAIGHT_RADPS:
-        findings.append(
-            f"all {len(values)} rates of rotation are zero while the camera turns at {rate_radps:.2g} rad/s"
-        )
+    moved, findings = (camera.v_mps, camera.w_radps), list[str]()
+    for sensor, seen, least, moves in zip(
+        SENSORS["twist"], moved, (CAMERA_STANDING_MPS, STRAIGHT_RADPS), ("moves", "turns"), strict=True
+    ):
+        usual = float(np.median(np.linalg.norm(seen[camera.known], axis=1)))
+        if not values[:, sensor.columns].any() and usual > least:
+            camera_moves = f"the camera {moves} at {usual:.2g} {sensor.unit}"
+            findings.append(f"all {len(values)} {sensor.plural} are zero while {camera_moves} (median)")
     if not findings:
         return None
-    return Symptom(
-        count=len(values),
-        detail=", and ".join(findings),
-        treatment="they were not recorded: check the driver and the cables",
-        remedy=None,
-        spoils_vision=True,
-    )
+    why = "they were not recorded: check the driver and the cables"
+    return Symptom(len(values), ", and ".join(findings), why, remedy=None, spoils_vision=True)
 
 
 def _in_long_runs(values: Array, least: int) -> BoolArray:
@@ -304,8 +313,6 @@ def _in_long_runs(values: Array, least: int) -> BoolArray:
 # Least number of samples at the largest value of an axis, and the least ratio to the number at the value next to it. A
 # sensor with coarse steps also has several samples at its largest value, but more at the one next to it.
 LEAST_COUNT, LEAST_RATIO = 10, 3.0
-AXES = tuple(f"{sensor} {axis}" for sensor in ("accelerometer", "gyro") for axis in "xyz")
-UNITS = ("m/s^2", "m/s^2", "m/s^2", "rad/s", "rad/s", "rad/s")
 
 
 def saturated_samples(evidence: Evidence) -> Symptom | None:
@@ -314,12 +321,14 @@ def saturated_samples(evidence: Evidence) -> Symptom | None:
         return None
     values = evidence.sequence.motion.values
     findings, rows = list[str](), np.zeros(len(values), dtype=bool)
-    for name, unit, column in zip(AXES, UNITS, values.T, strict=True):
+    axes = [(sensor, axis) for sensor in SENSORS["imu"] for axis in "xyz"]
+    for (sensor, axis), column in zip(axes, values.T, strict=True):
         for sign in (1.0, -1.0):
             at_end = _at_range_end(sign * column)
             if at_end.any():
                 rows |= at_end
-                findings.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
+                at = f"{column[at_end][0]:.3g} {sensor.unit}"
+                findings.append(f"{sensor.name} {axis} at {at} ({at_end.sum()} samples)")
     if not findings:
         return None
     return Symptom.warning(
@@ -341,21 +350,6 @@ def _at_range_end(column: Array) -> BoolArray:
 LEAST_COARSE_SAMPLES, LEAST_VALUES = 100, 5
 # Rounding is reported from this share of the stated standard deviation of a sample on, as for pixels.
 MOST_ROUNDING = 0.5
-_COLUMNS = {
-    "twist": (("velocities", "m/s"), ("rates of rotation", "rad/s")),
-    "imu": (("accelerometer", "m/s^2"), ("gyro", "rad/s")),
-}
-
-
-class _Coarse(NamedTuple):
-    """The step of a sensor's axis, and the stated standard deviation of a sample, in its unit."""
-
-    step: float
-    stated: float
-
-    @property
-    def rounding(self) -> float:
-        return self.step / float(np.sqrt(12.0))
 
 
 def coarse_samples(evidence: Evidence) -> Symptom | None:
@@ -371,33 +365,20 @@ def coarse_samples(evidence: Evidence) -> Symptom | None:
     step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
     if not step_s > 0.0:
         return None
-    values, stated = sequence.motion.values, _stated(sequence.noise) / np.sqrt(step_s)
-    found = list[str]()
-    for columns, (name, unit) in zip((slice(0, 3), slice(3, 6)), _COLUMNS[sequence.motion_kind], strict=True):
-        axes = [
-            _Coarse(*one) for one in zip(map(_step_of, values[:, columns].T), stated[columns].tolist(), strict=True)
-        ]
-        worst = max(axes, key=lambda one: one.rounding / one.stated)
-        if worst.rounding > MOST_ROUNDING * worst.stated:
+    sigma, found = stated_densities(sequence.noise) / np.sqrt(step_s), list[str]()
+    step = np.array([_step_of(column) for column in sequence.motion.values.T])
+    rounding = step / np.sqrt(12.0)
+    for sensor in SENSORS[sequence.motion_kind]:
+        k = sensor.columns.start + int(np.argmax((rounding / sigma)[sensor.columns]))
+        if rounding[k] > MOST_ROUNDING * sigma[k]:
             found.append(
-                f"{name} come in steps of {worst.step:.3g} {unit}, which adds errors of {worst.rounding:.2g} to the "
-                f"{worst.stated:.2g} {unit} stated for a sample"
+                f"{sensor.plural} come in steps of {step[k]:.3g} {sensor.unit}, which adds errors of {rounding[k]:.2g} "
+                f"to the {sigma[k]:.2g} {sensor.unit} stated for a sample"
             )
     if not found:
         return None
-    return Symptom.warning(
-        count=len(found),
-        detail="; ".join(found),
-        treatment="write all the digits that the sensor has, or state noise that includes the rounding",
-    )
-
-
-def _stated(noise: MotionNoise) -> Array:
-    """Return the stated densities (6,) of linear and angular samples."""
-    if isinstance(noise, TwistNoise):
-        return np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
-    assert isinstance(noise, ImuNoise)
-    return np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
+    why = "write all the digits that the sensor has, or state noise that includes the rounding"
+    return Symptom.warning(len(found), "; ".join(found), why)
 
 
 def _step_of(column: Array) -> float:
@@ -417,7 +398,6 @@ MOST_WHITE = 40.0
 # recording).
 MOST_WALK = 3.0
 LEAST_SAMPLES = 100
-_SENSORS = {"accel": (slice(0, 3), "m/s^2"), "gyro": (slice(3, 6), "rad/s")}
 
 
 def overstated_noise(evidence: Evidence) -> Symptom | None:
@@ -451,22 +431,17 @@ def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
     """Yield a description of each stated density that samples (S, 6) at times (S,) contradict, with both figures."""
     step_s = float(np.median(np.diff(t_s)))
     lag_s = 0.25 * float(t_s[-1] - t_s[0])
-    for name, (columns, unit) in _SENSORS.items():
+    for name, (_, _, columns, unit) in zip(("accel", "gyro"), SENSORS["imu"], strict=True):
         stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s)
         found = float(white_sigma(values[:, columns]).max())
-        error = found / np.sqrt(len(values))
         if stated > MOST_WHITE * found and found > 0.0:
-            yield (
-                f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and measured are {found:.2g} "
-                f"+- {error:.1g}"
-            )
+            measured = f"measured are {found:.2g} +- {found / np.sqrt(len(values)):.1g}"
+            yield f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and {measured}"
         stated = getattr(noise, f"{name}_random_walk") * np.sqrt(lag_s)
         found = _moved(t_s, values[:, columns], lag_s)
         if stated > MOST_WALK * found > 0.0:
-            yield (
-                f"by {name}_random_walk they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are "
-                f"{found:.3g}"
-            )
+            drift = f"they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are {found:.3g}"
+            yield f"by {name}_random_walk {drift}"
 
 
 def _moved(t_s: Array, values: Array, lag_s: float) -> float:
@@ -570,7 +545,8 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
     found: list[_WrongUnit] = []
     now = evidence
     stamps = _stamps(evidence) or _frame_rate(evidence)
-    measures = (_baseline, _lever_arm, _speed, _rotation, _force, _truth)
+    of_samples = (partial(_of_samples, quantity=quantity) for quantity in _QUANTITIES)
+    measures: tuple[Callable[[Evidence], _WrongUnit | None], ...] = (_baseline, _lever_arm, *of_samples, _truth)
     found += [] if stamps is None else [stamps]
     for measure in measures if stamps is None else ():
         wrong = measure(now)
@@ -660,48 +636,59 @@ def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
     return _WrongUnit(f"{summary}: its translation is in {unit}", remedy)
 
 
-def _speed(evidence: Evidence) -> _WrongUnit | None:
-    ratio = speed_ratio(evidence.intervals)
-    unit = None if ratio is None else _in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, UNIT_SIGMAS)
+class _Quantity(NamedTuple):
+    """A quantity of the samples that may be in another unit: its ratio to another source, and the units' factors."""
+
+    summary: str
+    ratio_of: Callable[[Sequence, Intervals | None], Scalar | None]
+    factors: Mapping[str, float]
+    within: float
+    columns: slice
+    by_camera: bool = True
+
+
+_QUANTITIES = (
+    _Quantity(
+        "the samples' speed is {:.3g} +- {:.1g} times the camera's",
+        lambda _, intervals: speed_ratio(intervals),
+        SPEEDS,
+        WITHIN_FACTOR_OF_SPEED,
+        _LINEAR,
+    ),
+    _Quantity(
+        "the gyro turns {:.3g} +- {:.1g} times as fast as the camera",
+        lambda _, intervals: None if intervals is None else rotation_ratio(intervals),
+        RATES,
+        WITHIN_FACTOR,
+        _ANGULAR,
+    ),
+    _Quantity(
+        "the accelerometer reads {:.3g} times gravity (median)",
+        lambda sequence, _: force_ratio(sequence),
+        FORCES,
+        WITHIN_FACTOR,
+        _LINEAR,
+        by_camera=False,
+    ),
+)
+
+
+def _of_samples(evidence: Evidence, quantity: _Quantity) -> _WrongUnit | None:
+    """Judge a quantity of the samples; both halves of the recording must have the unit."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    ratio = quantity.ratio_of(sequence, intervals)
+    unit = None if ratio is None else _in_other_unit(ratio, quantity.factors, quantity.within, UNIT_SIGMAS)
     if ratio is None or unit is None:
         return None
-    summary = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
-    if not _all_along(evidence, speed_ratio, SPEEDS[unit]):
-        return _WrongUnit(f"{summary}{IN_A_PART}", None)
-    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
-
-
-def _rotation(evidence: Evidence) -> _WrongUnit | None:
-    intervals = evidence.intervals
-    if intervals is None:
-        return None
-    ratio = rotation_ratio(intervals)
-    unit = _in_other_unit(ratio, RATES, WITHIN_FACTOR, UNIT_SIGMAS)
-    if unit is None:
-        return None
-    summary = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
-    if not _all_along(evidence, rotation_ratio, RATES[unit]):
-        return _WrongUnit(f"{summary}{IN_A_PART}", None)
-    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
-
-
-def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
-    """Say whether both halves of the recording have a ratio nearer to a unit's factor than to one."""
-    intervals = evidence.intervals
-    assert intervals is not None
-    first = np.arange(intervals.interval.size) < intervals.interval.size // 2
-    halves = (intervals.select(first), intervals.select(~first))
-    ratios = [ratio for half in halves if (ratio := ratio_of(half)) is not None]
-    return all((ratio.value > np.sqrt(factor)) == (factor > 1.0) for ratio in ratios)
-
-
-def _force(evidence: Evidence) -> _WrongUnit | None:
-    ratio = force_ratio(evidence.sequence)
-    unit = None if ratio is None else _in_other_unit(ratio, FORCES, WITHIN_FACTOR, UNIT_SIGMAS)
-    if ratio is None or unit is None:
-        return None
-    summary = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
-    return _WrongUnit(summary, _scaled(evidence.sequence, 1.0 / FORCES[unit]))
+    factor, summary = quantity.factors[unit], f"{quantity.summary.format(*ratio)}: it is in {unit}"
+    if quantity.by_camera and intervals is not None:
+        first = np.arange(intervals.interval.size) < intervals.interval.size // 2
+        halves = (quantity.ratio_of(sequence, intervals.select(rows)) for rows in (first, ~first))
+        if any(half is not None and (half.value > np.sqrt(factor)) != (factor > 1.0) for half in halves):
+            return _WrongUnit(f"{summary}{IN_A_PART}", None)
+    scale = np.ones(6)
+    scale[quantity.columns] /= factor
+    return _WrongUnit(summary, _scaled(sequence, scale))
 
 
 def _truth(evidence: Evidence) -> _WrongUnit | None:
@@ -738,23 +725,19 @@ def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: f
     return near[0] if len(near) == 1 else None
 
 
-def _scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Sequence:
-    """Return the sequence with its motion samples multiplied, linear and angular ones.
+def _scaled(sequence: Sequence, scale: Array) -> Sequence:
+    """Return the sequence with the columns of its motion samples multiplied (6,), linear and angular ones.
 
     Noise that the file did not state, but a loader estimated from the scatter of the samples, is in their unit and
     is scaled as well.
     """
     motion, noise = sequence.motion, sequence.noise
-    scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
+    scaled = replace(sequence, motion=motion.of(motion.t_ns, motion.values * scale))
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
-        return replace(sequence, motion=scaled)
+        return scaled
     velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
-    if linear != 1.0 and is_from_scatter(velocity, motion.v_mps, motion.t_ns):
-        velocity = linear * velocity
-    if angular != 1.0 and is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
-        gyro_noise = angular * gyro_noise
-    return replace(
-        sequence,
-        motion=scaled,
-        noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
-    )
+    if is_from_scatter(velocity, motion.v_mps, motion.t_ns):
+        velocity = scale[_LINEAR] * velocity
+    if is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
+        gyro_noise = scale[_ANGULAR] * gyro_noise
+    return replace(scaled, noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise))

@@ -10,12 +10,12 @@ from toolkit.audit.bundle import CHANGE, LATE
 from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
 from toolkit.audit.self_calibration import self_calibration
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
-from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise, TwistNoise
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.motion_samples import Bridges, MotionSamples, NoSamples, TwistSamples
@@ -466,7 +466,7 @@ def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
         density_squared = (np.mean(summed**2, axis=0) / elapsed_s).max(axis=0)
     else:
         density_squared = np.var(values, axis=0) * steps * step_s
-    excess = density_squared.reshape(2, 3).max(axis=1) / _stated_densities(sequence.noise) ** 2
+    excess = density_squared.reshape(2, 3).max(axis=1) / stated_densities(sequence.noise).reshape(2, 3).min(axis=1) ** 2
     return np.asarray(np.sqrt(1.0 + excess))
 
 
@@ -476,14 +476,6 @@ def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray
         return np.empty(0, dtype=np.int64)
     holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
     return np.flatnonzero(holes_before[steps:] == holes_before[:-steps])
-
-
-def _stated_densities(noise: MotionNoise) -> Array:
-    """Return the stated densities (2,) of linear and angular samples, the smallest over the axes."""
-    if isinstance(noise, TwistNoise):
-        return np.array([noise.velocity_noise_density.min(), noise.gyro_noise_density.min()])
-    assert isinstance(noise, ImuNoise)
-    return np.array([noise.accel_noise_density, noise.gyro_noise_density])
 
 
 def _filled(motion: MotionSamples, rows: IntArray, usual_ns: float) -> MotionSamples:
