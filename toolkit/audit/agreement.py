@@ -1,6 +1,6 @@
 """Faults that show only where vision is compared with the measured motion, at once or from some time on."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import stdtrit
 
 from toolkit.audit.alignment import ForceBesideCamera
-from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
     FORCES,
     LEAST_INTERVALS,
@@ -43,12 +43,11 @@ OTHER_RATES = {"turns a minute": 30.0 / np.pi, "mrad/s": 1000.0}
 MOST_ANGLE_DEG = 60.0
 
 
-def disagreement(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def disagreement(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report tracks that do not follow the measured motion after all repairs."""
-    if evidence.intervals is None:
-        return evidence.blind
     found = evidence.agreement
-    findings = _ratios(evidence)
+    findings = [*_direction(intervals), *_ratios(evidence.sequence, intervals)]
     if found.residual_px > found.limit_px or found.own_px > found.limit_px or findings:
         findings.append(
             f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion "
@@ -63,48 +62,39 @@ def disagreement(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom(count=1, detail="; ".join(findings), treatment=treatment, remedy=None)
 
 
-def _ratios(evidence: Evidence) -> list[str]:
-    """Describe which sizes of the motion differ from the camera's, or from gravity, by a factor."""
-    assert evidence.intervals is not None
-    speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
-    rotation = rotation_ratio(evidence.intervals)
-    findings = []
-    angle_deg = _median_angle_deg(evidence)
-    if angle_deg is not None and angle_deg > MOST_ANGLE_DEG:
-        findings.append(f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)")
+def _direction(intervals: Intervals) -> Iterator[str]:
+    """Yield a description of velocities in the faster half that point away from the camera's (median)."""
+    if intervals.v_mps is None:
+        return
+    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
+    lengths = np.linalg.norm(measured, axis=1) * np.linalg.norm(seen, axis=1)
+    moving = lengths > np.median(lengths)
+    if moving.sum() < LEAST_INTERVALS // 2:
+        return
+    cosine = np.median(np.sum(measured * seen, axis=1)[moving] / lengths[moving])
+    angle_deg = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    if angle_deg > MOST_ANGLE_DEG:
+        yield f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)"
+
+
+def _ratios(sequence: Sequence, intervals: Intervals) -> Iterator[str]:
+    """Yield a description of each size of the motion that differs from the camera's, or gravity, by a factor."""
+    speed, rotation, force = speed_ratio(intervals), rotation_ratio(intervals), force_ratio(sequence)
     if speed is not None and _is_off(speed, 1.0 / MOST_RATIO, MOST_RATIO):
         meant = _units_meant(speed.value, SPEEDS | OTHER_SPEEDS)
-        findings.append(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}")
+        yield f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}"
     if _is_off(rotation, 0.0, MOST_RATIO):
         meant = _units_meant(rotation.value, RATES | OTHER_RATES)
-        findings.append(
-            f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}"
-        )
+        yield f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}"
     if force is not None and _is_off(force, 1.0 / MOST_FORCE_RATIO, MOST_FORCE_RATIO):
         meant = _units_meant(force.value, FORCES | OTHER_FORCES)
-        findings.append(f"the accelerometer reads {force.value:.3g} times gravity (median){meant}")
-    return findings
+        yield f"the accelerometer reads {force.value:.3g} times gravity (median){meant}"
 
 
 def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:
     """Name the units whose factor is near a ratio, if there are any."""
     units = [unit for unit, factor in factors.items() if abs(ratio / factor - 1.0) < NEAR_UNIT]
     return f", as if in {' or '.join(units)}" if units else ""
-
-
-def _median_angle_deg(evidence: Evidence) -> float | None:
-    """Return the median angle between the samples' velocity and the camera's in the faster half; None with an IMU."""
-    intervals = evidence.intervals
-    assert intervals is not None
-    if intervals.v_mps is None:
-        return None
-    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
-    lengths = np.linalg.norm(measured, axis=1) * np.linalg.norm(seen, axis=1)
-    moving = lengths > np.median(lengths)
-    if moving.sum() < LEAST_INTERVALS // 2:
-        return None
-    cosine = np.sum(measured * seen, axis=1)[moving] / lengths[moving]
-    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1.0, 1.0))))
 
 
 def _is_off(ratio: Scalar, least: float, most: float) -> bool:
@@ -137,10 +127,8 @@ _LOWER_QUARTILE = 0.3186
 class Deviation(NamedTuple):
     """Samples less camera: ``value`` (n, 3) in ``unit``, at times ``t_s`` (n,) after the first frame.
 
-    ``what`` names the quantity.
-
-    ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of n. Where ``telescopes`` it is
-    times n: the mean of changes of velocity depends only on the velocities at both ends.
+    ``what`` names the quantity. ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of
+    n. Where ``telescopes`` it is times n: the mean of changes of velocity depends only on the velocities at both ends.
     """
 
     what: str
@@ -159,41 +147,33 @@ class Span(NamedTuple):
     size: float
 
 
-def conflict(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def conflict(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the times at which vision and samples differ for seconds, and by how much; nothing is repaired.
 
     Most of the points in view may belong to traffic, wheels may slip, or an IMU may be shaken. The deviation of the
     samples from the camera's own motion is averaged over stretches of time and compared with the scatter of such
     means in the rest of the recording.
     """
-    if evidence.intervals is None:
-        return evidence.blind
     sequence, found = evidence.sequence, list[tuple[Deviation, Span]]()
-    speed_mps = float(np.median(np.linalg.norm(evidence.intervals.v_cam_mps, axis=1)))
-    for deviation in _deviations(evidence, evidence.intervals):
+    speed_mps = float(np.median(np.linalg.norm(intervals.v_cam_mps, axis=1)))
+    for deviation in _deviations(evidence, intervals):
         least = LEAST_DEVIATION[deviation.what] + LEAST_OF_SPEED * speed_mps * (deviation.what == "velocity")
         found += [(deviation, span) for span in sustained(deviation, CONFLICT_SIGMAS, least)]
     if not found:
         return None
     samples = "the IMU" if sequence.motion_kind == "imu" else "odometry"
+    where = ", ".join(
+        f"{span.begin_s:.0f}-{span.end_s:.0f} s (by {span.size:.2g} {deviation.unit} of {deviation.what})"
+        for deviation, span in sorted(found, key=lambda one: one[1].begin_s)
+    )
+    spans_ns = (np.rint(np.array(span[:2]) * NS_PER_S).astype(int) + int(sequence.frames_t_ns[0]) for _, span in found)
     return Symptom.warning(
         count=len(found),
-        detail=f"vision and {samples} disagree at {', '.join(_detail(*one) for one in sorted(found, key=_begin))}",
+        detail=f"vision and {samples} disagree at {where}",
         treatment="moving objects or wrong samples: do not rely on any estimate from there on",
-        spans_ns=tuple(_in_ns(span, int(sequence.frames_t_ns[0])) for _, span in found),
+        spans_ns=tuple((int(begin), int(end)) for begin, end in spans_ns),
     )
-
-
-def _begin(one: tuple[Deviation, Span]) -> float:
-    return one[1].begin_s
-
-
-def _in_ns(span: Span, first_ns: int) -> tuple[int, int]:
-    return first_ns + round(span.begin_s * NS_PER_S), first_ns + round(span.end_s * NS_PER_S)
-
-
-def _detail(deviation: Deviation, span: Span) -> str:
-    return f"{span.begin_s:.0f}-{span.end_s:.0f} s (by {span.size:.2g} {deviation.unit} of {deviation.what})"
 
 
 def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ...]:
@@ -296,17 +276,14 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: ForceBeside
     constant but for the drift of the gyro. The integrals of both are subtracted from the velocities before the median
     of five neighbours is taken: the median of velocities that vibrate or fall differs from their mean.
     """
-    frames_t_ns = sequence.frames_t_ns
-    middle_ns = found.middle_ns
-    h_s = np.diff(middle_ns)[:, None] / NS_PER_S
-    fallen = (
-        found.gravity_mps
-        - np.median(np.diff(found.gravity_mps, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
-    )
+    middle_s = (found.middle_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    h_s = np.diff(middle_s)[:, None]
+    gravity_mps2 = np.median(np.diff(found.gravity_mps, axis=0) / h_s, axis=0)
+    fallen = found.gravity_mps - gravity_mps2 * (middle_s - middle_s[0])[:, None]
     smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
     sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
     rows = np.flatnonzero(sound[1:] & sound[:-1])
-    t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
+    t_s = middle_s[rows]
     value = (np.diff(smooth, axis=0) / h_s)[rows]
     bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(fallen) - 2]]
     # Without three known intervals in a row, the scatter of the velocities is unknown.
@@ -345,15 +322,13 @@ STANDING_MPS = 0.05
 LEAST_STRETCHES_ASIDE = 2
 
 
-def scale_change(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def scale_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report a step of odometry's scale: a tyre loses air, a gear or a focus is changed.
 
     The ratio of the measured velocity to the camera's is computed in ten stretches. A step between two of them is
     reported where the scatter within the parts before and after does not explain it.
     """
-    if evidence.intervals is None:
-        return evidence.blind
-    intervals = evidence.intervals
     if intervals.v_mps is None:
         return None  # an IMU has no speed to compare
     measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
@@ -510,16 +485,15 @@ AROUND, STAYS_SIGMAS, SHARE = 60, 4.0, (0.5, 1.75)
 LEAST_AROUND = 10
 
 
-def image_jump(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def image_jump(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the times at which the image is displaced for good: a knock of the camera, another crop.
 
     For one interval the camera seems to rotate by an angle that the gyro did not measure. A slip of the tracks
     causes the same, but does not last: with odometry the camera's velocity must be rotated by that angle from then
     on.
     """
-    if evidence.intervals is None:
-        return evidence.blind
-    sequence, intervals = evidence.sequence, evidence.intervals
+    sequence = evidence.sequence
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     excess_radps = intervals.w_seen_radps - intervals.w_radps + intervals.bias_radps
     turn_rad = excess_radps * np.diff(frame_s)[intervals.interval][:, None]

@@ -17,7 +17,7 @@ from toolkit.audit.alignment import (
     turn_by_rotations,
 )
 from toolkit.audit.bundle import BASELINE, GYRO_BIAS, LATE, RIGHT_ROLL, RIGHT_SHIFT, TURN
-from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
     LEAST_INTERVALS,
     MOST_FORCE_RATIO,
@@ -419,16 +419,14 @@ class _Bounds(NamedTuple):
     most: float
 
 
-def gyro_scale(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def gyro_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the axes of the gyro whose rates are a multiple of the camera's: a channel with a wrong scale.
 
     Noise of the camera's rates makes the slope of the gyro's rates on them too small, noise of the gyro makes the
     inverse of the opposite slope too large (Frisch, "Statistical confluence analysis", 1934). Where both are above
     1, or both below, noise does not explain it.
     """
-    intervals = evidence.intervals
-    if intervals is None:
-        return evidence.blind
     off, doubtful = list[str](), list[str]()
     for axis, (measured, seen) in zip("xyz", _rates(intervals), strict=True):
         found = _sensitivity(measured, seen)
@@ -488,15 +486,14 @@ HIDDEN_M = {"twist": 1.2, "imu": 0.5}
 LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
-def lever_arm(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def lever_arm(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the axes along which the camera is not at the position of the extrinsic.
 
     In a turn of rate w, a camera whose position is wrong by p moves by w x p more than expected, so that residuals
     appear in turns only. The data do not show whether the camera is elsewhere or the velocities are of another point.
     With an IMU the self-calibration decides, which follows points over seconds.
     """
-    if evidence.intervals is None:
-        return evidence.blind
     found, kind, T_imu_cam = evidence.position, evidence.sequence.motion_kind, evidence.sequence.rig.T_imu_cam
     if found is None:
         return Undecided(f"the camera's position: {_unfitted(kind)}")
@@ -554,16 +551,14 @@ SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
 LARGEST_RAD = 0.05
 
 
-def miscalibration(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report small errors of the calibration that bend a trajectory: rotation, K, a sensor's scale.
 
     From frame to frame, a rotated camera cannot be distinguished from a principal point that is off. Points
     followed over a second distinguish most errors (`self_calibration`). With odometry, whose slip lasts as long,
     the rotation from frame to frame is judged as well.
     """
-    intervals = evidence.intervals
-    if intervals is None:
-        return evidence.blind
     calibration = _calibration(evidence, intervals)
     wrongs, rotation = list(calibration.wrongs), rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation, SYSTEMATIC_RATE[evidence.sequence.motion_kind]):
@@ -649,14 +644,13 @@ LARGEST_HIDDEN_SCALE = {"twist": 0.08, "imu": 0.01}
 LARGEST_CHANCE = 0.02
 
 
-def vision_scale(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def vision_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report steps of vision longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
 
     A relative error of all depths scales every step of the camera by the same factor. Odometry's velocities show it;
     with an IMU it is the baseline of the self-calibration. A ratio beyond MOST_RATIO is a `disagreement`.
     """
-    if evidence.intervals is None:
-        return evidence.blind
     if evidence.velocity_fit is not None:
         return _scale_beside_odometry(evidence.velocity_fit)
     return _scale_beside_imu(evidence.self_calibration)

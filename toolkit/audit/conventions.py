@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
-from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import Intervals
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
@@ -169,7 +169,8 @@ class ExtrinsicConvention(NamedTuple):
     other_m: Array
 
 
-def mixed_axes(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Find the extrinsic under which samples and camera agree, and take it where it is not the given one.
 
     Three axes have 24 right-handed conventions. If the body's axes follow another one, the whole extrinsic is
@@ -178,14 +179,12 @@ def mixed_axes(evidence: Evidence) -> Symptom | Undecided | None:
     it, among all 48 ways to exchange and negate three channels: otherwise channels of the samples are wrong, and
     nothing is repaired. Velocities alone decide nothing, because slip changes the signs of small components.
     """
-    if evidence.intervals is None:
-        return evidence.blind
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
-    costs = _costs(evidence.intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
+    costs = _costs(intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
     first, second = _best_two(readings, costs)
-    better, alone = mean_in_sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
-    at_odds = _of_rotations(evidence.intervals, readings[first].T_imu_cam) != _OWN
+    better, alone = mean_in_sigmas(costs[0] - costs[first]), _of_rotations(intervals, given)
+    at_odds = _of_rotations(intervals, readings[first].T_imu_cam) != _OWN
     if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
         return _exchanged(alone)
     if first == 0 and (certainty := mean_in_sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
@@ -197,7 +196,7 @@ def mixed_axes(evidence: Evidence) -> Symptom | Undecided | None:
     if better < AGAINST_GIVEN:
         return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
     certain = mean_in_sigmas(costs[second] - costs[first]) > AGAINST_SECOND
-    taken, doubt = _settled(evidence, evidence.intervals, [readings[k] for k in _twins(readings, first)])
+    taken, doubt = _settled(evidence, intervals, [readings[k] for k in _twins(readings, first)])
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
         count=1,
@@ -325,15 +324,14 @@ def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
     return f"median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px"
 
 
-def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def extrinsic_translation(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Compare the extrinsic's translation with that of its inverse; take the latter where it is far more likely.
 
     A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like
     a rigid transform, it puts the camera at p = -R_imu_cam t. Turns distinguish p and t, because the camera's
     velocity differs from the IMU's by w x p.
     """
-    if evidence.intervals is None:
-        return evidence.blind
     if evidence.velocity_fit is None:
         return None  # without velocities lever-arm estimates the position
     rig = evidence.sequence.rig
@@ -342,7 +340,7 @@ def extrinsic_translation(evidence: Evidence) -> Symptom | Undecided | None:
     apart_m = float(np.linalg.norm(candidate - given))
     if apart_m == 0.0:
         return None
-    share = way_gone(evidence.intervals, evidence.velocity_fit.position, candidate - given)
+    share = way_gone(intervals, evidence.velocity_fit.position, candidate - given)
     if is_excluded(share):
         return None
     where = (

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
 from typing import Self
 
 import numpy as np
@@ -185,6 +185,16 @@ class Evidence:
 
 
 Check = Callable[[Evidence], Symptom | Undecided | None]
+
+
+def beside_camera(check: Callable[[Evidence, Intervals], Symptom | Undecided | None]) -> Check:
+    """Make a check of both motions undecided where they cannot be compared."""
+
+    @wraps(check)
+    def checked(evidence: Evidence) -> Symptom | Undecided | None:
+        return evidence.blind if evidence.intervals is None else check(evidence, evidence.intervals)
+
+    return checked
 
 
 def name_of(check: Check) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from toolkit.audit.bundle import CHANGE, LATE
 from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.edits import keep_frames, keep_samples
-from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
 from toolkit.audit.self_calibration import self_calibration
@@ -658,16 +658,15 @@ LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
 CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 
 
-def time_offset(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Find the offset of the frames' stamps by rotations (`clocks`), and shift the frames by it.
 
     For twists stamped at the frames, `twist_lag` sets the pairing, and only an offset that no pairing explains is
     reported. Frames are not shifted by an offset that only half of the recording has, or that grows (a change of
     the clock), nor where the velocities of the twists then fit worse: the rates of rotation alone are late.
     """
-    sequence, intervals = evidence.sequence, evidence.intervals
-    if intervals is None:
-        return evidence.blind
+    sequence = evidence.sequence
     found = _refined(camera_offset(sequence, intervals), evidence)
     if found is None:
         return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
@@ -822,16 +821,14 @@ def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
 LARGEST_CHANGE_S = 0.1
 
 
-def clock_change(evidence: Evidence) -> Symptom | Undecided | None:
+@beside_camera
+def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Compare the offsets of camera and samples in both halves of the recording.
 
     With clocks of one rate they are equal, whatever interval a sample describes; if they change, no constant shift
     is right. With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by
     rotations.
     """
-    intervals = evidence.intervals
-    if intervals is None:
-        return evidence.blind
     found = _fitted_change(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
     if found is None:
         return Undecided("too little change of rotation in half of the recording: whether the clocks drift is unknown")
