@@ -11,16 +11,6 @@ The table has, for each estimator and model, the geometric mean over drives of t
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``auto`` (the measured noise), ``full`` (every
 sighting counts in full) or a weight of tracks as ``0.04``; ``+open`` behind it improves no twist where no track leads
 on, ``+robust`` and the other outlier policies' names are the policy.
-
-    python tests/benchmarks/real_tracks.py pairs results.jsonl auto full
-
-compares two models run by run: per drive the ratio of the final ATE, its standard error over seeds, and on average.
-
-    python tests/benchmarks/real_tracks.py truth
-
-says how far the drives' truth can be trusted: the ATE SE(3) of their clean twists, which are the truth's instrument's
-own; and the median px by which withheld tracks, seen in stereo, are missed in (c, v) a second later, by the poses of
-the truth, of the clean twists and of ``batch``; and how many intervals no track leads across.
 """
 
 import argparse
@@ -36,12 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from toolkit.experiment.recording import Prepared, Recording, prepare
-from toolkit.geometry import Array
 from toolkit.metrics import score_run
-from toolkit.models import stereo
-from toolkit.models.camera_motion import neighbours
 from toolkit.models.noise import twist_noise
-from toolkit.models.stereo import CHANNELS
 from toolkit.motion_samples import TwistSamples
 from toolkit.registry import find
 from toolkit.runner import run
@@ -177,61 +163,6 @@ def table(options: argparse.Namespace) -> None:
         )
 
 
-def pairs(options: argparse.Namespace) -> None:
-    """Print what a second model makes of the ATE of a first, drive by drive."""
-    of_model: dict[str, dict[tuple[str, int], dict[str, Any]]] = defaultdict(dict)
-    for line in lines(options.results):
-        if line["estimator"] == options.estimator and "final" in line:
-            of_model[line["model"]][line["drive"], line["seed"]] = line
-    one, other = of_model[options.one], of_model[options.other]
-    logs: dict[str, list[list[float]]] = defaultdict(list)
-    for case in one.keys() & other.keys():
-        before, after = one[case]["final"], other[case]["final"]
-        logs[case[0]].append([np.log(after[key] / before[key]) for key in METRICS[:3]])
-    print(f"{options.other} over {options.one}: SE(3), yaw, none; standard errors over seeds")
-    for drive, of_seeds in sorted(logs.items()):
-        _print_ratios(drive, np.array(of_seeds), len(of_seeds))
-    short = np.array([np.mean(of_seeds, axis=0) for drive, of_seeds in logs.items() if drive != LONG_DRIVE])
-    _print_ratios("mean", short, len(short))
-
-
-def truths(options: argparse.Namespace) -> None:
-    """Print how well the truth of each drive agrees with its instrument's twists, and with tracks nobody was given."""
-    print("drive     gaps  ATE SE(3) m: clean twists  batch    px a second on: truth  clean twists  batch")
-    for drive in options.drives:
-        clean, noisy = prepare(Recording(str(drives()[drive]))), prepared(drive, 0, "auto")
-        assert clean.sequence.truth is not None
-        turned = run("dead-reckoning", find("dead-reckoning").load(), clean.sequence, clean.prior)
-        smoothed = run("batch", find("batch").load(), noisy.sequence, noisy.prior)
-        errors_m = [score_run(one, "final", clean.sequence).values["ate_se3_m"] for one in (turned, smoothed)]
-        assert turned.final is not None and smoothed.final is not None
-        np.testing.assert_array_equal(clean.sequence.truth.t_ns, turned.final.t_ns)
-        ways = (clean.sequence.truth, turned.final, smoothed.final)
-        missed_px = [missed_a_second_on(clean.sequence, way.T_world_imu) for way in ways]
-        common = np.bincount(neighbours(clean.sequence.visible).interval, minlength=clean.sequence.frame_count - 1)
-        gap_count = int((common == 0).sum())
-        figures = "".join(f"{px:14.2f}" for px in missed_px)
-        print(f"{drive}  {gap_count:4d}{errors_m[0]:28.3f}{errors_m[1]:7.3f}{figures}", flush=True)
-
-
-def missed_a_second_on(sequence: Sequence, T_world_imu: Array) -> float:
-    """Return the median px by which poses (K, 4, 4) miss withheld tracks ten frames on, seen in stereo before."""
-    held = sequence.held_out
-    place = {key: row for row, key in enumerate(zip(held.track_id.tolist(), held.frame.tolist(), strict=True))}
-    pairs = [(row, place[track, frame + 10]) for (track, frame), row in place.items() if (track, frame + 10) in place]
-    now, later = np.array(pairs).T
-    points = stereo.triangulate_world(held.uv_px[now], T_world_imu[held.frame[now]], sequence.rig)
-    predicted = stereo.predict(points, T_world_imu[held.frame[later]], sequence.rig)
-    missed = (held.uv_px[later] - predicted.uv_px) @ CHANNELS.T
-    return float(np.nanmedian(np.hypot(missed[:, 0], missed[:, 2])))
-
-
-def _print_ratios(name: str, logs: Array, count: int) -> None:
-    ratios = np.exp(logs.mean(axis=0))
-    errors = ratios * logs.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(3, np.nan)
-    print(f"{name:8s}" + "  ".join(f"{one:5.3f} +- {error:5.3f}" for one, error in zip(ratios, errors, strict=True)))
-
-
 def _ratio(one: list[dict[str, Any]], reference: list[dict[str, Any]], output: str, key: str) -> float:
     seeds = {line["seed"] for line in one}
     return _mean(one, output, key) / _mean([line for line in reference if line["seed"] in seeds], "causal", key)
@@ -259,17 +190,8 @@ def main() -> None:
     running.add_argument("--models", type=lambda text: text.split("/"), default=["auto"])
     showing = commands.add_parser("table")
     showing.set_defaults(command=table)
-    pairing = commands.add_parser("pairs")
-    pairing.set_defaults(command=pairs)
-    pairing.add_argument("--estimator", default="batch")
-    trusting = commands.add_parser("truth")
-    trusting.set_defaults(command=truths)
-    short = [drive for drive in drives() if drive != LONG_DRIVE]
-    trusting.add_argument("--drives", type=lambda text: text.split(","), default=short)
-    for command in (running, showing, pairing):
+    for command in (running, showing):
         command.add_argument("results", type=Path)
-    pairing.add_argument("one")
-    pairing.add_argument("other")
     options = parser.parse_args()
     options.command(options)
 
