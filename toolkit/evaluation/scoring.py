@@ -18,15 +18,15 @@ import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
+    BACKWARDS,
+    INVERTED,
     Reference,
-    backwards,
     check_axes,
     check_clock,
     check_length_unit,
     check_mirrored,
     check_turns,
     in_other_order,
-    inverted,
     range_s,
     turned_body,
 )
@@ -233,7 +233,7 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
     matched = matched_poses(estimate, truth.stamped)
     check_mirrored(what, matched.truth, matched.estimate)
-    readings = [inverted(), backwards()]
+    readings = [INVERTED, BACKWARDS]
     if file.other_order is not None:
         readings.insert(0, in_other_order(file.other_order))
     some = slice(None, None, 1 + len(rotations) // _ENOUGH_TURNS)

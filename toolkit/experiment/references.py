@@ -4,14 +4,14 @@ from collections.abc import Iterable, Mapping
 
 from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
+    BACKWARDS,
+    INVERTED,
     Reference,
-    backwards,
     check_axes,
     check_clock,
     check_length_unit,
     check_turns,
     in_other_order,
-    inverted,
     of_the_camera,
     range_s,
 )
@@ -70,7 +70,7 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
     reference = Reference.of_recording(recording)
     check_clock(what, reference, trajectory.t_ns)
     check_length_unit(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
-    readings = [inverted(), backwards(), of_the_camera(recording)]
+    readings = [INVERTED, BACKWARDS, of_the_camera(recording)]
     if poses.other_order is not None:
         readings.insert(0, in_other_order(poses.other_order))
     confirmed = check_turns(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)

@@ -5,8 +5,10 @@ Every check turns a malformed array into one line that names file and key. YAML 
 which OpenCV's own reader does not take.
 """
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy.typing as npt
 import yaml
 
 from toolkit.arrays import check_rigid, check_shape
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.files.reading import read_text_input
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
@@ -34,6 +36,11 @@ _MOST_SKEW = 1e-3
 _LATEST_S = 1e11
 # Largest time in seconds that int64 nanoseconds can hold: the year 2262.
 _LATEST_NS_S = 9.2e9
+_LARGEST_NS = 2**63 - 1
+# Digits before the point that fit with nanoseconds into 64 bits, unless the first is 9.
+_MOST_DIGITS, _DECIMALS = 10, 9
+# The usual form of seconds; reading digits is several times as fast as decimal numbers.
+_USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 # Stamps are finer than this; single precision is not, from 10 000 s on.
 _COARSE_S = 9e-4
 # No recording has a sample only every half minute.
@@ -167,6 +174,53 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     if unit is not None:
         raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit[1]}")
     return np.rint(stamps_s * NS_PER_S).astype(np.int64)
+
+
+def exact_ns(cells: Sequence[str], per_unit_ns: int, place: Callable[[int], str]) -> IntArray:
+    """Return printed stamps, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
+
+    A double holds today's seconds to 0.2 us only. Raises DataError, with the ``place`` of a row, where a stamp is no
+    finite number or beyond what 64 bits hold.
+    """
+    alike = _printed_alike(cells) if per_unit_ns == NS_PER_S and cells else None
+    if alike is not None:
+        return alike
+    return np.array([_exact_ns(cell, per_unit_ns, row, place) for row, cell in enumerate(cells)], dtype=np.int64)
+
+
+def _exact_ns(cell: str, per_unit_ns: int, row: int, place: Callable[[int], str]) -> int:
+    if per_unit_ns == NS_PER_S and (usual := _USUAL_STAMP.fullmatch(cell)):
+        t_ns = int(usual[1] + usual[2].ljust(9, "0"))
+    else:
+        try:
+            # Decimal takes 1_0 for ten, and no other program does.
+            t_ns = int((Decimal(cell.replace("_", "?")) * per_unit_ns).to_integral_value())
+        except (InvalidOperation, OverflowError, ValueError):
+            shown = printable(cell)[:50] or "empty"
+            raise DataError(f"{place(row)} has no finite time ({shown}); remove the line") from None
+    if abs(t_ns) > _LARGEST_NS:
+        raise DataError(f"{place(row)} has the time {printable(cell)[:50]}, beyond any clock; check its unit")
+    return t_ns
+
+
+def _printed_alike(cells: Sequence[str]) -> IntArray | None:
+    """Return seconds as nanoseconds (N,) where all have as many digits before and after the point; None elsewhere."""
+    width, point = len(cells[0]), cells[0].find(".")
+    after = width - point - 1
+    if not (0 < point <= _MOST_DIGITS and 0 < after <= _DECIMALS) or set(map(len, cells)) != {width}:
+        return None
+    characters = np.frombuffer("".join(cells).encode(), dtype=np.uint8)
+    if characters.size != width * len(cells):  # some characters are not ASCII
+        return None
+    digits = characters.reshape(-1, width) - np.int64(ord("0"))
+    is_digit = (digits >= 0) & (digits <= 9)
+    is_digit[:, point] = digits[:, point] == ord(".") - ord("0")
+    if not is_digit.all() or (point == _MOST_DIGITS and digits[:, 0].max() == 9):
+        return None
+    weights = np.zeros(width, dtype=np.int64)
+    weights[:point] = 10 ** np.arange(point + _DECIMALS - 1, _DECIMALS - 1, -1)
+    weights[point + 1 :] = 10 ** np.arange(_DECIMALS - 1, _DECIMALS - 1 - after, -1)
+    return np.asarray(digits @ weights)
 
 
 def _is_single_precision(stamps: Array) -> bool:

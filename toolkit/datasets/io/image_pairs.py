@@ -103,7 +103,7 @@ def pairs_of_asl(mav0: Path) -> Listed:
     t_ns, first = np.unique(left.t_ns, return_index=True)
     if t_ns.size < left.t_ns.size:
         remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.camera} had the stamp of another; left out")
-    partner = _nearest(right.t_ns, t_ns)
+    partner = _nearest(right.t_ns, t_ns, _SAME_INSTANT_NS)
     alone = int((partner < 0).sum())
     if alone:
         remarks.append(f"{alone} left images have no right one within 1 ms and are left out")
@@ -169,11 +169,10 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:
     """Return the number of the right stamp nearest to each left one, by number; none beyond half an interval."""
-    numbers, stamps = (np.array(list(items), dtype=np.int64) for items in (right_t_ns.keys(), right_t_ns.values()))
-    wanted_ns = np.array(sorted(t_ns.values()), dtype=np.int64)
-    reach_ns = 0.5 * float(np.median(np.diff(wanted_ns))) if wanted_ns.size > 1 else np.inf
-    off_ns = {number: np.abs(stamps - stamp) for number, stamp in t_ns.items()}
-    return {number: int(numbers[off.argmin()]) for number, off in off_ns.items() if off.min() <= reach_ns}
+    stamps, wanted_ns = (np.array(list(items.values()), dtype=np.int64) for items in (right_t_ns, t_ns))
+    reach_ns = 0.5 * float(np.median(np.diff(np.sort(wanted_ns)))) if wanted_ns.size > 1 else np.inf
+    rows, numbers = _nearest(stamps, wanted_ns, reach_ns).tolist(), list(right_t_ns)
+    return {number: numbers[row] for number, row in zip(t_ns, rows, strict=True) if row >= 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +283,8 @@ def _stamp_ns(stem: str) -> int | None:
     return int(f"{whole}{fraction[:9]:0<9}") if point else int(whole[:19])
 
 
-def _nearest(t_ns: IntArray, wanted_ns: IntArray) -> IntArray:
-    """Return the row of the stamp nearest to each asked one, -1 where none is of the same instant."""
+def _nearest(t_ns: IntArray, wanted_ns: IntArray, reach_ns: float) -> IntArray:
+    """Return the row of the stamp nearest to each asked one, -1 where none is within reach."""
     if t_ns.size == 0:
         return np.full(wanted_ns.size, -1)
     order = np.argsort(t_ns, kind="stable")
@@ -295,7 +294,7 @@ def _nearest(t_ns: IntArray, wanted_ns: IntArray) -> IntArray:
     nearer = np.where(
         np.abs(t_ns[order[after]] - wanted_ns) < np.abs(t_ns[order[before]] - wanted_ns), order[after], order[before]
     )
-    return np.where(np.abs(t_ns[nearer] - wanted_ns) <= _SAME_INSTANT_NS, nearer, -1)
+    return np.where(np.abs(t_ns[nearer] - wanted_ns) <= reach_ns, nearer, -1)
 
 
 def check_both_cameras(root: Path, left: Path, right: Path) -> None:

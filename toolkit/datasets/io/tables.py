@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
 from toolkit.errors import DataError, nearest, printable
 from toolkit.files.reading import is_regular, open_input, read_input, read_text_input
 from toolkit.geometry import Array, IntArray
@@ -190,11 +190,10 @@ class Columns:
         values = self.values[SECONDS]
         if isinstance(values, np.ndarray) and values.dtype.kind in "fiu":
             return stamps_ns(self.what, SECONDS, values.astype(np.float64))
-        exact = [self._decimal(i, str(value)) for i, value in enumerate(values)]
-        unit = probable_unit(np.array(exact, dtype=np.float64))
+        unit = probable_unit(self._numbers(SECONDS))
         if unit is not None:
             raise DataError(f"{self.what}: {SECONDS} must be in seconds, but the stamps look like {unit}")
-        return np.array([self._ns(i, seconds) for i, seconds in enumerate(exact)], dtype=np.int64)
+        return exact_ns(list(map(str, values)), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
 
     def at(self, row: int) -> str:
         """Return how a row is called."""
@@ -233,23 +232,6 @@ class Columns:
             most = f" of at most {_LARGEST}" if too_large else ""
             raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number{most}")
         return number
-
-    def _decimal(self, row: int, text: str) -> Decimal:
-        try:
-            seconds = Decimal(text.replace("_", "?"))
-        except InvalidOperation:
-            seconds = Decimal("nan")
-        if not seconds.is_finite():
-            shown = printable(text)[:50] or "empty"
-            raise DataError(f"{self.what}: {self.at(row)}: {SECONDS} is {shown}, expected seconds")
-        return seconds
-
-    def _ns(self, row: int, seconds: Decimal) -> int:
-        t_ns = int((seconds * NS_PER_S).to_integral_value())
-        if abs(t_ns) > _LARGEST:
-            shown = f"{seconds:.6g}"
-            raise DataError(f"{self.what}: {self.at(row)}: {SECONDS} is {shown}, beyond any clock; check its unit")
-        return t_ns
 
 
 def _is_number(value: Any) -> bool:

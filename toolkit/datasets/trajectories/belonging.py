@@ -114,19 +114,18 @@ def in_other_order(order: OtherOrder) -> Reading:
     return Reading(f"read {order.name}", order.remedy, order.reread)
 
 
-def inverted() -> Reading:
-    """Return the reading of rotations from the world to the IMU."""
-    remedy = "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them"
-    return Reading("inverted", remedy, lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2))
-
-
-def backwards() -> Reading:
-    """Return the reading of poses in the reverse of their order, on stamps that go on."""
-    return Reading("read backwards", "its poses run backwards: write them in the order of their stamps", _reversed)
-
-
-def _reversed(R_world_imu: Array) -> Array:
-    return R_world_imu[::-1]
+# Rotations from the world to the IMU.
+INVERTED = Reading(
+    "inverted",
+    "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
+    lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2),
+)
+# Poses in the reverse of their order, on stamps that go on.
+BACKWARDS = Reading(
+    "read backwards",
+    "its poses run backwards: write them in the order of their stamps",
+    lambda R_world_imu: R_world_imu[::-1],
+)
 
 
 def of_the_camera(sequence: Sequence) -> Reading:

@@ -9,18 +9,16 @@ the position in the world. JPL's quaternion of the world to the IMU has the same
 to the world.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from toolkit.datasets.io.fields import probable_unit_of_ns, stamps_ns
+from toolkit.datasets.io.fields import exact_ns, probable_unit_of_ns, stamps_ns
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.files.reading import read_text_input
@@ -34,11 +32,6 @@ _TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove t
 _IDENTITY_TOLERANCE = 1e-2
 # Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
 _VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.9, 0.1
-_LARGEST_NS = 2**63 - 1
-# Digits before the point that fit with nanoseconds into 64 bits, unless the first is 9.
-_MOST_DIGITS, _DECIMALS = 10, 9
-# The usual form of seconds; reading digits is several times as fast as decimal numbers.
-_USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 
 
 # The lines of a file as cells ----------------------------------------------------------------------------------------
@@ -80,10 +73,7 @@ class Rows:
         or beyond what 64 bits hold.
         """
         first = [cells[0] for cells in self.cells]
-        alike = _printed_alike(first) if per_unit_ns == NS_PER_S else None
-        if alike is not None:
-            return alike
-        return np.array([self._stamp(n, cells[0], per_unit_ns) for n, cells in self], dtype=np.int64)
+        return exact_ns(first, per_unit_ns, lambda row: f"{self.path}: line {self.line_numbers[row]}")
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
         return zip(self.line_numbers, self.cells, strict=True)
@@ -96,20 +86,6 @@ class Rows:
             return [_number(cell) for cell in cells]
         except ValueError as error:
             raise DataError(f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}") from error
-
-    def _stamp(self, line_number: int, cell: str, per_unit_ns: int) -> int:
-        if per_unit_ns == NS_PER_S and (usual := _USUAL_STAMP.fullmatch(cell)):
-            t_ns = int(usual[1] + usual[2].ljust(9, "0"))
-        else:
-            try:
-                t_ns = int((Decimal(cell) * per_unit_ns).to_integral_value())
-            except (InvalidOperation, OverflowError, ValueError):
-                raise DataError(
-                    f"{self.path}: line {line_number} has no finite time ({cell}); remove the line"
-                ) from None
-        if abs(t_ns) > _LARGEST_NS:
-            raise DataError(f"{self.path}: line {line_number} has the time {cell}, beyond any clock; check its unit")
-        return t_ns
 
 
 def read_rows(path: Path, kind: str) -> Rows:
@@ -132,26 +108,6 @@ def read_rows(path: Path, kind: str) -> Rows:
         raise DataError(f"{path}: the file holds no poses; {kind}")
     underscored = "_" in text and any("_" in line for line in lines)
     return Rows(path, line_numbers, cells, commas, underscored)
-
-
-def _printed_alike(cells: list[str]) -> IntArray | None:
-    """Return seconds as nanoseconds (N,) where all have as many digits before and after the point; None elsewhere."""
-    width, point = len(cells[0]), cells[0].find(".")
-    after = width - point - 1
-    if not (0 < point <= _MOST_DIGITS and 0 < after <= _DECIMALS) or set(map(len, cells)) != {width}:
-        return None
-    characters = np.frombuffer("".join(cells).encode(), dtype=np.uint8)
-    if characters.size != width * len(cells):  # some characters are not ASCII
-        return None
-    digits = characters.reshape(-1, width) - np.int64(ord("0"))
-    is_digit = (digits >= 0) & (digits <= 9)
-    is_digit[:, point] = digits[:, point] == ord(".") - ord("0")
-    if not is_digit.all() or (point == _MOST_DIGITS and digits[:, 0].max() == 9):
-        return None
-    weights = np.zeros(width, dtype=np.int64)
-    weights[:point] = 10 ** np.arange(point + _DECIMALS - 1, _DECIMALS - 1, -1)
-    weights[point + 1 :] = 10 ** np.arange(_DECIMALS - 1, _DECIMALS - 1 - after, -1)
-    return np.asarray(digits @ weights)
 
 
 def stamp_text(t_ns: int) -> str:
