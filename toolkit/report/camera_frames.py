@@ -5,7 +5,6 @@ and the estimated poses. It needs only the poses of an estimator, and is small w
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,16 +28,8 @@ _COUNT = 4
 _JPEG_QUALITY = 80
 
 
-@dataclass(frozen=True)
-class SeenFrame:
-    """A frame as the report has it, and the content of its JPEG file."""
-
-    frame: CameraFrame
-    jpeg: bytes
-
-
-def camera_frames(comparison: Comparison) -> tuple[SeenFrame, ...]:
-    """Return some frames, spread over the recording, where its tracks are made of images; else none."""
+def camera_frames(comparison: Comparison) -> tuple[tuple[CameraFrame, bytes], ...]:
+    """Return some frames, spread over the recording, each with its JPEG, where its tracks are made of images."""
     recording = None if comparison.over_seeds else _images(comparison)
     if recording is None:
         return ()
@@ -62,7 +53,7 @@ def camera_frames(comparison: Comparison) -> tuple[SeenFrame, ...]:
                 for row, of_all in errors_px.items()
             ),
         )
-        frames.append(SeenFrame(frame, _jpeg(image)))
+        frames.append((frame, _jpeg(image)))
     return tuple(frames)
 
 

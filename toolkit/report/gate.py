@@ -73,28 +73,23 @@ def _row(verdict: Verdict) -> tuple[str, ...]:
 
 
 def _values(verdict: Verdict) -> tuple[str, str]:
-    """Return the value before and now with their unit, and enough digits that a difference shows."""
-    before, now = verdict.before, verdict.after
-    given = [abs(value) for value in (before, now) if value is not None and math.isfinite(value)]
+    """Return the value before and now with their unit, and with enough digits that a difference shows."""
+    given = [value for value in (verdict.before, verdict.after) if value is not None and math.isfinite(value)]
     metric = _metric(verdict.metric)
     unit, factor = metric.unit if metric is not None and metric.unit != "1" else "", 1.0
-    if unit == "m" and max(given, default=1.0) < _SHORT_M:
+    if unit == "m" and max(map(abs, given), default=1.0) < _SHORT_M:
         unit, factor = "mm", 1e3
-    differs = 0.0
-    if before is not None and now is not None and verdict.finding != "same":
-        differs = factor * abs(now - before)
-    return _value(before, factor, unit, differs), _value(now, factor, unit, differs)
-
-
-def _value(value: float | None, factor: float, unit: str, differs: float) -> str:
-    """Return a value with three digits or more: two of what ``differs``, which has the value's factor."""
-    if value is None:
-        return MISSING
-    scaled = factor * value
-    of_difference = 0
-    if math.isfinite(scaled) and scaled and math.isfinite(differs) and differs:
-        of_difference = math.floor(math.log10(abs(scaled))) - math.floor(math.log10(differs)) + 2
-    return f"{number(scaled, min(max(DIGITS, of_difference), _MOST_DIGITS))} {unit}".rstrip()
+    digits = DIGITS
+    if len(given) == 2 and verdict.finding != "same" and given[0] != given[1] and all(given):
+        largest, difference = (
+            math.floor(math.log10(size)) for size in (max(map(abs, given)), abs(given[1] - given[0]))
+        )
+        digits = min(max(DIGITS, largest - difference + 2), _MOST_DIGITS)
+    before, now = (
+        MISSING if value is None else f"{number(factor * value, digits)} {unit}".rstrip()
+        for value in (verdict.before, verdict.after)
+    )
+    return before, now
 
 
 def _percent(value: float | None, sign: str = "") -> str:

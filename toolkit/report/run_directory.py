@@ -193,11 +193,11 @@ def _files_in(directory: Path) -> tuple[str, ...]:
 def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
     """Write the images that the report shows, where the recording has any, and return what is told of them."""
     seen = camera_frames(comparison)
-    for one in seen:
-        place = directory / one.frame.image
+    for frame, jpeg in seen:
+        place = directory / frame.image
         place.parent.mkdir(exist_ok=True)
-        place.write_bytes(one.jpeg)
-    return tuple(one.frame for one in seen)
+        place.write_bytes(jpeg)
+    return tuple(frame for frame, _ in seen)
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:

@@ -60,7 +60,7 @@ _ROWS = ("x", "y", "z")
 # An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
 _BAND_ALPHA = 0.16
-_LEAST_M, _LEAST_DEG = 1e-3, 1e-3
+_LEAST = 1e-3  # m, deg
 
 
 def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -170,44 +170,38 @@ def _telling(comparison: Comparison) -> list[str]:
 
 def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
     rows = [row for row in comparison.lines if row.estimator == name]
-    found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
+    found = [(row, one) for row in rows if (one := components(comparison, row)) is not None]
     if found:
-        yield _components_figure(comparison, name, rows[0].run.final_is_causal, found)
+        yield _components_figure(comparison, name, found)
 
 
-def _components_figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:
+def _components_figure(comparison: Comparison, name: str, found: list[tuple[Row, Components]]) -> NamedFigure:
     figure = new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
-    what, colour = _what(comparison), colour_of(comparison, name)
-    for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
+    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
+    what = "error" if reference is None else f"difference from {reference.name}"
+    colour = colour_of(comparison, name)
+    for column, block, label in ((0, POSITION, "{} [m]"), (1, ROTATION, "about {} [deg]")):
         for i, axis in enumerate(_ROWS):
             axes = grid[i, column]
-            for output, one in found.items():
-                t_s, shown_as = comparison.sequence.elapsed_s(one.t_ns), "final" if both else output
-                _plot(axes, t_s, one, block.start + i, colour, shown_as)
-            _limit(axes, found.values(), block.start + i, least)
-            style_axes(
-                axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
-            )
+            for row, one in found:
+                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, colour, shown_as(row))
+            _limit(axes, [one for _, one in found], block.start + i)
+            style_axes(axes, "", "time [s]" if i == 2 else "", label.format(axis))
     stated = "" if comparison.sequence.truth is None else _nees_text(comparison, name)
     figure.suptitle(f"{comparison.name}: {name}{stated}", fontsize=TITLE_PT, x=0.01, ha="left")
     grid[0, 0].set_title(f"position {what}", fontsize=TITLE_PT, loc="left")
     grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
     figure.align_ylabels(grid)
-    legend_below(figure, _entries(found, both, what.split()[0], colour))
-    return NamedFigure(f"components_{plain_name(name)}", _caption(comparison, name), figure)
+    legend_below(figure, _entries(found, what.split(maxsplit=1)[0], colour))
+    caption = _caption(name, reference.name if reference is not None else "", comparison.sequence.truth is not None)
+    return NamedFigure(f"components_{plain_name(name)}", caption, figure)
 
 
 def _nees_text(comparison: Comparison, name: str) -> str:
     values = [row.value("nees_pose_mean") for row in comparison.lines if row.estimator == name]
     listed = ", ".join(number(value) for value in values if value is not None)
     return f" (mean NEES {listed})" if listed else ""
-
-
-def _what(comparison: Comparison) -> str:
-    """Return how to call what is drawn: the error, or without truth the difference from whom."""
-    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
-    return "error" if reference is None else f"difference from {reference.name}"
 
 
 def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as: Output) -> None:
@@ -221,44 +215,41 @@ def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as
     axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
 
 
-def _limit(axes: Axes, drawn: Collection[Components], i: int, least: float) -> None:
+def _limit(axes: Axes, drawn: Collection[Components], i: int) -> None:
     """Show all of the error around zero, and the band unless that would flatten the error."""
     error = max(float(np.abs(one.error[:, i]).max()) for one in drawn)
     bands = [_SIGMAS * float(np.nanmax(one.sigma[:, i])) for one in drawn if one.sigma is not None]
-    reach = max(error, least, min(max(bands, default=0.0), _BAND_REACH * max(error, least)))
+    reach = max(error, _LEAST, min(max(bands, default=0.0), _BAND_REACH * max(error, _LEAST)))
     axes.set_ylim(-1.08 * reach, 1.08 * reach)
     axes.axhline(0.0, color=ZERO_COLOUR, linewidth=0.8, zorder=1)
 
 
-def _entries(found: dict[Output, Components], both: bool, what: str, colour: str) -> list[Entry]:
+def _entries(found: list[tuple[Row, Components]], what: str, colour: str) -> list[Entry]:
     entries = []
-    for output, one in found.items():
-        shown_as: Output = "final" if both else output
-        name = "causal = final" if both else output
-        entries.append(Entry.of_line(f"{name}: {what}", colour, line_of(shown_as)))
+    for row, one in found:
+        name = "causal = final" if row.label == "both" else row.output
+        line = line_of(shown_as(row))
+        entries.append(Entry.of_line(f"{name}: {what}", colour, line))
         if one.sigma is not None:
-            band = Patch(facecolor=to_rgba(colour, _BAND_ALPHA if shown_as == "final" else 0.0), edgecolor=colour)
-            band.set(linestyle=line_of(shown_as), linewidth=0.6)
+            alpha = _BAND_ALPHA if shown_as(row) == "final" else 0.0
+            band = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
             entries.append(Entry(f"{name}: ± 3 standard deviations", (band,)))
     return entries
 
 
-def _caption(comparison: Comparison, name: str) -> str:
+def _caption(name: str, reference: str, has_truth: bool) -> str:
     """Say what the panels show and how the band is to be read."""
     axes = "by component along and about the world's axes, z up"
-    if comparison.sequence.truth is None:
-        reference = reference_estimate(comparison)
-        of_whom = "" if reference is None else f" from {reference.name}"
+    if not has_truth:
+        of_whom = f" from {reference}" if reference else ""
         return (
             f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "
             f"deviations that {name} states; a difference far outside it means that one of the two is overconfident."
         )
-    placed = (
-        "as the NEES takes it: where the start is not in the truth's world, its first pose is placed on the truth's"
-    )
     return (
-        f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: a consistent "
-        "estimator is inside nearly always, and fills it."
+        f"Error of {name} {axes}, as the NEES takes it: where the start is not in the truth's world, its first pose is "
+        "placed on the truth's. The band is three standard deviations that it states: a consistent estimator is inside "
+        "nearly always, and fills it."
     )
 
 
