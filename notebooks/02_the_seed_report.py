@@ -28,9 +28,9 @@ from matplotlib.axes import Axes
 from recordings import real
 
 from toolkit import Result, compare
+from toolkit.answers import Run
 from toolkit.audit import Audit, audit, faults
 from toolkit.datasets import load_sequence
-from toolkit.estimate import Run
 from toolkit.models.camera_motion import camera_motion
 from toolkit.report.comparison_text import audit_text
 from toolkit.sequence import Sequence

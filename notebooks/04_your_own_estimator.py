@@ -23,8 +23,9 @@ import numpy as np
 from IPython import get_ipython
 
 from toolkit import compare, load_sequence
+from toolkit.answers import Run
 from toolkit.errors import EstimatorError
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Setup
 from toolkit.gate.baseline import Case
 from toolkit.gate.checking import How, check, new_baseline
@@ -146,8 +147,8 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
+from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo, twist
-from toolkit.sequence import Packet, StereoFrame
 
 
 '''

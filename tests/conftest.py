@@ -31,8 +31,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from toolkit import runner
+from toolkit.answers import Run
 from toolkit.audit import Audit, Finding
-from toolkit.estimate import Run
 from toolkit.experiment import pipeline, recording, workers
 from toolkit.experiment.recording import WHOLE, Recording
 from toolkit.measurements import Prior

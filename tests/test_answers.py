@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit import runner
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
+from toolkit.answers import Run
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
 from toolkit.sequence import Sequence

@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from toolkit.answers import Run
 from toolkit.divergence import MOST_FAR_STEPS, contradiction, gate_collapse
-from toolkit.estimate import Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_exp, se3_inverse
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate

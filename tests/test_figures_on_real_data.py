@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from toolkit.estimate import Output, Run
+from toolkit.answers import Output, Run
 from toolkit.experiment import recording
 from toolkit.experiment.recording import Recording
 from toolkit.geometry import Array

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from toolkit import runner
+from toolkit.answers import Run
 from toolkit.errors import DataError, EstimatorError
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
 from toolkit.sequence import Sequence

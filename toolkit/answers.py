@@ -1,23 +1,81 @@
-"""Checks what an estimator answers, where the runner receives it: types, shapes and the frames that it is about.
+"""Everything that an estimator answered in one run, and the checks of each answer where the runner receives it.
 
-Values are not checked: a pose that is not finite is a result (``diverged``), an array of another shape is a mistake in
-the estimator's code, and is named as such before anything computes with it.
+Types, shapes and the frames that an answer is about are checked. Values are not checked: a pose that is not finite is a
+result (``diverged``), an array of another shape is a mistake in the estimator's code, and is named as such before
+anything computes with it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 
 from toolkit.errors import EstimatorError, type_of
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
-from toolkit.geometry import IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet
 
+Status = Literal["ok", "diverged", "failed"]
+STATUS_MEANING: Mapping[Status, str] = {
+    "ok": "ran to the end",
+    "diverged": "ran to the end with implausible estimates",
+    "failed": "could not go on",
+}
+Output = Literal["causal", "final"]
+Arithmetic = Literal["compiled", "numpy"]
+# What several runs of an estimator computed with: "both" where they differ.
+ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
 COV_SIZES = (6, 9, 12, 15)
 _STATE: Mapping[str, tuple[tuple[int, ...], ...]] = {"T_world_imu": ((4, 4),), "v_world": ((3,),), "bias": ((6,),)}
 _COVARIANCE = {"cov": tuple((size, size) for size in COV_SIZES)}
+
+
+@dataclass(frozen=True, eq=False)
+class Timings:
+    """Seconds of wall clock per step (K,), of the finish and of all, seconds of CPU, peak memory in MB."""
+
+    step_s: Array
+    finish_s: float
+    total_s: float
+    cpu_s: float
+    peak_rss_mb: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One estimator on one sequence: both kinds of output, the map, diagnostics per step, cost and status.
+
+    ``causal`` is what was known at each frame and is None for an estimator that answers only at the end. ``timings`` is
+    None for another system's run, read from a file and not made here. ``info`` holds the diagnostics of the causal
+    estimates by name, each (N,), NaN where one was not given. ``arithmetic`` says whether compiled code or NumPy ran,
+    where the estimator has both.
+    """
+
+    estimator: str
+    status: Status
+    causal: Trajectory | None
+    final: Trajectory | None
+    landmarks: Landmarks
+    timings: Timings | None
+    info: Mapping[str, Array] = field(default_factory=dict)
+    log: tuple[str, ...] = ()
+    arithmetic: Arithmetic | None = None
+
+    def trajectory(self, output: Output) -> Trajectory | None:
+        """Return the trajectory of one kind of output."""
+        return self.causal if output == "causal" else self.final
+
+    @property
+    def final_is_causal(self) -> bool:
+        """Say whether the final output repeats the causal one, poses and covariances, as a filter's does."""
+        causal, final = self.causal, self.final
+        if causal is None or final is None or not np.array_equal(causal.T_world_imu, final.T_world_imu):
+            return False
+        if causal.cov is None or final.cov is None:
+            return causal.cov is final.cov
+        return np.array_equal(causal.cov, final.cov, equal_nan=True)
 
 
 def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Estimate | None:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import numpy as np
 from msgspec import Meta, Struct
 
+from toolkit.answers import Output, Run
 from toolkit.errors import VislamError, did_you_mean, type_of
-from toolkit.estimate import Output, Run
 from toolkit.estimator import Build
 from toolkit.experiment import Comparison, Record
 from toolkit.experiment import run as run_plan

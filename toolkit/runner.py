@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.answers import checked_estimate, checked_finish
+from toolkit.answers import Run, Status, Timings, checked_estimate, checked_finish
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError, in_words, one_line
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Packet, Prior

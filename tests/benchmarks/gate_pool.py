@@ -24,8 +24,9 @@ from unittest.mock import patch
 import numpy as np
 
 from toolkit import runner
+from toolkit.answers import Run
 from toolkit.audit import audit
-from toolkit.estimate import Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.gate.measuring import reference_s
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements

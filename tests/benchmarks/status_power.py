@@ -35,8 +35,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from toolkit.answers import Output, Run, Status
 from toolkit.errors import VislamError
-from toolkit.estimate import Output, Run, Status
 from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.disagreement import too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare

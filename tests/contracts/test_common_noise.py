@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from toolkit import runner
-from toolkit.estimate import Run, Trajectory
+from toolkit.answers import Run
+from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.registry import find, ladder
 from toolkit.sequence import Sequence

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from toolkit import runner
+from toolkit.answers import Run
 from toolkit.errors import DataError, EstimatorError
-from toolkit.estimate import Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.estimator import Build, Estimator
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.measurements import Packet

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from toolkit import metrics
-from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.answers import Run, Timings
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS
 from toolkit.geometry import se3
 from toolkit.measurements import StereoRig, TwistNoise

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from toolkit import runner
+from toolkit.answers import Run
 from toolkit.audit import audit
 from toolkit.errors import EstimatorError
-from toolkit.estimate import Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import Prior, StereoRig

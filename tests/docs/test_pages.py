@@ -20,12 +20,13 @@ import numpy as np
 import pytest
 
 from toolkit import cli
+from toolkit.answers import Output, Run
 from toolkit.audit import audit
 from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import VislamError
-from toolkit.estimate import Landmarks, Output, Run, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
 from toolkit.report.records import read_metrics

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.answers import Run
 from toolkit.datasets import load_sequence
-from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.units import Scored, outcome_of
 from toolkit.metrics import Evaluation, Scores

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.answers import Run
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Row
 from toolkit.experiment.disagreement import FARTHEST, FarthestPose, farthest, too_far
 from toolkit.experiment.recording import Prepared, Recording, prepare

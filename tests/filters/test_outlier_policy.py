@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.sequence import Sequence, is_held_out
 from toolkit.settings import POLICIES, PolicyName, Settings, Window

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.geometry import Array
 from toolkit.initialization import GYRO_BIAS_SIGMA
 from toolkit.measurements import Prior, StereoFrame, StereoRig, TwistMotion, TwistNoise

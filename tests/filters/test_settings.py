@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit import runner
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.registry import find
 from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings, Window

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.answers import Run, Timings
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import Array, about_z, se3, se3_exp, se3_inverse, so3_exp, transform
 from toolkit.measurements import ImuNoise, StereoRig, TwistNoise
 from toolkit.models import stereo

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.answers import Run
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.metrics import Evaluation, correction_trend
 from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.parts.scores import Unavailable

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.metrics import Evaluation, Scores
 from toolkit.metrics.innovations import ACCEPTED, refuses_much, score
 from toolkit.simulation import SCENARIOS, simulate

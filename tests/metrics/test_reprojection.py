@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from toolkit.estimate import Landmarks, Run
+from toolkit.answers import Run
+from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, transform
 from toolkit.metrics import Evaluation, Scores, reprojection, score_run
 from toolkit.metrics.parts.leave_one_out import CAP_PX, predict_left_out

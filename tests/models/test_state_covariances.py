@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from filters.smoothing import indeterminate
-from toolkit.estimate import Run, Trajectory
+from toolkit.answers import Run
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
 from toolkit.measurements import TwistNoise
 from toolkit.models import state_covariances

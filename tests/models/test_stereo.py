@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from toolkit.answers import Run
 from toolkit.datasets import load_sequence
-from toolkit.estimate import Run
 from toolkit.geometry import Array, se3_exp
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import StereoFrame, StereoRig

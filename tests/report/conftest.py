@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.answers import Run, Timings
 from toolkit.audit import Finding
-from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import outcome_of

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from toolkit.answers import Run
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
-from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import outcome_of

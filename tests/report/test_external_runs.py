@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.answers import Run
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.errors import DataError
-from toolkit.estimate import Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.experiment.references import external_runs
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
 from toolkit.metrics import score_run

@@ -10,8 +10,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from toolkit.answers import STATUS_MEANING, Status
 from toolkit.errors import DataError
-from toolkit.estimate import STATUS_MEANING, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.metrics import Scores

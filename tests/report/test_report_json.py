@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from msgspec import to_builtins
 
+from toolkit.answers import Run
 from toolkit.datasets import load_sequence
-from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.against_truth import rmse

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from toolkit.answers import Status
 from toolkit.errors import DataError
-from toolkit.estimate import Status
 from toolkit.evaluation.scoring import METRICS
 from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll

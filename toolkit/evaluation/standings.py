@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.answers import Status
 from toolkit.errors import DataError
-from toolkit.estimate import Status
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all

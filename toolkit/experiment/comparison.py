@@ -37,8 +37,8 @@ from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 from toolkit.settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:
+    from toolkit.answers import Output, Run, Status
     from toolkit.audit import Finding
-    from toolkit.estimate import Output, Run, Status
     from toolkit.geometry import Array
     from toolkit.measurements import Prior
     from toolkit.noise import Card, MeasuredNoise

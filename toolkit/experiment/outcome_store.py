@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from toolkit.answers import Arithmetic, Output, Status
 from toolkit.errors import DataError, OutputError
-from toolkit.estimate import Arithmetic, Output, Status
 from toolkit.experiment.code_version import code_digest, numeric_versions
 from toolkit.experiment.comparison import plain_name
 from toolkit.experiment.units import Outcome, Scored, Unit

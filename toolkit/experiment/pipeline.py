@@ -6,11 +6,11 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from toolkit.answers import Run
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
-from toolkit.estimate import Run
 from toolkit.estimator import Build
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order

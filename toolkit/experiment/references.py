@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
+from toolkit.answers import Output, Run
 from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
     BACKWARDS,
@@ -17,7 +18,7 @@ from toolkit.datasets.trajectories.belonging import (
 )
 from toolkit.datasets.trajectories.formats import PosesFile, check_order
 from toolkit.errors import DataError
-from toolkit.estimate import Landmarks, Output, Run, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import TRUTH, plain_name
 from toolkit.metrics.parts.against_truth import associate, median_period_ns, poses_at
 from toolkit.sequence import LONGEST_NAME, Sequence, Truth

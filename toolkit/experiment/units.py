@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from toolkit import runner
+from toolkit.answers import Arithmetic, ArithmeticOfRuns, Output, Run, Status
 from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
-from toolkit.estimate import Arithmetic, ArithmeticOfRuns, Output, Run, Status
 from toolkit.estimator import Build
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray

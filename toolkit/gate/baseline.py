@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import ClassVar, Literal
 
+from toolkit.answers import ArithmeticOfRuns, Output, Status
 from toolkit.errors import VislamError
-from toolkit.estimate import ArithmeticOfRuns, Output, Status
 from toolkit.settings import DEFAULTS, Settings
 
 Worse = Literal["larger", "away from 1"]

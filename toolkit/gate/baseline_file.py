@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
-from toolkit.estimate import ArithmeticOfRuns, Output, Status
+from toolkit.answers import ArithmeticOfRuns, Output, Status
 from toolkit.files import documents
 from toolkit.gate.baseline import (
     Baseline,

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from toolkit.estimate import ArithmeticOfRuns, Status
+from toolkit.answers import ArithmeticOfRuns, Status
 from toolkit.gate.baseline import COVERAGE, SPEED, Bounds, Case, Criterion, Measured, Series, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict

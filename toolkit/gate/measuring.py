@@ -17,9 +17,9 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from toolkit.answers import Output, Run, Status
 from toolkit.datasets import built_ins
 from toolkit.errors import EstimatorError, VislamError
-from toolkit.estimate import Output, Run, Status
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import (
     OUTPUTS,

@@ -16,9 +16,9 @@ from types import ModuleType
 
 import numpy as np
 
+from toolkit.answers import Output, Run
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import ExtensionError, UnknownNameError, did_you_mean
-from toolkit.estimate import Output, Run
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.sequence import Sequence

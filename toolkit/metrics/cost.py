@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from toolkit.estimate import Timings
+from toolkit.answers import Timings
 from toolkit.geometry import Array
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate

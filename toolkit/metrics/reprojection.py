@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.answers import Run
 from toolkit.arrays import rows_of
-from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.evaluation import Evaluation

@@ -11,7 +11,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from toolkit.estimate import Output, Run, Trajectory
+from toolkit.answers import Output, Run
+from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
 from toolkit.metrics import Evaluation

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, to_builtins
 
-from toolkit.estimate import Status
+from toolkit.answers import Status
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array

@@ -14,9 +14,10 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct
 
+from toolkit.answers import Output
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
-from toolkit.estimate import Output, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import TRUTH
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents

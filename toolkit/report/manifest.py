@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.estimate import ArithmeticOfRuns
+from toolkit.answers import ArithmeticOfRuns
 from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
-from toolkit.estimate import Output, Run
+from toolkit.answers import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.files.documents import number, numbers, of_attributes, read, rounded
 from toolkit.geometry import Array

@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
+from toolkit.answers import Output
 from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
-from toolkit.estimate import Landmarks, Output, Trajectory
+from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.estimate import STATUS_MEANING, Output, Status
+from toolkit.answers import STATUS_MEANING, Output, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.files.documents import Count, Value, of_attributes, read

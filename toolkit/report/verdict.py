@@ -8,7 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from toolkit.estimate import Output
+from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import COST, HELD_OUT, Contest, Question, cheaper_near
 from toolkit.experiment.drift_test import CONFIDENCE

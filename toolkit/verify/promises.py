@@ -9,9 +9,9 @@ from itertools import zip_longest
 
 import numpy as np
 
-from toolkit.answers import COV_SIZES, check_state
+from toolkit.answers import COV_SIZES, Run, check_state
 from toolkit.errors import EstimatorError
-from toolkit.estimate import Estimate, Finished, Run
+from toolkit.estimate import Estimate, Finished
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet

@@ -22,8 +22,9 @@ from functools import lru_cache
 import gtsam
 import numpy as np
 
+from toolkit.answers import Output
 from toolkit.arrays import rows_of
-from toolkit.estimate import Output, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import Packet, Prior, StereoFrame, StereoRig, is_left_only

@@ -5,8 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
+from toolkit.answers import Output, Run
 from toolkit.arrays import rows_of
-from toolkit.estimate import Output, Run, Trajectory
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics.parts.against_truth import (
     STAMP_TOLERANCE_NS,

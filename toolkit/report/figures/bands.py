@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from toolkit.estimate import Output
+from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
 
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import reprojection

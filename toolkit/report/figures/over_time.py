@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
-from toolkit.estimate import Output
+from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array
 from toolkit.metrics.bound import AgainstBound, against_bound

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 
-from toolkit.estimate import Run
+from toolkit.answers import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, reprojection

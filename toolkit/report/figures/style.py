@@ -16,7 +16,7 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
-from toolkit.estimate import Output
+from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.report.curves import COLOURS, look_numbers
 
