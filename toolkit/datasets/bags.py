@@ -10,17 +10,15 @@ has it. Poses of a truth are those of the IMU, or of a frame that /tf_static kno
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from toolkit.datasets.io import bag_reader, ros_values
-from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Held, Message, Topic, choose
+from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Message, Topic, choose
 from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
-from toolkit.datasets.io.ros_values import Mounted, Source, mounted, source_of
+from toolkit.datasets.io.ros_values import Mounted, Recorded, mounted, recorded
 from toolkit.datasets.io.truth import truth_near, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
@@ -102,9 +100,8 @@ class _Read:
 def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress) -> _Read:
     with bag_reader.opened(path) as bag:
         chosen = choose(path, bag.topics, frontend.topics)
-        held = _held(bag, chosen)
-        source = source_of(bag, chosen, held)
-        motion, how_moved = _motion_of(path, chosen, held, source.tree)
+        source = recorded(bag, chosen)
+        motion, how_moved = _motion_of(source)
         camera = mounted(source, motion)
         truth, whose = _truth(source)
         unstamped = _spool_images(bag, chosen, spool, progress)
@@ -116,18 +113,6 @@ def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress)
     camera = _as_filmed(camera, within.pairs, frontend)
     remarks = (*within.remarks, *unstamped, *how_moved, *whose)
     return _Read(chosen, motion, camera, within.pairs, truth, remarks)
-
-
-def _held(bag: Bag, chosen: Chosen) -> Held:
-    """Return the messages of all topics but the images'; of calibrations, and one image a side, the first."""
-    wanted = (chosen.imu, chosen.accel, chosen.twist, chosen.truth, *chosen.transforms)
-    found: dict[str, list[Message]] = {}
-    for message in bag.messages({topic.name for topic in wanted if topic is not None}):
-        found.setdefault(message.topic, []).append(message)
-    for topic in (chosen.left_info, chosen.right_info, chosen.left, chosen.right):
-        if topic is not None:
-            found[topic.name] = list(islice(bag.messages({topic.name}), 1))
-    return Held(found)
 
 
 def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
@@ -163,26 +148,23 @@ def _as_filmed(camera: Mounted, pairs: Sequence[StampedPair], frontend: Frontend
     return replace(camera, pair=camera.as_they_are, facts=(*camera.facts, fact))
 
 
-def _truth(source: Source) -> tuple[Truth | None, tuple[str, ...]]:
+def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     """Return the poses of the body, and of what they are; another frame's are moved to it where the tree knows how."""
-    chosen, body = source.chosen, source.frames.body
-    messages = source.held.of(chosen.truth)
-    if chosen.truth is None or not messages:
+    topic, messages = source.chosen.truth, source.of(source.chosen.truth)
+    if topic is None or not messages:
         return None, ()
-    t_ns, poses = _stamps_ns(messages), [ros_values.pose_of(message.value) for message in messages]
-    _, first = np.unique(t_ns, return_index=True)
-    values = np.array([pose for pose, _ in poses])[first]
-    what = Path(f"{source.path}: {chosen.truth.name}")
-    T_world_child = checked_poses(what, first.tolist(), t_ns[first], values)
-    child = poses[0][1]
+    t_ns, first = np.unique(_stamps_ns(messages), return_index=True)
+    poses = ros_values.poses_of([message.value for message in messages], topic.type)[first]
+    T_world_child = checked_poses(Path(f"{source.path}: {topic.name}"), first.tolist(), t_ns, poses)
+    body, child = source.body, ros_values.frame_name(getattr(messages[0].value, "child_frame_id", ""))
     T_child_body = source.tree.between(child, body)
     if T_child_body is not None:
-        return Truth(t_ns[first], T_world_child @ T_child_body), ()
+        return Truth(t_ns, T_world_child @ T_child_body), ()
     whose = (
         f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
         "body's"
     )
-    return Truth(t_ns[first], T_world_child), (whose,) if child and child != body else ()
+    return Truth(t_ns, T_world_child), (whose,) if child and child != body else ()
 
 
 def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progress) -> tuple[str, ...]:
@@ -216,80 +198,73 @@ def _stamps_ns(messages: Sequence[Message]) -> IntArray:
     return np.array(stamps, dtype=np.int64)
 
 
-def _motion_of(path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree) -> tuple[MotionSamples, tuple[str, ...]]:
+def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
     """Return the samples of the IMU, or the twists where there is none, and what must be known of them.
 
     Raises DataError where nothing measures the motion, or what was chosen does not measure all of it.
     """
-    if chosen.imu is not None:
-        messages = _messages_of(path, chosen.imu, held)
-        t_ns, gyro = _stamps_ns(messages), _vectors([m.value.angular_velocity for m in messages])
-        _check_measured(path, chosen.imu, gyro, messages[0].value.angular_velocity_covariance, "angular velocity")
-        if chosen.accel is not None:
-            return _joined(path, chosen, held, tree, (t_ns, gyro))
-        accel, stated = _accel(messages)
-        _check_measured(path, chosen.imu, accel, stated, "acceleration")
-        return ImuSamples(t_ns, accel, gyro), ()
-    if chosen.twist is None:
-        others = ", ".join(chosen.other_twists)
+    imu, accel = source.chosen.imu, source.chosen.accel
+    if imu is None:
+        return _twists(source), ()
+    t_ns, gyro = _measured(source, imu, "angular velocity")
+    if accel is not None:
+        return _joined(source, (imu, t_ns, gyro), accel)
+    return ImuSamples(t_ns, _measured(source, imu, "acceleration")[1], gyro), ()
+
+
+def _twists(source: Recorded) -> TwistSamples:
+    path, topic = source.path, source.chosen.twist
+    if topic is None:
+        others = ", ".join(source.chosen.other_twists)
         remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one with the images"
         raise DataError(
             f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; {remedy}"
         )
-    messages = _messages_of(path, chosen.twist, held)
-    # A twist is wrapped once more where it has a covariance.
-    twists = [getattr(message.value.twist, "twist", message.value.twist) for message in messages]
-    linear, angular = (_vectors([getattr(twist, name) for twist in twists]) for name in ("linear", "angular"))
+    messages = _messages_of(source, topic)
+    values = [message.value for message in messages]
+    linear, angular = (ros_values.columns(values, part) for part in ros_values.VECTORS[topic.type])
     if not (linear.any() or angular.any()):
-        raise DataError(f"{path}: {chosen.twist.name} states no twist (all are 0); name {_NAME_ANOTHER}")
-    return TwistSamples(_stamps_ns(messages), linear, angular), ()
+        raise DataError(f"{path}: {topic.name} states no twist (all are 0); name {_NAME_ANOTHER}")
+    return TwistSamples(_stamps_ns(messages), linear, angular)
 
 
-def _joined(
-    path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree, gyro: tuple[IntArray, Array]
-) -> tuple[ImuSamples, tuple[str, ...]]:
+def _joined(source: Recorded, gyro: tuple[Topic, IntArray, Array], accel: Topic) -> tuple[ImuSamples, tuple[str, ...]]:
     """Return the samples of a gyro with the accelerometer's, which has other stamps, interpolated at its own."""
-    assert chosen.imu is not None
-    assert chosen.accel is not None
-    messages = _messages_of(path, chosen.accel, held)
-    order = np.argsort(_stamps_ns(messages), kind="stable")
-    t_ns, (accel, stated) = _stamps_ns(messages)[order], _accel(messages)
-    _check_measured(path, chosen.accel, accel, stated, "acceleration")
-    frames = (ros_values.frame_name(held.of(topic)[0].value.header.frame_id) for topic in (chosen.imu, chosen.accel))
-    T_gyro_accel = tree.between(*frames)
-    accel = accel[order] if T_gyro_accel is None else accel[order] @ T_gyro_accel[:3, :3].T
-    within = (gyro[0] >= t_ns[0]) & (gyro[0] <= t_ns[-1])
+    imu, gyro_t_ns, rates = gyro
+    t_ns, values = _measured(source, accel, "acceleration")
+    order = np.argsort(t_ns, kind="stable")
+    t_ns, values = t_ns[order], values[order]
+    T_gyro_accel = source.tree.between(source.frame_of(imu), source.frame_of(accel))
+    values = values if T_gyro_accel is None else values @ T_gyro_accel[:3, :3].T
+    within = (gyro_t_ns >= t_ns[0]) & (gyro_t_ns <= t_ns[-1])
     if not within.any():
-        raise DataError(
-            f"{path}: {chosen.imu.name} and {chosen.accel.name} have no time in common; name {_NAME_ANOTHER}"
-        )
-    at_ns = gyro[0][within]
-    at_gyro = np.stack([np.interp(at_ns - t_ns[0], t_ns - t_ns[0], column) for column in accel.T], axis=1)
-    fact = f"{len(messages)} samples of {chosen.accel.name} are interpolated at the {at_ns.size} of {chosen.imu.name}"
-    return ImuSamples(at_ns, at_gyro, gyro[1][within]), (fact,)
+        raise DataError(f"{source.path}: {imu.name} and {accel.name} have no time in common; name {_NAME_ANOTHER}")
+    at_ns = gyro_t_ns[within]
+    at_gyro = np.stack([np.interp(at_ns - t_ns[0], t_ns - t_ns[0], column) for column in values.T], axis=1)
+    fact = f"{t_ns.size} samples of {accel.name} are interpolated at the {at_ns.size} of {imu.name}"
+    return ImuSamples(at_ns, at_gyro, rates[within]), (fact,)
 
 
-def _messages_of(path: Path, topic: Topic, held: Held) -> list[Message]:
-    messages = held.of(topic)
+def _messages_of(source: Recorded, topic: Topic) -> Sequence[Message]:
+    messages = source.of(topic)
     if not messages:
-        raise DataError(f"{path}: {topic.name} has no message; name another topic with --topics")
+        raise DataError(f"{source.path}: {topic.name} has no message; name another topic with --topics")
     return messages
 
 
-def _accel(messages: list[Message]) -> tuple[Array, Any]:
-    """Return the accelerations (N, 3) of messages, and the covariance that the first one states."""
-    return _vectors([m.value.linear_acceleration for m in messages]), messages[0].value.linear_acceleration_covariance
+def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Array]:
+    """Return stamps (N,) and what an Imu measures (N, 3).
 
-
-def _vectors(values: Sequence[Any]) -> Array:
-    return np.array([[v.x, v.y, v.z] for v in values], dtype=np.float64).reshape(-1, 3)
-
-
-def _check_measured(path: Path, topic: Topic, values: Array, covariance: Any, what: str) -> None:
-    """Raise DataError where an Imu does not measure something: a covariance of -1 says so, or all values are 0."""
-    if values.any() and float(np.asarray(covariance).ravel()[0]) != -1.0:
-        return
-    apart = "the accelerometer's topic with --topics accel=TOPIC, " if what == "acceleration" else ""
-    raise DataError(
-        f"{path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}{_NAME_ANOTHER}"
-    )
+    Raises DataError where it does not: a covariance of -1 says so, or all values are 0.
+    """
+    messages = _messages_of(source, topic)
+    part = ros_values.VECTORS[topic.type][what == "acceleration"]
+    values = ros_values.columns([message.value for message in messages], part)
+    covariance = getattr(messages[0].value, f"{part}_covariance")
+    if not values.any() or float(np.asarray(covariance).ravel()[0]) == -1.0:
+        apart = "the accelerometer's topic with --topics accel=TOPIC, " if what == "acceleration" else ""
+        raise DataError(
+            f"{source.path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}"
+            f"{_NAME_ANOTHER}"
+        )
+    return _stamps_ns(messages), values

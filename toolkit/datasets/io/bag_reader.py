@@ -8,13 +8,13 @@ Topics get their roles as given with ``--topics``, else guessed from types and n
 
 import importlib.util
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from toolkit.errors import DataError, VislamError, no_such, printable
 from toolkit.files.reading import is_regular, open_input
@@ -91,24 +91,12 @@ class Topic:
         return f"{printable(self.name)} ({printable(self.type).replace('/msg/', '/')}{why})"
 
 
-@dataclass(frozen=True, eq=False)
-class Message:
+class Message(NamedTuple):
     """A message as the library decodes it, its topic, and when it was recorded (ns)."""
 
     topic: str
     t_ns: int
     value: Any
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """The messages of the topics that are small enough to be held in memory, in the order of recording."""
-
-    by_topic: Mapping[str, list[Message]]
-
-    def of(self, topic: Topic | None) -> list[Message]:
-        """Return the messages of a topic; none where there is no such topic."""
-        return [] if topic is None else self.by_topic.get(topic.name, [])
 
 
 def kind_of(path: Path) -> Kind | None:

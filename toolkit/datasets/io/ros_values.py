@@ -6,15 +6,29 @@ baseline; REP 103 (camera axes), REP 104 (rectified images), REP 105 (frames).
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.bag_reader import Bag, Chosen, Held, Message, Topic
+from toolkit.datasets.io.bag_reader import (
+    IMU,
+    ODOMETRY,
+    POSE,
+    POSE_COV,
+    TRANSFORM,
+    TWIST,
+    TWIST_COV,
+    Bag,
+    Chosen,
+    Message,
+    Topic,
+)
 from toolkit.datasets.io.euroc_calibration import kalibr_noise, read_calibration
 from toolkit.datasets.io.fields import camera_matrix
 from toolkit.errors import DataError, printable
@@ -183,19 +197,41 @@ def _field(info: Any, name: str) -> Any:
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.lower())
 
 
-def pose_of(value: Any) -> tuple[list[float], str]:
-    """Return x y z qx qy qz qw of an Odometry, Pose(WithCovariance)Stamped or TransformStamped, and whose frame."""
-    if hasattr(value, "transform"):
-        at, turn, child = value.transform.translation, value.transform.rotation, str(value.child_frame_id)
-    else:
-        pose = getattr(value.pose, "pose", value.pose)
-        at, turn, child = pose.position, pose.orientation, str(getattr(value, "child_frame_id", ""))
-    return [at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w], frame_name(child)
+# Where messages have their vectors, by type: of an IMU rates and specific force, of others linear and angular velocity.
+VECTORS = {
+    IMU: ("angular_velocity", "linear_acceleration"),
+    ODOMETRY: ("twist.twist.linear", "twist.twist.angular"),
+    TWIST: ("twist.linear", "twist.angular"),
+    TWIST_COV: ("twist.twist.linear", "twist.twist.angular"),
+}
+_POSES = {
+    ODOMETRY: ("pose.pose.position", "pose.pose.orientation"),
+    POSE: ("pose.position", "pose.orientation"),
+    POSE_COV: ("pose.pose.position", "pose.pose.orientation"),
+    TRANSFORM: ("transform.translation", "transform.rotation"),
+}
+
+
+def columns(values: Sequence[Any], part: str, axes: str = "xyz") -> Array:
+    """Return a part of messages (N, 3), or a quaternion (N, 4) with the axes xyzw."""
+    get = attrgetter(*(f"{part}.{axis}" for axis in axes))
+    return np.array([get(value) for value in values], dtype=np.float64).reshape(-1, len(axes))
+
+
+def poses_of(values: Sequence[Any], message_type: str) -> Array:
+    """Return x y z qx qy qz qw (N, 7) of messages of a type that has poses."""
+    at, turn = _POSES[message_type]
+    return np.hstack([columns(values, at), columns(values, turn, "xyzw")])
 
 
 def frame_name(name: Any) -> str:
     """Return the name of a frame without the slash that ROS 1 may write before it."""
     return str(name).lstrip("/")
+
+
+_joint: Callable[[Any], tuple[float, ...]] = attrgetter(
+    *(f"transform.translation.{axis}" for axis in "xyz"), *(f"transform.rotation.{axis}" for axis in "xyzw")
+)
 
 
 def fixed(transforms: Iterable[Any]) -> list[Any]:
@@ -204,7 +240,7 @@ def fixed(transforms: Iterable[Any]) -> list[Any]:
     moved: set[tuple[str, str]] = set()
     for transform in transforms:
         edge = (frame_name(transform.header.frame_id), frame_name(transform.child_frame_id))
-        if pose_of(first.setdefault(edge, transform)) != pose_of(transform):
+        if _joint(first.setdefault(edge, transform)) != _joint(transform):
             moved.add(edge)
     return [transform for edge, transform in first.items() if edge not in moved]
 
@@ -215,12 +251,12 @@ class Tree:
     def __init__(self, transforms: Iterable[Any]) -> None:
         self._next: dict[str, dict[str, Array]] = {}
         for transform in transforms:
-            values, child = pose_of(transform)
-            parent = frame_name(transform.header.frame_id)
-            quaternion = np.array(values[3:])
+            parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+            values = np.array(_joint(transform))
+            quaternion = values[3:]
             if not np.isclose(np.linalg.norm(quaternion), 1.0, atol=1e-2):
                 continue  # no rotation, as an unset message
-            T_parent_child = se3(rotation_from_quaternion(quaternion), np.array(values[:3]))
+            T_parent_child = se3(rotation_from_quaternion(quaternion), values[:3])
             self._next.setdefault(parent, {})[child] = T_parent_child
             self._next.setdefault(child, {})[parent] = se3_inverse(T_parent_child)
 
@@ -253,62 +289,67 @@ class Mounted:
     as_they_are: RectifiedPair | None = None
 
 
-@dataclass(frozen=True)
-class Frames:
-    """The names of the frames of the body and of both cameras."""
-
-    body: str
-    left: str
-    right: str
-
-    @classmethod
-    def of(cls, chosen: Chosen, held: Held) -> "Frames":
-        """Return the frames that the first messages name."""
-        body = (chosen.imu, "header.frame_id") if chosen.imu is not None else (chosen.twist, "child_frame_id")
-        left, right = (_frame(held.of(topic)) for topic in (chosen.left, chosen.right))
-        return cls(_frame(held.of(body[0]), of_child=chosen.imu is None), left, right)
-
-
-def _frame(messages: list[Message], *, of_child: bool = False) -> str:
-    """Return the frame of the first message; of an odometry that of the child, which its twist is in."""
-    if not messages:
-        return ""
-    value = messages[0].value
-    child = getattr(value, "child_frame_id", "") if of_child else ""
-    return frame_name(child or value.header.frame_id)
-
-
 @dataclass(frozen=True, eq=False)
-class Source:
-    """Possible sources of a calibration; ``in_tf`` says that /tf connects the frames, and not /tf_static."""
+class Recorded:
+    """What a bag holds but its images: messages by topic, of cameras the first, and the fixed transforms.
+
+    ``in_tf`` says that /tf connects the frames of body and camera, and not /tf_static.
+    """
 
     path: Path
     chosen: Chosen
-    held: Held
+    held: Mapping[str, Sequence[Message]]
     tree: Tree
-    frames: Frames
     in_tf: bool = False
 
+    def of(self, topic: Topic | None) -> Sequence[Message]:
+        """Return the messages of a topic in the order of recording; none where there is no such topic."""
+        return () if topic is None else self.held.get(topic.name, ())
 
-def source_of(bag: Bag, chosen: Chosen, held: Held) -> Source:
-    """Return where the calibration of a bag may be from; /tf is read where /tf_static does not join the frames."""
-    frames = Frames.of(chosen, held)
-    static = [t for topic in chosen.transforms for message in held.of(topic) for t in message.value.transforms]
-    source = Source(bag.path, chosen, held, Tree(static), frames)
-    if not chosen.moving or source.tree.between(frames.body, frames.left) is not None:
-        return source
-    tree = Tree([*fixed(_moving(bag, chosen)), *static])
-    if tree.between(frames.body, frames.left) is None:
-        return source
-    return replace(source, tree=tree, in_tf=True)
+    def frame_of(self, topic: Topic | None, *, of_child: bool = False) -> str:
+        """Return the frame of a topic's first message; of an odometry that of the child, which its twist is in."""
+        if not self.of(topic):
+            return ""
+        value = self.of(topic)[0].value
+        child = getattr(value, "child_frame_id", "") if of_child else ""
+        return frame_name(child or value.header.frame_id)
+
+    @property
+    def body(self) -> str:
+        """The frame of the IMU, or the one whose twists are measured."""
+        imu = self.chosen.imu
+        return self.frame_of(self.chosen.twist, of_child=True) if imu is None else self.frame_of(imu)
+
+    @property
+    def T_imu_left(self) -> Array | None:
+        """Where the left camera stands on the body, None where no transform says it."""
+        return self.tree.between(self.body, self.frame_of(self.chosen.left))
 
 
-def _moving(bag: Bag, chosen: Chosen) -> Iterator[Any]:
-    for message in bag.messages({topic.name for topic in chosen.moving}):
-        yield from message.value.transforms
+def recorded(bag: Bag, chosen: Chosen) -> Recorded:
+    """Read what a bag holds but its images; /tf is read where /tf_static does not join the body and the camera."""
+    wanted = (chosen.imu, chosen.accel, chosen.twist, chosen.truth, *chosen.transforms)
+    held: dict[str, list[Message]] = {}
+    for message in bag.messages({topic.name for topic in wanted if topic is not None}):
+        held.setdefault(message.topic, []).append(message)
+    for topic in (chosen.left_info, chosen.right_info, chosen.left, chosen.right):
+        if topic is not None:
+            held[topic.name] = list(islice(bag.messages({topic.name}), 1))
+    static = [one for topic in chosen.transforms for message in held.get(topic.name, ()) for one in _joints(message)]
+    found = Recorded(bag.path, chosen, held, Tree(static))
+    if not chosen.moving or found.T_imu_left is not None:
+        return found
+    moving = (one for message in bag.messages({topic.name for topic in chosen.moving}) for one in _joints(message))
+    by_tf = replace(found, tree=Tree([*fixed(moving), *static]), in_tf=True)
+    return found if by_tf.T_imu_left is None else by_tf
 
 
-def mounted(source: Source, motion: MotionSamples) -> Mounted:
+def _joints(message: Message) -> Sequence[Any]:
+    transforms: Sequence[Any] = message.value.transforms
+    return transforms
+
+
+def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
     """Return the calibration: from files beside the bag, or from its own messages.
 
     Raises DataError where there is none, it is incomplete, or the pose of the camera on the body is unknown.
@@ -323,9 +364,9 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
         pair = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
         notes = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
         return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes)
-    T_imu_left = source.tree.between(source.frames.body, source.frames.left)
+    T_imu_left, left = source.T_imu_left, source.frame_of(source.chosen.left)
     # An IMU does not have the axes of a camera: if both name the same frame, the name is wrong for one of them.
-    if T_imu_left is None or (source.chosen.imu is not None and source.frames.body == source.frames.left):
+    if T_imu_left is None or (source.chosen.imu is not None and source.body == left):
         raise DataError(_not_joined(source))
     pair, as_they_are, how = _pair(source)
     stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
@@ -335,13 +376,13 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
     return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)
 
 
-def _not_joined(source: Source) -> str:
+def _not_joined(source: Recorded) -> str:
     others = ", ".join(source.chosen.other_imus)
     other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
     tf = "/tf_static and no fixed transform of /tf" if source.chosen.moving else "/tf_static"
     return (
         f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
-        f"{source.frames.body!r} and {source.frames.left!r}; {_PUT_BESIDE}{other}"
+        f"{source.body!r} and {source.frame_of(source.chosen.left)!r}; {_PUT_BESIDE}{other}"
     )
 
 
@@ -362,14 +403,14 @@ def _folders_beside(path: Path) -> tuple[Path, ...]:
     return (resolved, resolved.parent) if resolved.is_dir() else (resolved.parent,)
 
 
-def _pair(source: Source) -> tuple[RectifiedPair, RectifiedPair | None, str]:
+def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     """Return the pair of cameras of the CameraInfo messages, that of images which come rectified, and the topics."""
     topics, infos = _infos(source)
     what = [f"{source.path}: {topic.name}" for topic in topics]
     left_rect, right_rect = (rectification(info) for info in infos)
     how = " and ".join(topic.name for topic in topics)
     baseline_m = right_rect.right_m - left_rect.right_m
-    T_right_left = source.tree.between(source.frames.right, source.frames.left)
+    T_right_left = source.tree.between(*(source.frame_of(one) for one in (source.chosen.right, source.chosen.left)))
     R_rect_left, R_rect_right = left_rect.R_rect_cam, right_rect.R_rect_cam
     if source.chosen.rectified:
         if not baseline_m > 0.0 and T_right_left is not None:
@@ -394,11 +435,11 @@ def _pair(source: Source) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     return rectified(left, right, T_right_left, f"{source.path}: {how}"), as_they_are, how
 
 
-def _infos(source: Source) -> tuple[list[Topic], list[Any]]:
+def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
     """Return the topics of both calibrations and their first messages; raises DataError where one is missing."""
     chosen, topics, infos = source.chosen, [], []
     for image, topic in ((chosen.left, chosen.left_info), (chosen.right, chosen.right_info)):
-        messages = source.held.of(topic)
+        messages = source.of(topic)
         if topic is None or not messages:
             raise DataError(
                 f"{source.path}: there is no sensor_msgs/CameraInfo beside {image.name}; name it with --topics "
