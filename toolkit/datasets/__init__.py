@@ -113,7 +113,11 @@ class _Found(NamedTuple):
 
 def modules() -> dict[str, FoundModule]:
     """Return every module of this package and of the announced ones by name, importing none of them."""
-    return {one.name: one for one in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP))}
+    return {one.name: one for one in _modules()}
+
+
+def _modules() -> tuple[FoundModule, ...]:
+    return (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP))
 
 
 @cache
@@ -124,7 +128,7 @@ def _found() -> _Found:
     """
     modules: dict[str, ModuleType] = {}
     missing: dict[str, str] = {}
-    for found in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP)):
+    for found in _modules():
         if found.name in modules:
             raise ExtensionError(f"two dataset modules are called {found.name}, the second is {found.path}; rename one")
         try:
@@ -238,8 +242,7 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
 
     Raises DataError where the source is no recording with images, or they cannot be used.
     """
-    path = Path(source).expanduser()
-    reader = None if source in built_ins() else _reader_of(path, source)
+    path, reader = _found_at(source)
     if not isinstance(reader, HasImages):
         raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
     _check_topics(source, reader, frontend)
@@ -251,11 +254,8 @@ def tracked_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> Image
 
     Raises DataError where the source cannot be read.
     """
-    if source in built_ins():
-        return None
-    path = Path(source).expanduser()
-    reader = _reader_of(path, source)
-    return reader.images_of(path, frontend) if _of_images(reader, path, frontend) else None
+    path, reader = _found_at(source)
+    return reader.images_of(path, frontend) if reader and _of_images(reader, path, frontend) else None
 
 
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:
@@ -263,10 +263,9 @@ def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) ->
 
     Raises DataError where it is no source at all.
     """
-    if source in built_ins():
+    path, reader = _found_at(source)
+    if reader is None:
         return _differs_by_seed(built_ins()[source])
-    path = Path(source).expanduser()
-    reader = _reader_of(path, source)
     return isinstance(reader, DrawnFromASeed) and not _of_images(reader, path, frontend)
 
 
@@ -280,12 +279,15 @@ def load_references(source: str) -> dict[str, Trajectory]:
 
     Raises DataError as :func:`load_sequence` does, or where such an estimate cannot be read.
     """
-    if source in built_ins():
-        return {}
-    path = Path(source).expanduser()
-    reader = _reader_of(path, source)
+    path, reader = _found_at(source)
     with np.errstate(all="ignore"):
         return dict(reader.references(path)) if isinstance(reader, BringsReferences) else {}
+
+
+def _found_at(source: str) -> tuple[Path, RecordingFormat | None]:
+    """Return the path of a source and the module that reads it, None of a built-in one; raise DataError where none."""
+    path = Path(source).expanduser()
+    return path, None if source in built_ins() else _reader_of(path, source)
 
 
 def _reader_of(path: Path, source: str) -> RecordingFormat:

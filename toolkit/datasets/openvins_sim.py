@@ -8,14 +8,12 @@ Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
 import json
-from collections.abc import Iterator
 from json import JSONDecodeError
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, rectified_observations, stamps_ns
+from toolkit.datasets.io.fields import Fields, check_frame_count, flattened, rectified_observations, stamps_ns
 from toolkit.datasets.io.tables import find_table, first_line, read_columns
 from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.formats import checked_poses
@@ -111,25 +109,9 @@ def _calibration(path: Path) -> Fields:
         raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a JSON {type(content).__name__}, expected an object; export it again")
-    fields = Fields(path, dict(_leaves(content)))
+    fields = Fields(path, dict(flattened(content)))
     fields.require(*_REQUIRED)
     return fields
-
-
-def _leaves(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield what a tree of JSON objects holds as arrays with dotted keys; ragged lists become arrays of objects."""
-    for key, value in node.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, _as_array(value)
-
-
-def _as_array(value: Any) -> Any:
-    try:
-        return np.asarray(value)
-    except ValueError:  # a ragged list has no shape
-        return np.asarray(str(value))
 
 
 def _rig(calibration: Fields) -> StereoRig:

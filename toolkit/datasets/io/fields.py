@@ -347,7 +347,7 @@ def read_fields(path: Path) -> Fields:
         raise DataError(f"{path}: is no YAML of a calibration ({why}); copy it again, or name another file") from error
     if not isinstance(document, dict):
         raise DataError(f"{path}: holds no 'key: value'; a calibration is made of them")
-    return Fields(path, dict(_flattened(document, "")))
+    return Fields(path, dict(flattened(document)))
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
@@ -389,10 +389,11 @@ for _tag in ("tag:yaml.org,2002:map", "tag:yaml.org,2002:opencv-matrix"):
     _Loader.add_constructor(_tag, _mapping)
 
 
-def _flattened(value: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
+def flattened(value: Any, key: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Yield what a tree of mappings holds as arrays with dotted keys, as :func:`read_fields` gives them."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _flattened(inner, f"{key}.{name}" if key else str(name))
+            yield from flattened(inner, f"{key}.{name}" if key else str(name))
         matrix = _as_matrix(value)
         if matrix is not None:
             yield key, matrix
