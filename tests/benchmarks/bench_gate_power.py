@@ -39,7 +39,7 @@ import gate_pool
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
 from toolkit.gate.case_check import changed_metrics
-from toolkit.gate.significance import Pairs, Where, holm, moved_p, worse_p
+from toolkit.gate.significance import Pairs, Where, holm
 from toolkit.progress import silent
 
 CASES = {"flight": 2.5, "drive": 25.0}
@@ -131,7 +131,7 @@ def drawn_checks(every: list[Column], size: Size, planted: tuple[str, str]) -> t
         count, source = column.values["0"].shape[0], column.where.sequence
         seeds = np.take_along_axis(pools[source][:, None], draws[source] % count, axis=-1) % count
         pairs = column.pairs(seeds, flips[source], plant if column.where.estimator == name else "0")
-        moved[..., i], worse[..., i] = moved_p(pairs), worse_p(pairs)
+        moved[..., i], worse[..., i] = pairs.moved_p(), pairs.worse_p()
     kept = slice(len(every))
     return (
         (holm(moved) <= FALSE_ALARM_RATE)[..., kept] | (holm(worse) <= FALSE_ALARM_RATE / 2.0)[..., kept],

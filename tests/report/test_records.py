@@ -10,8 +10,9 @@ import msgspec
 import pytest
 
 from toolkit.errors import DataError
+from toolkit.evaluation import against_baseline
 from toolkit.files.documents import parse, read, to_line, to_text
-from toolkit.gate import baseline_file, trajectory_baseline
+from toolkit.gate import baseline_file
 from toolkit.report.records import RECORDS, read_card, read_check, schema_files
 
 Document = dict[str, Any]
@@ -41,9 +42,7 @@ CASES = {
 # Baselines are made to be reviewed, and laid out otherwise than other documents.
 REVIEWED = {
     "baseline.json": lambda path: baseline_file.to_text(baseline_file.load_baseline(path)),
-    "trajectory-baseline.json": lambda path: trajectory_baseline.to_text(
-        trajectory_baseline.load_trajectory_baseline(path)
-    ),
+    "trajectory-baseline.json": lambda path: against_baseline.to_text(against_baseline.load_trajectory_baseline(path)),
 }
 
 

@@ -28,8 +28,8 @@ from toolkit.errors import printable
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from toolkit.evaluation.against_baseline import GivenRuns
     from toolkit.gate.baseline import Baseline, Case
-    from toolkit.gate.trajectory_check import GivenRuns
     from toolkit.gate.verdict import Check
     from toolkit.settings import Settings
 
@@ -119,10 +119,9 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
+    from toolkit.evaluation.against_baseline import new_trajectory_baseline, to_text
+    from toolkit.evaluation.scoring import Terms
     from toolkit.files.writing import check_writable, write_text
-    from toolkit.gate.trajectory_baseline import to_text
-    from toolkit.gate.trajectory_check import new_trajectory_baseline
-    from toolkit.gate.trajectory_files import Scoring
     from toolkit.report.manifest import made_here
 
     asked = (options.sequences, options.estimators, options.duration, options.config, requested_changes(options))
@@ -130,11 +129,11 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
     out = options.out or Path("trajectory-baseline.json")
     check_writable(out, "{")
-    scoring = Scoring(options.align or Scoring.align, options.gap or Scoring.gap_s)
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_trajectory_baseline(_runs_given(options.trajectories, options.truth), scoring, made_by)
+    given = _runs_given(options.trajectories, options.truth)
+    made = new_trajectory_baseline(given, options.align or "se3", options.gap or Terms.gap_s, made_by)
     write_text(out, to_text(made))
-    runs = sum(len(one.files) for one in made.sequences.values())
+    runs = sum(len(one.files) for one in made.sequences)
     print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))
     return 0
 
@@ -285,13 +284,12 @@ def _check_of_estimators(options: argparse.Namespace) -> Check:
 
 
 def _check_of_trajectories(options: argparse.Namespace) -> Check:
-    from toolkit.gate.trajectory_baseline import load_trajectory_baseline
-    from toolkit.gate.trajectory_check import check_trajectories
+    from toolkit.evaluation.against_baseline import check_trajectories, load_trajectory_baseline
 
     if options.speed_against:
         raise UsageError("--speed-against measures the time of estimators; with --trajectories nothing runs")
     baseline = load_trajectory_baseline(options.baseline)
-    given = _runs_given(options.trajectories, options.truth, baseline.sequences)
+    given = _runs_given(options.trajectories, options.truth, [one.sequence for one in baseline.sequences])
     return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)
 
 
@@ -301,7 +299,7 @@ def _runs_given(place: Path, truths: Sequence[str], known: Iterable[str] = ()) -
     Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none, or
     a truth that is not there, or of a sequence that neither the folder has nor is ``known``.
     """
-    from toolkit.gate.trajectory_check import FolderOfRuns, Truths
+    from toolkit.evaluation.against_baseline import EvaluatedRuns, FolderOfRuns, Truths
 
     if place.is_dir() or place.suffix != ".json":
         named = [text.partition("=") for text in truths if "=" in text and not Path(text).is_dir()]
@@ -312,8 +310,6 @@ def _runs_given(place: Path, truths: Sequence[str], known: Iterable[str] = ()) -
         folder = FolderOfRuns(place, Truths(folders[0] if folders else None, files))
         folder.truths.check({*folder.sequences, *known})
         return folder
-    from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
-
     if truths:
         raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
-    return EvaluatedRuns(place, read_evaluation(place))
+    return EvaluatedRuns(place)

@@ -4,24 +4,17 @@ An entry of ``runs`` is one of ``metrics.json`` with the sequence and the file i
 the place of a folder of trajectories.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
 from toolkit.answers import Status
-from toolkit.errors import DataError
 from toolkit.evaluation.scoring import METRICS
 from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.files import documents
 from toolkit.files.documents import Count, Value, of_attributes
-from toolkit.gate.baseline import Values
-from toolkit.gate.trajectory_baseline import ScoredSequence
-from toolkit.gate.trajectory_files import Scoring
 from toolkit.metrics import Metric
 
 _REMEDY = "make it with vislam evaluate --out"
@@ -142,7 +135,7 @@ def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
         ranked_by=evaluation.ranked_by.key,
         sequences=tuple(
             SequenceScored(
-                sequence=name, truth=truth.path.as_posix(), truth_hash=truth.stamped.digest, poses=len(truth.poses),
+                sequence=name, truth=truth.path.as_posix(), truth_hash=truth.digest, poses=len(truth.poses),
                 duration_s=truth.duration_s, path_m=truth.path_m,
             )
             for name, truth in evaluation.truths.items()
@@ -194,48 +187,3 @@ def _paired(test: PairedTest) -> PairedRecord:
 def read_evaluation(path: Path) -> EvaluationRecord:
     """Read an ``evaluation.json``; raises DataError, in one line with the place, where it is not one."""
     return documents.read(path, EvaluationRecord, remedy=_REMEDY)
-
-
-@dataclass(frozen=True)
-class EvaluatedRuns:
-    """The runs of an evaluation as the gate takes them: a sequence is SYSTEM/SEQUENCE where there are several systems.
-
-    Coverage and errors must be by the gate's own rules, so that the nearest poses of ``--max-dt`` are refused.
-    """
-
-    path: Path
-    record: EvaluationRecord
-
-    @property
-    def sequences(self) -> tuple[str, ...]:
-        """Return the sequences there are runs of."""
-        return tuple(self._runs)
-
-    def scored(self, sequence: str, scoring: Scoring, before: ScoredSequence | None) -> ScoredSequence:
-        """Return the scores of a sequence's runs; raises DataError where one failed, or they were scored otherwise."""
-        self._check_terms(scoring)
-        runs = self._runs.get(sequence, ())
-        if not runs:
-            raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
-        failed = next((run for run in runs if run.status != "ok"), None)
-        if failed is not None:
-            raise DataError(f"{failed.run} failed: {failed.log[0]}")
-        truth = next(one for one in self.record.sequences if one.sequence == runs[0].sequence)
-        scores: Mapping[str, Values] = {key: tuple(run.metrics.get(key) for run in runs) for key in scoring.metrics}
-        return ScoredSequence(truth.truth, truth.truth_hash, tuple(run.file or run.run for run in runs), scores)
-
-    def _check_terms(self, scoring: Scoring) -> None:
-        terms = self.record.terms
-        if terms.max_dt_s is not None:
-            raise DataError(f"{self.path}: it pairs nearest poses; evaluate again without --max-dt")
-        if terms.gap_s != scoring.gap_s:
-            gaps = f"its longest covered gap is {terms.gap_s:g} s, the baseline's {scoring.gap_s:g} s"
-            raise DataError(f"{self.path}: {gaps}; evaluate again with --gap {scoring.gap_s:g}")
-
-    @cached_property
-    def _runs(self) -> dict[str, tuple[RunRecord, ...]]:
-        several = len({run.estimator for run in self.record.runs}) > 1
-        found: dict[str, list[RunRecord]] = {}
-        for run in self.record.runs:
-            found.setdefault(f"{run.estimator}/{run.sequence}" if several else run.sequence, []).append(run)
-        return {name: tuple(runs) for name, runs in found.items()}

@@ -1,4 +1,8 @@
-"""Finds trajectory files by system, sequence and run, and the truth of each sequence."""
+"""Finds trajectory files by system, sequence and run, and the truth of each sequence.
+
+A folder of a system has, for each sequence, one file (``V1_01.tum``) or a folder of repeated runs
+(``V1_01/run-1.tum`` ...).
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -6,7 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from toolkit.errors import DataError, printable
-from toolkit.gate.trajectory_files import files_by_sequence, trajectory_files
+from toolkit.files.reading import unreadable
+
+SUFFIXES = (".tum", ".txt", ".csv")
 
 
 @dataclass(frozen=True)
@@ -153,3 +159,36 @@ def _existing(path: Path) -> Path:
 
 def _name(path: Path) -> str:
     return printable(path.stem)
+
+
+def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
+    """Return the trajectory files of each sequence in a folder; raises DataError where there are none."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum")
+    found: dict[str, tuple[Path, ...]] = {}
+    for path in _entries(folder):
+        files = trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
+        name = printable(path.name if path.is_dir() else path.stem)
+        if files and name in found:
+            raise DataError(f"{folder}: {name} is given twice, as {found[name][0].name} and {path.name}; keep one")
+        if files:
+            found[name] = files
+    if not found:
+        raise DataError(f"{folder}: no SEQUENCE.tum and no SEQUENCE/RUN.tum in it ({', '.join(SUFFIXES)} are read)")
+    return found
+
+
+def trajectory_files(folder: Path) -> tuple[Path, ...]:
+    """Return the trajectory files that are directly in a folder, by name; raises DataError where it cannot be read."""
+    return tuple(filter(_is_file, _entries(folder)))
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise DataError(unreadable(folder, error)) from error
+
+
+def _is_file(path: Path) -> bool:
+    return path.is_file() and path.suffix in SUFFIXES and not path.name.startswith(".")

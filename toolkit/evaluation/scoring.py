@@ -32,7 +32,6 @@ from toolkit.datasets.trajectories.belonging import (
 )
 from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
-from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
@@ -54,7 +53,9 @@ from toolkit.metrics.parts.consistency import (
     chi2_quantile,
 )
 from toolkit.models.gating import mahalanobis_squared
+from toolkit.sequence import content_digest
 
+TIME_COVERAGE = "time_coverage_percent"
 COVERAGE = Metric(
     TIME_COVERAGE,
     "the truth's time that lies between poses no farther apart than the longest gap (percent)",
@@ -98,6 +99,8 @@ _LOOKS_ONE_WAY = (
 _OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
 _LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
+# Of the hash of a truth: significant digits that are hashed, hexadecimal digits that are kept.
+_DIGITS, _LENGTH = 9, 16
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
@@ -124,19 +127,25 @@ class Terms:
 
 
 @dataclass(frozen=True, eq=False)
-class TruthFile:
-    """The truth of a sequence: poses (N, 4, 4) on stamps (N,) ns, which are its lines where it has none."""
+class Poses:
+    """Poses (N, 4, 4) of a file on their stamps (N,) ns."""
 
-    name: str
     path: Path
     t_ns: IntArray
     poses: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TruthFile(Poses):
+    """The truth of a sequence; its stamps are its lines where it has none."""
+
+    name: str
     is_timed: bool
 
     @property
-    def stamped(self) -> Poses:
-        """Return the poses as the gate has them."""
-        return Poses(self.path, self.t_ns, self.poses)
+    def digest(self) -> str:
+        """Return a hash of the content, which another way to print it does not change."""
+        return content_digest((self.t_ns, self.poses), _DIGITS)[:_LENGTH]
 
     @cached_property
     def reference(self) -> Reference:
@@ -162,7 +171,7 @@ def read_truth(name: str, path: Path) -> TruthFile:
     if file.other_order is not None:
         check_order(path, file.T_world_imu, file.other_order)
     t_ns = _lines_ns(len(file)) if file.t_ns is None else file.t_ns
-    return TruthFile(name, path, t_ns, file.T_world_imu, file.t_ns is not None)
+    return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None)
 
 
 def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
@@ -231,7 +240,7 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     reference = truth.reference
     check_clock(what, reference, estimate.t_ns)
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
-    matched = matched_poses(estimate, truth.stamped)
+    matched = matched_poses(estimate, truth)
     check_mirrored(what, matched.truth, matched.estimate)
     readings = [INVERTED, BACKWARDS]
     if file.other_order is not None:
@@ -245,8 +254,8 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
 
 
 def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:
-    matched = matched_poses(estimate, truth.stamped) if max_dt_s is None else nearest_poses(estimate, truth, max_dt_s)
-    alone = next((file.path for file in (estimate, truth.stamped) if file.t_ns.size < 2), None)
+    matched = matched_poses(estimate, truth) if max_dt_s is None else nearest_poses(estimate, truth, max_dt_s)
+    alone = next((file.path for file in (estimate, truth) if file.t_ns.size < 2), None)
     if alone is not None:
         raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
@@ -256,6 +265,31 @@ def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Match
             "or allow more with --max-dt"
         )
     return matched
+
+
+def time_coverage_percent(t_ns: IntArray, truth_t_ns: IntArray, gap_s: float) -> float:
+    """Return the percentage of the truth's time (N,) ns that lies between stamps (n,) ns at most ``gap_s`` apart.
+
+    Keyframes that are seconds apart cover the time between them; a lost track does not. What precedes the first pose
+    and follows the last one is not covered.
+    """
+    begin, end = int(truth_t_ns[0]), int(truth_t_ns[-1])
+    within = np.clip(t_ns, begin, end)
+    gaps = np.diff(within)
+    covered = float(gaps[np.diff(t_ns) <= gap_s * NS_PER_S].sum())
+    return 100.0 * covered / max(end - begin, 1)
+
+
+def matched_poses(estimate: Poses, truth: Poses) -> Matched:
+    """Return the pairs on the stamps of the sparser of the two, between whose neighbours the other is interpolated."""
+    path_m = distance_along(truth.poses[:, :3, 3])
+    truth_period_ns, period_ns = median_period_ns(truth.t_ns), median_period_ns(estimate.t_ns)
+    if truth_period_ns > period_ns:
+        met, poses = poses_at(estimate.t_ns, estimate.poses, truth.t_ns, period_ns)
+        return Matched(truth.t_ns[met], truth.poses[met], poses, path_m[met])
+    met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, truth_period_ns)
+    t_ns = estimate.t_ns[met]
+    return Matched(t_ns, true, estimate.poses[met], np.interp(t_ns, truth.t_ns, path_m))
 
 
 def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched:
@@ -281,7 +315,7 @@ def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile,
     with np.errstate(all="ignore"):  # a value that is not finite becomes None, with that as its reason
         for file_of_metrics in (ate, rpe, kitti, drift, clock_offset):
             found.append(_or_reason(file_of_metrics.score, pairs, file_of_metrics.METRICS))
-        found.append(_nees_scores(file, estimate, truth.stamped, level=terms.level))
+        found.append(_nees_scores(file, estimate, truth, level=terms.level))
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
     found.append(Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)}))
     values = {key: value for one in found for key, value in one.values.items()}

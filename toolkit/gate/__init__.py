@@ -2,6 +2,6 @@
 
 Reading order: baseline (its values), baseline_file (as JSON) -> measuring -> verdict, significance (the tests of a
 metric) -> case_check (a case) -> checking (the whole). Besides: interleaved (speed against another version of the code,
-each in a process of timing_child), and trajectory_files -> trajectory_baseline -> trajectory_check (files of another
-system, without a run). Use, and power of the tests: docs/gate.md.
+each in a process of timing_child). Files of another system, without a run: toolkit.evaluation.against_baseline. Use,
+and power of the tests: docs/gate.md.
 """

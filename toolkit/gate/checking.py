@@ -9,7 +9,7 @@ from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, inst
 from toolkit.gate.case_check import USUAL_TERMS, CaseVerdicts, CheckTerms, check_case
 from toolkit.gate.interleaved import compare_speed
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
-from toolkit.gate.significance import check_pairs
+from toolkit.gate.significance import check_metrics
 from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import check_options, find_all
@@ -82,7 +82,7 @@ def check_all(
     collected: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
 ) -> Check:
     """Test all metrics of the check together, and collect the verdicts."""
-    tested = check_pairs(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
+    tested = check_metrics(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {
         (case.source, name): (i, k)
         for i, (case, before) in enumerate(baseline.cases)

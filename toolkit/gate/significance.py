@@ -16,6 +16,7 @@ one-sided ("The generalization of 'Student's' problem when several different pop
 Biometrika 34, 1947). Identical runs have no spread; then the answer is certain.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,31 +67,94 @@ class Pairs(Compared):
         """Log ratios (..., n) of the value now to the baseline's, positive where it grew."""
         return log_of(self.after) - log_of(self.before)
 
+    @property
+    def runs(self) -> str:
+        """Return what was compared, in words."""
+        return f"over {self.before.size} seeds"
+
+    @property
+    def change(self) -> float:
+        """Return the mean change, as a log ratio."""
+        return float(self.differences.mean())
+
+    @property
+    def still(self) -> float:
+        """Return the change, as a log ratio, that is no movement."""
+        return ROUNDING
+
+    def moved_p(self) -> Array:
+        """Return the p-value (...) of having moved by more than rounding, two-sided."""
+        up, down = (paired_p(sign * self.differences, ROUNDING) for sign in (1.0, -1.0))
+        return np.asarray(np.minimum(1.0, 2.0 * np.minimum(up, down)))
+
+    def worse_p(self) -> Array:
+        """Return the p-value (...) of being worse by more than the margin; 1 where what changed is not worse."""
+        before, after, margin = log_of(self.before), log_of(self.after), self.criterion.margin
+        if self.criterion.worse == "larger":
+            return paired_p(after - before, margin)
+        # The mean NEES over runs scatters by chance; a NIS is a mean over so many innovations that it hardly does.
+        with_band = self.where.metric == "nees_pose_mean"
+        low, high = nees_band(POSE_DOF, before.shape[-1]) if with_band else (1.0, 1.0)
+        return _away_p(before, after, margin, (float(np.log(low)), float(np.log(high))))
+
+    def detectable(self, rate: float) -> float:
+        """Return the excess over a margin, as a log ratio, that one test at ``rate`` finds with 95 % power."""
+        return smallest_detectable(self.differences, rate, POWER)
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats(Compared):
+    """One metric in runs made anew on each side, at least FEWEST_RUNS of them, by Welch's test; growth is worse.
+
+    What changed by less than the margin, up or down, has not moved.
+    """
+
+    @property
+    def runs(self) -> str:
+        """Return what was compared, in words."""
+        return f"over {self.before.size} runs before, {self.after.size} now"
+
+    @property
+    def change(self) -> float:
+        """Return the change of the mean logarithm."""
+        return float(log_of(self.after).mean() - log_of(self.before).mean())
+
+    @property
+    def still(self) -> float:
+        """Return the change, as a log ratio, that is no movement."""
+        return self.criterion.margin
+
+    @property
+    def error_and_dof(self) -> tuple[float, float]:
+        """Return the standard error of the change, and its degrees of freedom."""
+        sides = [log_of(side) for side in (self.before, self.after)]
+        variances = np.array([0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides])
+        of_each = np.array([side.size - 1 for side in sides])
+        total = float(variances.sum())
+        dof = total**2 / float((variances**2 / of_each).sum()) if total else float(of_each.sum())
+        return float(np.sqrt(total)), dof
+
+    def moved_p(self) -> float:
+        """Return the p-value of having changed by more than the margin, two-sided."""
+        return min(1.0, 2.0 * min(self._beyond_p(1.0), self._beyond_p(-1.0)))
+
+    def worse_p(self) -> float:
+        """Return the p-value of having grown by more than the margin."""
+        return self._beyond_p(1.0)
+
+    def detectable(self, rate: float) -> float:
+        """Return the excess over a margin, as a log ratio, that one test at ``rate`` finds with 95 % power."""
+        error, dof = self.error_and_dof
+        return float(stdtrit(dof, 1.0 - rate) + stdtrit(dof, POWER)) * error
+
+    def _beyond_p(self, sign: float) -> float:
+        excess, (error, dof) = sign * self.change - self.criterion.margin, self.error_and_dof
+        return float(stdtr(dof, -excess / error)) if error else float(excess <= 0.0)
+
 
 def log_of(values: Array) -> Array:
     """Return the logarithms (...) of values (...) that are not negative."""
     return np.log(np.maximum(values, _LEAST))
-
-
-def moved_p(pairs: Pairs) -> Array:
-    """Return the p-value (...) of having moved by more than rounding, two-sided."""
-    up, down = (paired_p(sign * pairs.differences, ROUNDING) for sign in (1.0, -1.0))
-    return np.asarray(np.minimum(1.0, 2.0 * np.minimum(up, down)))
-
-
-def worse_p(pairs: Pairs) -> Array:
-    """Return the p-value (...) of having become worse by more than the margin; 1 where what changed is not worse."""
-    if pairs.criterion.worse == "larger":
-        return paired_p(pairs.differences, pairs.criterion.margin)
-    return _away_p(log_of(pairs.before), log_of(pairs.after), pairs.criterion.margin, _band(pairs))
-
-
-def _band(pairs: Pairs) -> tuple[float, float]:
-    """Return the band of logarithms within which the mean over the seeds is consistent."""
-    if pairs.where.metric not in _WITH_BAND:
-        return 0.0, 0.0
-    low, high = (float(log_of(np.array(edge))) for edge in nees_band(POSE_DOF, pairs.before.shape[-1]))
-    return low, high
 
 
 def _away_p(before: Array, after: Array, margin: float, band: tuple[float, float]) -> Array:
@@ -110,42 +174,43 @@ def _away_p(before: Array, after: Array, margin: float, band: tuple[float, float
     return np.where((low <= now) & (now <= high), 1.0, np.minimum(1.0, 2.0 * p))
 
 
-def check_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False) -> list[Verdict]:
-    """Judge all paired metrics of a check; the chance of any false alarm among them is at most ``rate``.
+def check_metrics(tests: Sequence[Pairs | Repeats], rate: float, *, accept_better: bool = False) -> list[Verdict]:
+    """Judge all metrics that are tested in a check; the chance of any false alarm among them is at most ``rate``.
 
     A movement may go up or down and a worsening has one side, so that half of the rate belongs to each side. With
     ``accept_better`` what moved passes unless it is worse.
     """
-    if not tests:
-        return []
-    moved, worse = (holm(np.array([float(p(pairs)) for pairs in tests])).tolist() for p in (moved_p, worse_p))
+    moved, worse = (
+        holm(np.array([float(p) for p in p_values])).tolist()
+        for p_values in ([one.moved_p() for one in tests], [one.worse_p() for one in tests])
+    )
     verdicts = []
-    for pairs, p, p_worse in zip(tests, moved, worse, strict=True):
+    for one, p, p_worse in zip(tests, moved, worse, strict=True):
         finding: Finding = "regressed" if p_worse <= rate / 2.0 else "moved" if p <= rate else "same"
         if finding == "moved" and accept_better:
-            finding = "better" if _is_nearer(pairs) else "worse"
-        margin = pairs.criterion.margin if accept_better else ROUNDING
-        seen = smallest_detectable(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
-        verdicts.append(_verdict(pairs, finding, p_worse if finding == "regressed" else p, seen))
+            finding = "better" if _is_nearer(one) else "worse"
+        margin = one.criterion.margin if accept_better else one.still
+        seen = one.detectable(rate / len(tests) / 2.0) + margin
+        verdicts.append(_verdict(one, finding, p_worse if finding == "regressed" else p, seen))
     return verdicts
 
 
-def _is_nearer(pairs: Pairs) -> bool:
+def _is_nearer(one: Compared) -> bool:
     """Say whether a metric is nearer to its ideal value than before."""
-    was, is_ = float(log_of(pairs.before).mean()), float(log_of(pairs.after).mean())
-    return is_ < was if pairs.criterion.worse == "larger" else abs(is_) < abs(was)
+    was, is_ = float(log_of(one.before).mean()), float(log_of(one.after).mean())
+    return is_ < was if one.criterion.worse == "larger" else abs(is_) < abs(was)
 
 
-def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
-    change = 100.0 * float(np.expm1(pairs.differences.mean()))
-    message = "" if finding == "same" else f"{percent_text(change)} over {pairs.before.size} seeds"
+def _verdict(one: Pairs | Repeats, finding: Finding, p: float, seen: float) -> Verdict:
+    change = 100.0 * float(np.expm1(one.change))
+    message = "" if finding == "same" else f"{percent_text(change)} {one.runs}"
     if finding in FAILURES:
         message += f", and chance explains that with p = {p:.2g}"
-    where = pairs.where
+    where = one.where
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, message,
-        before=geometric_mean(pairs.before), after=geometric_mean(pairs.after), change_percent=change,
-        allowed_percent=pairs.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
+        before=geometric_mean(one.before), after=geometric_mean(one.after), change_percent=change,
+        allowed_percent=one.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
     )  # fmt: skip
 
 
@@ -207,33 +272,3 @@ def smallest_detectable(differences: Array, rate: float, power: float) -> float:
     if n < 2:
         return float("inf")
     return float((stdtrit(n - 1, 1.0 - rate) + stdtrit(n - 1, power)) * standard_error(differences))
-
-
-@dataclass(frozen=True)
-class MeanChange:
-    """The change of the mean logarithm from some runs to others, its standard error and degrees of freedom."""
-
-    change: float
-    error: float
-    dof: float
-
-    @classmethod
-    def of(cls, before: Array, after: Array) -> "MeanChange":
-        """Return the spread between runs before (m,) and after (n,), each of at least FEWEST_RUNS."""
-        sides = [log_of(side) for side in (before, after)]
-        shares = np.array([0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides])
-        of_each = np.array([side.size - 1 for side in sides])
-        total = float(shares.sum())
-        dof = total**2 / float((shares**2 / of_each).sum()) if total else float(of_each.sum())
-        return cls(float(sides[1].mean() - sides[0].mean()), float(np.sqrt(total)), dof)
-
-    def beyond_p(self, margin: float, sign: float) -> float:
-        """Return the p-value that the change, up (1) or down (-1), exceeds a margin."""
-        excess = sign * self.change - margin
-        if self.error == 0.0:
-            return 0.0 if excess > 0.0 else 1.0
-        return float(stdtr(self.dof, -excess / self.error))
-
-    def detectable(self, margin: float, rate: float) -> float:
-        """Return the change that one test at ``rate`` sees with 95 % power."""
-        return margin + float(stdtrit(self.dof, 1.0 - rate) + stdtrit(self.dof, POWER)) * self.error

@@ -13,7 +13,7 @@ from msgspec import UNSET, Meta, Struct, to_builtins
 
 from toolkit.answers import Status
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
-from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
+from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats, Where, holm
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.run_directory import RunFiles, SeedsFiles
@@ -195,11 +195,11 @@ def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> flo
         if len(seeds) < _FEWEST_PAIRS:
             return None
         sides = (np.array([side[seed] for seed in seeds]) for side in (was, is_))
-        return float(moved_p(Pairs(Where("", "", "", metric.key), Criterion("larger", 0.0), *sides)))
+        return float(Pairs(Where("", "", "", metric.key), Criterion("larger", 0.0), *sides).moved_p())
     if min(len(was), len(is_)) < FEWEST_RUNS:
         return None
-    spread = MeanChange.of(_array(was), _array(is_))
-    return min(1.0, 2.0 * min(spread.beyond_p(ROUNDING, sign) for sign in (1.0, -1.0)))
+    criterion = Criterion("larger", 100.0 * ROUNDING)
+    return Repeats(Where("", "", "", metric.key), criterion, _array(was), _array(is_)).moved_p()
 
 
 def _array(values: Mapping[int, float]) -> Array:

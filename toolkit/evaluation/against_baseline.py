@@ -1,0 +1,343 @@
+"""Trajectories of another system against a baseline of its earlier ones, for the accuracy gate; nothing is run.
+
+The baseline holds the scores of each sequence's runs (:mod:`toolkit.evaluation.scoring`), never the trajectories, and
+the hash of the truth they were scored against: the contract is ``vislam.trajectory-baseline/1`` (docs/gate.md).
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePath
+from typing import Annotated, Literal, Protocol
+
+import numpy as np
+from msgspec import Meta, Struct, to_builtins
+
+from toolkit.errors import DataError, no_such, one_line, printable
+from toolkit.evaluation.document import EvaluationRecord, RunRecord, read_evaluation
+from toolkit.evaluation.gathering import files_by_sequence
+from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth, score_file
+from toolkit.files import documents
+from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, Values
+from toolkit.gate.baseline_file import MetricValues, Percent, json_text
+from toolkit.gate.case_check import check_recorded
+from toolkit.gate.measuring import place_of
+from toolkit.gate.significance import FEWEST_RUNS, Repeats, Where, check_metrics
+from toolkit.gate.verdict import Check, Finding, Verdict
+from toolkit.geometry import Array
+
+Align = Literal["se3", "yaw", "sim3"]
+# Growth of an error that is no regression (percent), and loss of time coverage that is accepted (percentage points).
+BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
+
+
+class SequenceRecord(Struct, frozen=True, kw_only=True):
+    """The truth of a sequence, and the scores of its runs."""
+
+    sequence: str
+    truth: Annotated[str, Meta(description="the truth's file, from where the baseline was made")]
+    truth_hash: Annotated[str, Meta(description="of the truth's stamps and poses, to nine digits")]
+    files: Annotated[tuple[str, ...], Meta(description="a run each", min_length=1)]
+    scores: MetricValues
+
+    def __post_init__(self) -> None:
+        for key, values in self.scores.items():
+            if len(values) != len(self.files):
+                raise ValueError(f"scores.{key} does not have an entry a file")
+
+
+class TrajectoryBaselineRecord(Struct, frozen=True, kw_only=True):
+    """How trajectories are scored, what came of it, and what counts as worse."""
+
+    schema: Literal["vislam.trajectory-baseline/1"]
+    made_by: Annotated[dict[str, str], Meta(description="how, when and where it was made")]
+    align: Annotated[Align, Meta(description="what is fitted before positions are compared")]
+    gap_s: Annotated[float, Meta(description="the longest time between two poses that counts as covered", gt=0)]
+    bounds: Annotated[dict[str, Percent], Meta(description="by metric key, the growth in percent that is allowed")]
+    coverage_points: Annotated[float, Meta(description="percent of the time that may be lost", ge=0)]
+    false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
+    sequences: Annotated[tuple[SequenceRecord, ...], Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        scored = scored_metrics(self.align)
+        for key in self.bounds:
+            if key not in scored or key == TIME_COVERAGE:
+                raise ValueError(f"bounds.{key} is not among what is scored: {', '.join(scored)}")
+        for one in self.sequences:
+            lacking = [key for key in (*self.bounds, TIME_COVERAGE) if key not in one.scores]
+            if lacking:
+                raise ValueError(f"{one.sequence} has no scores.{lacking[0]}")
+
+
+def scored_metrics(align: Align) -> tuple[str, ...]:
+    """Return what is scored; a scale that is fitted leaves no drift in metres to speak of."""
+    drift = () if align == "sim3" else ("rpe_100m_percent",)
+    return (f"ate_{align}_m", "ate_se3_deg", *drift, TIME_COVERAGE)
+
+
+def load_trajectory_baseline(path: Path) -> TrajectoryBaselineRecord:
+    """Read the file; raises BaselineError where there is none, or it is not one."""
+    remedy = "make the baseline with vislam baseline --trajectories"
+    try:
+        return documents.read(path, TrajectoryBaselineRecord, remedy=remedy, error=BaselineError)
+    except BaselineError as error:
+        if "'vislam.baseline/" not in str(error):
+            raise
+        why = "is a baseline of estimators, which are run to check it; leave --trajectories out"
+        raise BaselineError(f"{path} {why}") from error
+
+
+def to_text(baseline: TrajectoryBaselineRecord) -> str:
+    """Return the file's text, the values of all runs of a metric on one line."""
+    return json_text(to_builtins(baseline))
+
+
+class GivenRuns(Protocol):
+    """Runs of a system on sequences, from a folder or scored before."""
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are; raises DataError where there are none."""
+
+    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+        """Return the scores of a sequence; ``before`` is what the baseline has of it.
+
+        Raises DataError where there is no run, or one cannot be used.
+        """
+
+
+@dataclass(frozen=True)
+class Truths:
+    """Where the truth of a sequence is: in a file named for it in a folder, or in one that was named."""
+
+    folder: Path | None = None
+    files: Mapping[str, Path] | None = None
+
+    def check(self, sequences: Iterable[str]) -> None:
+        """Raise DataError where a truth is named for none of the sequences, as for a misspelt one, or is not there."""
+        known = sorted(sequences)
+        for name, file in (self.files or {}).items():
+            if name not in known:
+                raise DataError(f"--truth names the truth of {name}: {no_such('sequence', name, known)}")
+            if not file.exists():
+                raise DataError(f"--truth {name}={file}: there is no such file; check the path")
+        if self.folder is not None and not self.folder.is_dir():
+            raise DataError(f"--truth {self.folder}: it is no folder; name one that has SEQUENCE.tum, or SEQUENCE=FILE")
+
+    def of(self, sequence: str) -> Path:
+        """Return the truth's file; raises DataError where there is none."""
+        if self.files and sequence in self.files:
+            return self.files[sequence]
+        if self.folder is None:
+            raise DataError(f"{sequence}: no truth is given; name it with --truth {sequence}=FILE.tum or --truth DIR")
+        found = files_by_sequence(self.folder).get(sequence, ())
+        if len(found) != 1:
+            raise DataError(f"{sequence}: {self.folder} has {len(found)} truths for it; give one, {sequence}.tum")
+        return found[0]
+
+
+@dataclass(frozen=True)
+class FolderOfRuns:
+    """The trajectory files in a folder, with their truths."""
+
+    folder: Path
+    truths: Truths
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are files of; raises DataError where there are none."""
+        return tuple(self._files)
+
+    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+        """Score the files of a sequence; the truth is where it is given, or else where the baseline had it."""
+        files = self._files.get(sequence, ())
+        if not files:
+            had = ", ".join(before.files if before else ())
+            raise DataError(f"no trajectory of it is in {self.folder}; the baseline has {had}")
+        given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
+        path = self.truths.of(sequence) if before is None or given else place_of(before.truth) or Path(before.truth)
+        if not given and not path.is_file():
+            raise DataError(f"its truth is not at {path}, where the baseline had it; name another place with --truth")
+        truth = read_truth(sequence, path)
+        _check_truth(path.as_posix(), truth.digest, before)
+        by_file = [score_file(file, truth, Terms(gap_s=gap_s)).values for file in files]
+        return SequenceRecord(
+            sequence=sequence,
+            truth=path.as_posix(),
+            truth_hash=truth.digest,
+            files=tuple(str(file.relative_to(self.folder)) for file in files),
+            scores={key: tuple(one[key] for one in by_file) for key in scored_metrics(align)},
+        )
+
+    @cached_property
+    def _files(self) -> dict[str, tuple[Path, ...]]:
+        return files_by_sequence(self.folder)
+
+
+@dataclass(frozen=True)
+class EvaluatedRuns:
+    """The runs of an ``evaluation.json``: a sequence is SYSTEM/SEQUENCE where there are several systems.
+
+    Coverage and errors must be by the gate's own rules, so that the nearest poses of ``--max-dt`` are refused.
+    """
+
+    path: Path
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are runs of."""
+        return tuple(self._runs)
+
+    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
+        """Return the scores of a sequence's runs; raises DataError where one failed, or they were scored otherwise."""
+        terms = self._record.terms
+        if terms.max_dt_s is not None:
+            raise DataError(f"{self.path}: it pairs nearest poses; evaluate again without --max-dt")
+        if terms.gap_s != gap_s:
+            gaps = f"its longest covered gap is {terms.gap_s:g} s, the baseline's {gap_s:g} s"
+            raise DataError(f"{self.path}: {gaps}; evaluate again with --gap {gap_s:g}")
+        runs = self._runs.get(sequence, ())
+        if not runs:
+            raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
+        failed = next((run for run in runs if run.status != "ok"), None)
+        if failed is not None:
+            raise DataError(f"{failed.run} failed: {failed.log[0]}")
+        truth = next(one for one in self._record.sequences if one.sequence == runs[0].sequence)
+        _check_truth(truth.truth, truth.truth_hash, before)
+        return SequenceRecord(
+            sequence=sequence,
+            truth=truth.truth,
+            truth_hash=truth.truth_hash,
+            files=tuple(run.file or run.run for run in runs),
+            scores={key: tuple(run.metrics.get(key) for run in runs) for key in scored_metrics(align)},
+        )
+
+    @cached_property
+    def _record(self) -> EvaluationRecord:
+        return read_evaluation(self.path)
+
+    @cached_property
+    def _runs(self) -> dict[str, list[RunRecord]]:
+        several = len({run.estimator for run in self._record.runs}) > 1
+        found: dict[str, list[RunRecord]] = {}
+        for run in self._record.runs:
+            found.setdefault(f"{run.estimator}/{run.sequence}" if several else run.sequence, []).append(run)
+        return found
+
+
+def _check_truth(path: str, digest: str, before: SequenceRecord | None) -> None:
+    if before is not None and digest != before.truth_hash:
+        raise DataError(f"{path} differs from the baseline's truth; make a new baseline")
+
+
+def new_trajectory_baseline(
+    given: GivenRuns, align: Align, gap_s: float, made_by: Mapping[str, str]
+) -> TrajectoryBaselineRecord:
+    """Score every run there is; raises DataError for the first that cannot be used."""
+    return TrajectoryBaselineRecord(
+        schema="vislam.trajectory-baseline/1",
+        made_by=dict(made_by),
+        align=align,
+        gap_s=gap_s,
+        bounds={key: BOUND_PERCENT for key in scored_metrics(align) if key != TIME_COVERAGE},
+        coverage_points=COVERAGE_POINTS,
+        false_alarm_rate=FALSE_ALARM_RATE,
+        sequences=tuple(given.scored(sequence, align, gap_s, None) for sequence in given.sequences),
+    )
+
+
+def check_trajectories(
+    baseline: TrajectoryBaselineRecord, name: str, given: GivenRuns, *, accept_better: bool = False
+) -> Check:
+    """Judge the runs of a system; one that cannot be used is a verdict, not an error.
+
+    Raises DataError where there is no run at all.
+    """
+    began, there = time.monotonic(), given.sequences
+    order = [one.sequence for one in baseline.sequences]
+    unknown = sorted(set(there) - set(order))
+    notes = [f"not in the baseline, and not checked: {', '.join(unknown)}"] if unknown else []
+    verdicts: list[Verdict] = []
+    tests: list[Repeats] = []
+    for before in baseline.sequences:
+        try:
+            now = given.scored(before.sequence, baseline.align, baseline.gap_s, before)
+        except DataError as error:
+            verdicts.append(_verdict(before, "sequence", "missing", printable(one_line(str(error)))))
+            continue
+        verdicts += _missing(before, now, (*baseline.bounds, TIME_COVERAGE))
+        verdicts += _coverage(before, now, baseline.coverage_points)
+        for key, percent in baseline.bounds.items():
+            was, is_ = _known(before.scores[key]), _known(now.scores[key])
+            where, criterion = Where(before.sequence, "", "", key), Criterion("larger", percent)
+            if min(was.size, is_.size) >= FEWEST_RUNS:
+                tests.append(Repeats(where, criterion, was, is_))
+            elif was.size and is_.size:
+                medians = float(np.median(was)), float(np.median(is_))
+                verdicts.append(check_recorded(where, criterion, *medians, accept_better=accept_better))
+                notes += _other_rule(before.sequence, was, is_)
+    rate = baseline.false_alarm_rate
+    verdicts += check_metrics(tests, rate, accept_better=accept_better)
+    verdicts.sort(key=lambda verdict: order.index(verdict.sequence))
+    notes, seconds = list(dict.fromkeys(notes)), time.monotonic() - began
+    return Check(name, tuple(verdicts), tuple(notes), rate, len(tests), {}, seconds, accept_better)
+
+
+def _verdict(before: SequenceRecord, metric: str, finding: Finding, *rest: object) -> Verdict:
+    return Verdict(before.sequence, "", "", metric, finding, *rest)  # type: ignore[arg-type]
+
+
+def _other_rule(sequence: str, was: Array, is_: Array) -> Iterator[str]:
+    """Say where a metric that the baseline has runs enough to test has too few now."""
+    if was.size >= FEWEST_RUNS:
+        left = f"{is_.size} of the baseline's {was.size} runs are left"
+        yield f"{sequence}: {left}, too few to test; they are held to the bound instead"
+
+
+def _missing(before: SequenceRecord, now: SequenceRecord, keys: Iterable[str]) -> Iterator[Verdict]:
+    """Fail where a run of the baseline is not there by its file's name, or has no value where it had one."""
+    had, has = _names(before.files), _names(now.files)
+    missing, new = had - has, has - had
+    if missing:
+        words = f"{_listed(missing)} not there, of {len(before.files)} runs in the baseline"
+        if new:
+            words += f"; {_listed(new)} not in it: a run has the name of a file of the baseline"
+        yield _verdict(before, "run", "missing", words)
+    for key in keys:
+        lost = _with_value(before, key) - missing - _with_value(now, key)
+        if lost:
+            words = f"{_listed(lost)} without a value any more, of {len(before.files)} runs in the baseline"
+            yield _verdict(before, key, "missing", words)
+
+
+def _names(files: Iterable[str]) -> "Counter[str]":
+    """Count the names of files, whose folder may be another than the baseline's."""
+    return Counter(PurePath(file).name for file in files)
+
+
+def _with_value(scored: SequenceRecord, key: str) -> "Counter[str]":
+    values = zip(scored.files, scored.scores[key], strict=True)
+    return _names(file for file, value in values if value is not None)
+
+
+def _listed(names: "Counter[str]") -> str:
+    return f"{', '.join(names.elements())} {'is' if names.total() == 1 else 'are'}"
+
+
+def _known(values: Values) -> Array:
+    return np.array([value for value in values if value is not None])
+
+
+def _coverage(before: SequenceRecord, now: SequenceRecord, allowed: float) -> Iterator[Verdict]:
+    """Fail where the runs, from the least coverage to the largest, cover less of the time than the baseline's."""
+    was, is_ = (np.sort(_known(side.scores[TIME_COVERAGE])) for side in (before, now))
+    if not (was.size and is_.size):
+        return
+    in_order = np.quantile(is_, np.linspace(0.0, 1.0, was.size))
+    worst = int(np.argmax(was - in_order))
+    old, new = float(was[worst]), float(in_order[worst])
+    worse = old - new > allowed
+    words = f"a run covered {old:.1f} percent of the time, and {new:.1f} now; {allowed:g} less is allowed"
+    yield _verdict(before, TIME_COVERAGE, "regressed" if worse else "same", words if worse else "", old, new)
