@@ -61,13 +61,6 @@ def test_a_scale_and_strays_are_reported(walking: Sequence) -> None:
     assert "lasting mismatches" in messages
 
 
-def test_intervals_without_a_common_track_are_counted(walking: Sequence) -> None:
-    seen = walking.observations
-    cut = replace(seen, track_id=seen.track_id + 10_000 * (seen.frame >= 40) + 10_000 * (seen.frame >= 80))
-    card = card_of(replace(walking, observations=cut))
-    assert (card.blind_intervals, card.intervals) == (2, walking.frame_count - 1)
-
-
 def test_the_command_prints_the_card_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "card.json"
     assert main(["card", "drive", "--max-frames", "50", "--json", str(target)]) == 0

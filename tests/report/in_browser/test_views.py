@@ -107,19 +107,6 @@ def test_views_answer_to_the_pointer_and_the_buttons(page: Page, single: Path, v
     assert page.picture(canvas) != dragged
 
 
-def test_the_wheel_zooms_only_where_that_is_requested(page: Page, single: Path) -> None:
-    page.open(single)
-    element = page.into_view("canvas[data-view='top']")
-    before = page.picture("canvas[data-view='top']")
-    wheel = (
-        "arguments[0].dispatchEvent(new WheelEvent('wheel', { deltaY: -200, ctrlKey: arguments[1], cancelable: true }))"
-    )
-    page.run(wheel, element, False)
-    assert page.picture("canvas[data-view='top']") == before
-    page.run(wheel, element, True)
-    assert page.picture("canvas[data-view='top']") != before
-
-
 def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     page.open(single)
     figures = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart^='Position error']")

@@ -1,0 +1,351 @@
+"""The documents of a run are those that their contracts describe: written, read back, refused with the place."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import msgspec
+import numpy as np
+import pytest
+from msgspec import to_builtins
+
+from toolkit.answers import Run
+from toolkit.datasets import load_sequence
+from toolkit.errors import DataError
+from toolkit.evaluation import against_baseline
+from toolkit.experiment.comparison import Comparison, Row, consistency_of
+from toolkit.files.documents import parse, read, to_line, to_text
+from toolkit.gate import baseline_file
+from toolkit.metrics import Evaluation, Scores, describe
+from toolkit.metrics.parts.against_truth import rmse
+from toolkit.metrics.parts.consistency import body_errors
+from toolkit.report.curves import components, error_curves
+from toolkit.report.messages import note_lines
+from toolkit.report.records import RECORDS, read_card, read_check, schema_files
+from toolkit.report.report_json import report_document
+from toolkit.report.scores import MetricsDocument, metrics_document
+
+Document = dict[str, Any]
+
+# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records; the card by the
+# first command that made one of its version.
+OLD = Path(__file__).parent / "documents"
+SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
+CASES = {
+    "metrics.json": "metrics-1",
+    "seeds.json": "seeds-1",
+    "report.json": "report-1",
+    "report-over-seeds.json": "report-over-seeds-1",
+    "manifest.json": "manifest-1",
+    "manifest-over-seeds.json": "manifest-1",
+    "baseline.json": "baseline-1",
+    "trajectory-baseline.json": "trajectory-baseline-1",
+    "check.json": "check-2",
+    "card.json": "card-2",
+    "evaluation.json": "evaluation-1",
+    "verification.json": "verification-1",
+    "diff.json": "diff-1",
+    "bundle.json": "bundle-1",
+}
+
+
+# Baselines are made to be reviewed, and laid out otherwise than other documents.
+REVIEWED = {
+    "baseline.json": lambda path: baseline_file.to_text(baseline_file.load_baseline(path)),
+    "trajectory-baseline.json": lambda path: against_baseline.to_text(against_baseline.load_trajectory_baseline(path)),
+}
+
+
+OPTIONAL = {"references", "track_weight", "track_weight_error"}
+
+
+def old(name: str) -> Document:
+    document: Document = json.loads((OLD / name).read_text())
+    return document
+
+
+def refused(name: str, document: object) -> str:
+    """Return what is said of a document that must not be read."""
+    with pytest.raises(DataError) as raised:
+        parse(json.dumps(document), RECORDS[CASES[name]])
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def test_there_is_an_old_document_of_each_kind() -> None:
+    assert {path.name for path in OLD.iterdir()} == CASES.keys()
+    assert set(CASES.values()) == RECORDS.keys()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_old_document_is_written_again_as_it_was(name: str) -> None:
+    written = (OLD / name).read_text()
+    record = read(OLD / name, RECORDS[CASES[name]])
+    assert written in (to_text(record), to_line(record)) or name in REVIEWED
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_old_document_keeps_the_published_schema(name: str) -> None:
+    published = json.loads((SCHEMAS / f"{CASES[name]}.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(published)
+    jsonschema.validate(old(name), published)
+
+
+def test_a_check_of_version_1_is_read_as_one_that_let_pass_what_got_better() -> None:
+    path = OLD.with_name("older_documents") / "check-1.json"
+    expected = json.loads(path.read_text()) | {"schema": "vislam.check/2", "accept_better": True}
+    assert json.loads(to_text(read_check(path))) == expected
+
+
+def test_a_card_of_version_1_is_read_as_one_whose_tracks_were_not_weighed() -> None:
+    path = OLD.with_name("older_documents") / "card-1.json"
+    card = read_card(path)
+    assert (card.schema, card.track_weight) == ("vislam.card/1", msgspec.UNSET)
+    given = json.loads(path.read_text())
+    assert {key: given[key] for key in json.loads(to_text(card))} == json.loads(to_text(card))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_document_without_any_one_of_its_fields_is_refused(name: str) -> None:
+    for field in old(name).keys() - OPTIONAL:
+        lacking = {key: value for key, value in old(name).items() if key != field}
+        assert field in refused(name, lacking)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("document", [None, 3, [], {}, {"runs": [3]}, {"schema": 3}, "text"])
+def test_what_is_no_document_is_reported(name: str, document: object) -> None:
+    assert "has not the schema vislam." in refused(name, document)
+
+
+def test_the_published_schemas_are_those_of_the_records() -> None:
+    reported = "docs/schemas differs from the records: python -m toolkit.report.records docs/schemas renews it"
+    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), reported
+
+
+def _second_run(document: Document) -> Document:
+    run: Document = document["runs"][1]
+    return run
+
+
+@pytest.mark.parametrize(
+    ("spoil", "wanted"),
+    [
+        (lambda d: _second_run(d)["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
+        (lambda d: _second_run(d)["notes"].clear(), "is null, and notes does not say why"),
+        (
+            lambda d: _second_run(d)["metrics"].update(ate_se3_m="0.2"),
+            "runs[1].metrics.ate_se3_m: expected number or null, got string",
+        ),
+        (
+            lambda d: _second_run(d)["metrics"].update(ate_se3_m=float("nan")),
+            "runs[1].metrics.ate_se3_m: expected number or null, got NaN or infinity",
+        ),
+        (lambda d: d["sequence"].update(frames=True), "sequence.frames: expected integer, got true or false"),
+        (lambda d: d["sequence"].update(frames=-1), "sequence.frames: expected integer >= 0"),
+        (lambda d: _second_run(d).update(status="fine"), "runs[1].status: cannot be 'fine', only diverged, failed, ok"),
+        (lambda d: d.update(schema="vislam.metrics/2"), "its schema is 'vislam.metrics/2'"),
+        (lambda d: d["audit"].append({"fault": "gap", "count": 1, "repaired": True}), "audit[0]: lacks detail"),
+        (lambda d: d.pop("runs"), "the document: lacks runs"),
+    ],
+)
+def test_broken_metrics_are_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
+    document = old("metrics.json")
+    spoil(document)
+    assert wanted in refused("metrics.json", document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "wanted"),
+    [
+        (lambda d: d["runs"][0]["nees"]["pose"].pop(), "runs[0].nees: pose has 11 entries, t_s has 12"),
+        (lambda d: d["runs"][0]["rotation"].pop(), "runs[0].rotation: expected list of length 3, got 2"),
+        (lambda d: d["steps"][0]["t_s"].pop(), "steps[0]: step_ms has 12 entries, t_s has 11"),
+    ],
+)
+def test_a_broken_report_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
+    document = old("report.json")
+    spoil(document)
+    assert wanted in refused("report.json", document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "wanted"),
+    [
+        (lambda d: d.update(passed=False), "the document: passed does not fit failures"),
+        (lambda d: d.update(failures=1), "the document: failures does not count the verdicts that fail"),
+        (lambda d: d["verdicts"][0].update(fails=True), "verdicts[0]: fails does not fit the finding 'same'"),
+    ],
+)
+def test_a_broken_check_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
+    document = old("check.json")
+    spoil(document)
+    assert wanted in refused("check.json", document)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_fields_of_a_later_version_are_passed_over(name: str) -> None:
+    record = RECORDS[CASES[name]]
+    later = {**old(name), "of a later version": {"a": [1]}}
+    assert parse(json.dumps(later), record) == read(OLD / name, record)
+
+
+Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
+
+
+@pytest.fixture(scope="module")
+def scores(comparison: Comparison) -> dict[str, Any]:
+    return json.loads(to_text(metrics_document(comparison)))
+
+
+def test_key_order_is_stable(scores: dict[str, Any]) -> None:
+    assert list(scores) == ["schema", "sequence", "audit", "undecided", "runs"]
+    expected = ["name", "hash", "frames", "tracks", "observations", "duration_s", "path_m", "motion"]
+    assert list(scores["sequence"]) == expected
+    for run in scores["runs"]:
+        assert list(run["metrics"]) == list(describe())
+
+
+def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
+    built = json.loads(to_text(metrics_document(timid)))
+    assert parse(to_text(metrics_document(timid)), MetricsDocument) == metrics_document(timid)
+    low, high = built["runs"][0]["consistency"].pop("band")
+    assert (low, high) == (pytest.approx(1.2373 / 6, rel=1e-4), pytest.approx(14.4494 / 6, rel=1e-4))
+    assert built["runs"][0]["consistency"] == {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1}
+    assert "consistency" not in built["runs"][-1]  # it failed without an answer
+    words = [line for line in note_lines(timid) if "timid" in line]
+    assert all(part in words[0] for part in ("steady", "NEES", "0.100", "2.41"))
+
+
+def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimator(comparison: Comparison) -> None:
+    def mark(accepted: float) -> str:
+        one = replace(comparison.lines[0].outcomes[0].outputs["causal"], nis_dof=900.0)
+        values = {"nis_mean": 0.4, "gate_accepted_percent": accepted}
+        checked = consistency_of([replace(one, scores=Scores(values, {}))])
+        assert checked is not None
+        return checked.verdict
+
+    assert mark(95.0) == "timid"
+    assert mark(88.0) == "heavy-tailed"
+
+
+def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
+    leaning = rescored(comparison, lambda row: Scores(row.scores.values | trend, {}))
+    built = json.loads(to_text(metrics_document(leaning)))
+    assert parse(to_text(metrics_document(leaning)), MetricsDocument) == metrics_document(leaning)
+    assert built["runs"][0]["consistency"] == {
+        "verdict": "contradicted",
+        "metric": "correction_trend",
+        "mean": 5.25,
+        "band": [0.0, 4.0],
+    }
+    words = [line for line in note_lines(leaning) if "contradicted" in line]
+    assert all(text in words[0] for text in ("steady", "trend 5.2", "limit 4.00", "check calibration"))
+
+
+def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    harm = "explains withheld tracks worse than dead reckoning, with 3.00 +- 0.10 times its error"
+
+    def given(row: Row) -> Scores:
+        is_first = row.estimator == comparison.lines[0].estimator
+        found = {"heldout_over_motion": 3.0 if is_first else 0.9}
+        return Scores(row.scores.values | found, {"heldout_over_motion": harm} if is_first else {})
+
+    reported = [line for line in note_lines(rescored(comparison, given)) if "withheld tracks worse" in line]
+    assert reported == [f"{comparison.lines[0].estimator} {harm}"] * len(reported)
+    assert reported
+
+
+def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Comparison, rescored: Rescored) -> None:
+    def words(accepted: float) -> list[str]:
+        reported = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
+        return [line for line in note_lines(reported) if "outlier gate" in line]
+
+    assert words(91.0) == []
+    (line,) = words(55.0)
+    assert "steady 45 %" in line
+    assert "calibration" in line
+
+
+def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:
+    scores = Scores(dict.fromkeys(describe(), float("nan")), {})
+    built = metrics_document(rescored(comparison, lambda _: scores))
+    assert parse(to_text(built), MetricsDocument) == built
+    assert built.runs[0].metrics["ate_se3_m"] is None
+
+
+Document = dict[str, Any]
+
+
+def build(comparison: Comparison) -> Document:
+    document: Document = to_builtins(report_document(comparison))
+    return document
+
+
+@pytest.fixture(scope="module")
+def scored(run_estimator: Callable[..., Run], comparison_of: Callable[..., Comparison]) -> Comparison:
+    """A filter that states covariances and innovations, and one that does not, on a short simulated drive."""
+    sequence = load_sequence("drive").truncated(40)
+    runs = tuple(run_estimator(name, sequence) for name in ("ekf", "dead-reckoning"))
+    return comparison_of(sequence, runs)
+
+
+def run_of(document: Document, estimator: str, output: str = "causal") -> Document:
+    runs = document["runs"]
+    return next(run for run in runs if (run["estimator"], run["output"]) == (estimator, output))
+
+
+def test_nees_and_nis_series_average_to_their_metrics(scored: Comparison) -> None:
+    run, scores = run_of(build(scored), "ekf"), scored.rows[0].scores.values
+    # Six digits run_of each value are kept.
+    for part, key in (("pose", "nees_pose_mean"), ("orientation", "nees_ori_mean"), ("position", "nees_pos_mean")):
+        assert np.mean(run["nees"][part]) == pytest.approx(scores[key], rel=1e-5)
+    info = scored.runs[0].info
+    dof = info["nis_dof"][np.isfinite(info["nis"]) & (info["nis_dof"] > 0)]
+    assert np.average(run["nis"]["per_dof"], weights=dof) == pytest.approx(scores["nis_mean"], rel=1e-5)
+
+
+def test_errors_after_a_fit_are_those_of_the_metric(comparison: Comparison) -> None:
+    curves = error_curves(comparison, fitted=True)
+    assert curves is not None
+    for row, errors in curves.of_rows:
+        assert rmse(errors.position_m) == pytest.approx(row.scores.values["ate_se3_m"], rel=1e-9)
+
+
+def test_errors_are_those_from_the_start_that_the_nees_takes(comparison: Comparison) -> None:
+    run, row = run_of(build(comparison), "late", "final"), comparison.rows[-2]
+    assert row.estimator == "late"
+    expected_m = body_errors(Evaluation(row.run, "final", comparison.sequence)).distance_m
+    np.testing.assert_allclose(run["errors"]["position_m"], expected_m, rtol=1e-5, atol=1e-9)
+    path_m = run["errors"]["path_m"]
+    assert np.all(np.diff(path_m) >= 0.0)
+    assert path_m[0] == 0.0
+
+
+def test_components_and_their_deviations_are_those_of_the_figure(scored: Comparison) -> None:
+    run, row = run_of(build(scored), "ekf"), scored.rows[0]
+    found = components(scored, row)
+    assert found is not None
+    assert found.sigma is not None
+    assert run["components"]["z_m"] == pytest.approx(found.error[:, 5], rel=1e-5, abs=1e-12)  # six digits are kept
+    assert run["components"]["sigma_about_x_deg"] == pytest.approx(found.sigma[:, 0], rel=1e-5)
+    assert "components" not in run_of(build(scored), "ekf", "final")
+
+
+def test_truth_and_trajectories_are_where_the_document_says(run_directory: Path) -> None:
+    document = json.loads((run_directory / "report.json").read_text())
+    files = [document["truth"], *(run["trajectory"] for run in document["runs"] if run["trajectory"])]
+    files += [one["landmarks"] for one in document["maps"]]
+    assert len(files) == len(set(files)) > 5
+    assert all((run_directory / name).is_file() for name in files)
