@@ -82,7 +82,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     yield from _harm_by_vision(comparison)
     yield from _contradicted(comparison)
     yield from _refusals(comparison)
-    yield from truth_lines(comparison)
+    yield from _remarks(comparison, lambda key: key.startswith(_AGAINST_TRUTH))
     yield from _marks(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -218,25 +218,18 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def consistency_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield, over seeds, a verdict a row on whether its stated covariance is honest; equal verdicts once."""
-    if not comparison.over_seeds:
-        return
-    given: set[str] = set()
-    for row in comparison.rows:
+    """Yield, over seeds, a verdict a line of the table on whether its stated covariance is honest."""
+    for row in comparison.lines if comparison.over_seeds else ():
         nees = row.mean_nees
         if nees is None:
-            yield f"{row.estimator} {row.output}: {row.reason('nees_pose_mean')}"
+            yield f"{_name_of(row)}: {row.reason('nees_pose_mean')}"
             continue
-        verdict = f"{row.estimator}{{}}: in its band at {nees.in_band_percent:.0f} % of the frames"
+        verdict = f"{_name_of(row)}: in its band at {nees.in_band_percent:.0f} % of the frames"
         if nees.in_band_percent < _MOSTLY_PERCENT:
             above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
             how = _MARK.get(row.mark, "over the whole run no more than errors that last from frame to frame explain")
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
-        verdict += _stated_over_true(row)
-        if verdict not in given:
-            given.add(verdict)
-            same = sum(r.estimator == row.estimator and _equal(r, row) for r in comparison.rows) > 1
-            yield verdict.format("" if same else f" {row.output}")
+        yield verdict + _stated_over_true(row)
 
 
 def _stated_over_true(row: Row) -> str:
@@ -276,17 +269,6 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
     return f"{said}: may be chance; {more} more seed{'s' if more > 1 else ''} would show a difference as large as this"
 
 
-def _equal(one: Row, other: Row) -> bool:
-    nees, others = one.mean_nees, other.mean_nees
-    alike = nees is not None and others is not None and nees.in_band_percent == others.in_band_percent
-    return alike and _stated_over_true(one) == _stated_over_true(other)
-
-
-def truth_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield what must be known before an error against the truth is believed."""
-    return _remarks(comparison, lambda key: key.startswith(_AGAINST_TRUTH))
-
-
 def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
     """Yield, for each reason, the metrics of the table without a value for it, and whose where not everybody's.
 
@@ -312,10 +294,9 @@ def _whose(affected: list[Row], rows: list[Row]) -> str:
     """Name the rows affected: no name where all are, the estimator alone where all of its outputs are."""
     if len(affected) == len(rows):
         return ""
-    of_all, of_affected = Counter(row.estimator for row in rows), Counter(row.estimator for row in affected)
+    of_all, of_affected = (Counter(row.estimator for row in some) for some in (rows, affected))
     names = (
-        row.estimator if of_affected[row.estimator] == of_all[row.estimator] else f"{row.estimator} {row.output}"
-        for row in affected
+        row.estimator if of_affected[row.estimator] == of_all[row.estimator] else _name_of(row) for row in affected
     )
     return f" for {', '.join(dict.fromkeys(names))}"
 
