@@ -32,7 +32,7 @@ import numpy as np
 
 from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.msckf import Msckf
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.indeterminate import with_covariances
 from filters.smoothing.landmark_steps import FirstImages
@@ -96,7 +96,7 @@ class Batch:
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
         window_s = setup.settings.window.seconds("twist")
-        self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates(), window_s=window_s)
+        self._causal_pass = Msckf(setup, AtFirstEstimates(), window_s=window_s)
         self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []
@@ -118,7 +118,7 @@ class Batch:
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         trajectory, log = with_covariances(Trajectory.of(states), smoothed.graph.linearize(values), self._motion)
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, log)
+        return Finished(trajectory, landmarks, smoothed.solution.converged, (*self._causal_pass.log, *log))
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()

@@ -1,10 +1,30 @@
-"""Sliding window of cloned poses tied by tracks (Mourikis & Roumeliotis 2007)."""
+"""Sliding window of cloned poses tied by tracks (Mourikis & Roumeliotis 2007).
 
-from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.online_output import OnlineOutput
-from filters.kalman.sliding_window import SlidingWindowFilter
+What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that have
+left the window are never corrected again. The answer at a frame is the state given also the tracks still in view; these
+do not correct the belief itself (:mod:`filters.kalman.tracks_in_view`). A pose leaves once it is older than the window,
+as a state does in the smoothers.
+
+`msckf-fej` and `msckf-slam` are this filter with other options: Jacobians at first estimates, and landmarks that stay.
+"""
+
+import numpy as np
+
+from filters.kalman import joint_landmarks
+from filters.kalman.frame_gate import FrameGate
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import AtLatestEstimates, Linearisation, propagate
+from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
+from filters.kalman.tracks import AcceptedTracks, TrackSightings, Window, WindowTracks, accepted_tracks, load_kernels
+from filters.kalman.tracks_in_view import given_tracks_in_view
+from toolkit.arrays import is_among
+from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.measurements import NS_PER_S, Packet, StereoFrame
+from toolkit.models.gating import FEWEST_SIGHTINGS
+from toolkit.models.motion import motion_model
 
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
@@ -12,4 +32,117 @@ RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates())))
+    return estimator(setup, AtLatestEstimates())
+
+
+def estimator(setup: Setup, at: Linearisation, landmarks: int = 0) -> Estimator:
+    """Return the filter of a linearisation and a number of landmarks, with states as sparse as the window demands."""
+    msckf = Msckf(setup, at, landmarks)
+    return Thinned(setup, OnlineOutput(msckf, msckf.log))
+
+
+class Msckf:
+    """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
+
+    Up to ``landmarks`` tracks that span the window are kept in the state for as long as they are seen (Li & Mourikis
+    2013, "Optimization-based estimator design for vision-aided inertial navigation"); ``window_s`` is the length of the
+    window in seconds, by default that of the settings.
+    """
+
+    def __init__(self, setup: Setup, at: Linearisation, landmarks: int = 0, window_s: float | None = None) -> None:
+        self.log = load_kernels()
+        self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        if window_s is None:
+            window_s = setup.settings.window.seconds(setup.motion_kind)
+        self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
+        self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
+        self._joint = JointBelief(self._motion.initial_belief(setup.prior))
+        self._tracks, self._memory = WindowTracks(), LandmarkMemory()
+
+    def step(self, packet: Packet) -> Estimate:
+        """Take in one packet and return the state at its frame."""
+        frame, outliers = packet.frame, self._outliers
+        propagate(self._joint, self._motion, self._at, packet.motion)
+        self._joint.clone()
+        self._clone_t_ns = np.append(self._clone_t_ns, frame.t_ns)
+        gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
+        joint_landmarks.forget_lost(self._joint, frame, self._memory)
+        joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+        self._tracks.add_frame(self._without_landmarks(frame))
+        leaving = self._clone_t_ns < frame.t_ns - self._lag_ns
+        self._correct_by_tracks(leaving, gate)
+        self._forget_clones(leaving)
+        gate_in_view = FrameGate(outliers.gate_probability, outliers.joint_huber)
+        now = given_tracks_in_view(self._joint, self._window(), self._tracks, self._rig, gate_in_view)
+        return now.estimate(frame.t_ns, **gate.info())
+
+    def landmarks(self) -> Landmarks:
+        """Return the last estimate of every landmark that was ever triangulated."""
+        self._memory.remember(self._joint.landmark_ids, self._joint.points)
+        return self._memory.landmarks()
+
+    def _window(self) -> Window:
+        columns = self._joint.clone_columns
+        return Window(self._joint.clones, self._at.clones(self._joint), self._joint.cov[columns, columns])
+
+    def _without_landmarks(self, frame: StereoFrame) -> StereoFrame:
+        """Return the frame without the sightings of landmarks in the state."""
+        if not len(self._joint.landmark_ids):
+            return frame
+        return frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
+
+    def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
+        """Correct by the tracks that have ended, and by those seen from poses (C,) that leave the window now.
+
+        Both together, unless there is room for landmarks. A new landmark's linearisation point stays, so it is
+        triangulated after the ended tracks have corrected the window.
+        """
+        used = self._tracks.ended()
+        if not self._room:
+            used = used | self._tracks.seen_by(leaving)
+        self._correct_by(self._tracks.take(used), gate)
+        if self._room and leaving.any():
+            self._correct_by(self._tracks.take(self._tracks.seen_by(leaving)), gate)
+
+    @property
+    def _room(self) -> int:
+        return max(self._most_landmarks - len(self._joint.landmark_ids), 0)
+
+    def _correct_by(self, sightings: TrackSightings, gate: FrameGate) -> None:
+        """Correct the window by tracks; add those still seen as landmarks, as many as there is room for."""
+        sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+        window = self._window()
+        accepted = accepted_tracks(sightings, window, self._rig, gate)
+        if not len(accepted.points):
+            return
+        self._memory.remember(accepted.sightings.track_ids, accepted.points)
+        kept = np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room]
+        if len(kept):
+            self._add_landmarks(accepted, kept, window)
+        first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
+        self._update(accepted.H[:, first:], accepted.residuals)
+
+    def _add_landmarks(self, accepted: AcceptedTracks, kept: IntArray, window: Window) -> None:
+        """Add accepted tracks (m,) to the state."""
+        sightings, points = accepted.sightings.select(kept), accepted.points[kept]
+        linearised = joint_landmarks.linearise(sightings, points, window.poses, window.poses_at, self._rig)
+        weighted = linearised.scaled(np.sqrt(accepted.weights[kept]))
+        joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, weighted)
+
+    def _update(self, H: Array, residuals: Array) -> None:
+        """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
+        joint, (count, size) = self._joint, H.shape
+        end = joint.clone_columns.stop
+        if count > size and end == joint.cov.shape[0]:
+            joint.inform(H.T @ H, H.T @ residuals)
+            return
+        # With landmarks after the clones in the error state, an update by fewer rows is cheaper.
+        joint.update(*joint_landmarks.compressed(H, residuals), slice(end - size, end))
+
+    def _forget_clones(self, which: BoolArray) -> None:
+        """Marginalise poses (C,), which are the oldest."""
+        if which.any():
+            self._joint.forget_clones(which)
+            self._tracks.drop_oldest(int(which.sum()))
+            self._clone_t_ns = self._clone_t_ns[~which]

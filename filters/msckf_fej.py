@@ -1,9 +1,7 @@
 """MSCKF with first-estimate Jacobians, which keep the heading unobservable (Li & Mourikis 2013)."""
 
+from filters import msckf
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.online_output import OnlineOutput
-from filters.kalman.sliding_window import SlidingWindowFilter
-from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf", "li2013high")
@@ -12,4 +10,4 @@ RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates())))
+    return msckf.estimator(setup, AtFirstEstimates())

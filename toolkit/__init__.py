@@ -7,7 +7,7 @@ track_budget) -> estimator, estimate (the output; answers checks it) -> models -
 (an estimator over a sequence, with divergence) -> metrics -> experiment -> report. docs/architecture.md has the
 picture. Before a run: datasets, frontend and simulation make a sequence, audit finds its faults, noise measures how
 noisy it is, initialization finds the first state. gate, evaluation and verify judge results; users call cli and api.
-registry and discovery find what packages announce. The lowest layers: settings, files, progress, compilation, arrays,
+registry and discovery find what packages announce. The lowest layers: settings, files, progress, arrays,
 jackknife, geometry, threads, errors.
 """
 

@@ -23,9 +23,6 @@ STATUS_MEANING: Mapping[Status, str] = {
     "failed": "could not go on",
 }
 Output = Literal["causal", "final"]
-Arithmetic = Literal["compiled", "numpy"]
-# What several runs of an estimator computed with: "both" where they differ.
-ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
 COV_SIZES = (6, 9, 12, 15)
 _STATE: Mapping[str, tuple[tuple[int, ...], ...]] = {"T_world_imu": ((4, 4),), "v_world": ((3,),), "bias": ((6,),)}
@@ -49,8 +46,7 @@ class Run:
 
     ``causal`` is what was known at each frame and is None for an estimator that answers only at the end. ``timings`` is
     None for another system's run, read from a file and not made here. ``info`` holds the diagnostics of the causal
-    estimates by name, each (N,), NaN where one was not given. ``arithmetic`` says whether compiled code or NumPy ran,
-    where the estimator has both.
+    estimates by name, each (N,), NaN where one was not given.
     """
 
     estimator: str
@@ -61,7 +57,6 @@ class Run:
     timings: Timings | None
     info: Mapping[str, Array] = field(default_factory=dict)
     log: tuple[str, ...] = ()
-    arithmetic: Arithmetic | None = None
 
     def trajectory(self, output: Output) -> Trajectory | None:
         """Return the trajectory of one kind of output."""

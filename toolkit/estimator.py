@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
 from toolkit.measurements import MotionKind, MotionNoise, Packet, Prior, StereoRig
@@ -16,8 +15,7 @@ from toolkit.settings.records import DEFAULTS, Scalar, Settings
 class Setup:
     """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
 
-    ``options`` are the settings of this estimator alone, by name; a long ``finish`` reports to ``progress``;
-    ``compilation`` provides compiled modules.
+    ``options`` are the settings of this estimator alone, by name; a long ``finish`` reports to ``progress``.
     """
 
     rig: StereoRig
@@ -28,7 +26,6 @@ class Setup:
     settings: Settings = DEFAULTS
     options: Mapping[str, Scalar] = field(default_factory=dict)
     progress: Progress = SILENT
-    compilation: Compilation = field(default_factory=Compilation)
 
 
 class Estimator(Protocol):

@@ -22,7 +22,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import cast
 
-from toolkit.compilation import check_possible
 from toolkit.discovery import FoundModule, MissingDependency, announced, shown_name
 from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimator import Build
@@ -146,11 +145,7 @@ class EstimatorEntry:
         return declared
 
     def check_usable(self, settings: Settings) -> None:
-        """Raise EstimatorError unless the estimator can be imported and reads every option set for it.
-
-        It also raises EstimatorError where compiled arithmetic is required and numba is not installed.
-        """
-        check_possible(settings.arithmetic)
+        """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""
         self._rules()
         self.load()
         self.check_options(settings)

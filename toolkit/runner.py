@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.answers import Run, Status, Timings, checked_estimate, checked_finish
-from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError, in_words, one_line
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
@@ -37,19 +36,16 @@ _RESETS_PEAK, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 @dataclass
 class _Clock:
-    """Measures wall clock and CPU of one run; the wall clock of each step apart."""
+    """Measures wall clock and CPU of one run; the wall clock of each step apart.
+
+    Building the estimator is not part of it: what a process imports and compiles once is no cost of a run.
+    """
 
     def __post_init__(self) -> None:
         _count_memory_anew()
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         self.steps: list[float] = []
         self.finish_s = 0.0
-
-    def leave_out(self, compilation: Compilation) -> None:
-        """Count neither the time nor the memory of what a process imports and compiles once."""
-        if compilation.ran == "compiled":
-            self._wall, self._cpu = self._wall + compilation.wall_s, self._cpu + compilation.cpu_s
-            _count_memory_anew()
 
     def timings(self) -> Timings:
         total_s, cpu_s = time.perf_counter() - self._wall, time.process_time() - self._cpu
@@ -94,7 +90,6 @@ def run(
 
 def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress, settings: Settings) -> Run:
     packets = list(sequence.packets())
-    compilation = Compilation(settings.arithmetic)
     setup = Setup(
         sequence.rig,
         sequence.noise,
@@ -104,12 +99,11 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         settings,
         settings.options_of(name),
         progress,
-        compilation,
     )
     clock, online = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)
-        clock.leave_out(compilation)
+        clock = _Clock()
         for packet in packets:
             estimate = checked_estimate(_timed_step(estimator, packet, clock), packet, online[-1] if online else None)
             if estimate is not None:
@@ -124,9 +118,8 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
     except (Exception, SystemExit) as error:
         if (interrupt := _interrupt_behind(error)) is not None:
             raise interrupt from None
-        return replace(_failed(name, online, clock.timings(), error), arithmetic=compilation.ran)
-    finished = replace(finished, log=(*compilation.log, *finished.log))
-    return replace(_ended(name, online, finished, clock.timings(), sequence), arithmetic=compilation.ran)
+        return _failed(name, online, clock.timings(), error)
+    return _ended(name, online, finished, clock.timings(), sequence)
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:

@@ -35,7 +35,6 @@ class JointBelief:
     def __init__(self, core: Belief) -> None:
         self._core = core
         self.first_core = core
-        self.clone_frames: IntArray = np.empty(0, dtype=np.int64)
         self.clones: Array = np.empty((0, 4, 4))
         self.first_clones: Array = np.empty((0, 4, 4))
         self.landmark_ids: IntArray = np.empty(0, dtype=np.int64)
@@ -76,11 +75,10 @@ class JointBelief:
         cov[:d, :d] = _symmetric(carried[:, :d] @ transition.T + prediction.noise)
         self._cov = cov
 
-    def clone(self, frame: int) -> None:
+    def clone(self) -> None:
         """Add a clone of the present pose with all its correlations (stochastic cloning)."""
         end = self.clone_columns.stop
         self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, self._cov.shape[0])])
-        self.clone_frames = np.append(self.clone_frames, frame)
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
 
@@ -89,7 +87,6 @@ class JointBelief:
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.clone_columns] = np.repeat(~which, 6)
         self._cov = _of_slices(self._cov, _true_ranges(kept))
-        self.clone_frames = self.clone_frames[~which]
         self.clones, self.first_clones = self.clones[~which], self.first_clones[~which]
 
     def forget_landmarks(self, which: BoolArray) -> None:

@@ -9,17 +9,18 @@ from typing import Protocol
 
 import numpy as np
 
-from filters.kalman import joint_landmarks, multiview
+from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.multiview import TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from filters.kalman.triangulation import triangulate
+from filters.kalman.tracks import TrackSightings
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.measurements import Packet, StereoFrame, StereoRig
+from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 
@@ -60,7 +61,7 @@ class JointEkf:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
         propagate(self._joint, self._motion, self._at, packet.motion)
-        self._joint.clone(packet.index)
+        self._joint.clone()
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
@@ -75,17 +76,14 @@ class JointEkf:
         return self._memory.landmarks()
 
     def _start_new(self, frame: StereoFrame) -> None:
-        """Start landmarks for the frame's tracks that are not in the state, from this single view."""
-        joint = self._joint
-        new = ~is_among(frame.track_ids, joint.landmark_ids)
-        sightings = TrackSightings(
-            frame.track_ids[new],
-            frame.uvs_px[new][:, None],
-            np.ones((int(new.sum()), 1), dtype=bool),
-        )
-        points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
-        sightings, points = sightings.select(reliable), points[reliable]
-        if len(points):
-            linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
-            weighted = linearised.scaled(np.full(len(points), np.sqrt(self._rig.track_weight)))
-            joint_landmarks.add_tracks(joint, sightings.track_ids, points, weighted)
+        """Start landmarks for the frame's tracks that are not in the state, by the stereo point of this one view."""
+        joint, rig = self._joint, self._rig
+        new = frame.select(~is_among(frame.track_ids, joint.landmark_ids))
+        near = stereo.disparity_px(new.uvs_px) > LEAST_DISPARITY_PX
+        new = new.select(near & (rig.fx_px * rig.baseline_m > LEAST_DEPTH_M * stereo.disparity_px(new.uvs_px)))
+        if len(new.track_ids):
+            points = stereo.triangulate_world(new.uvs_px, joint.clones[-1], rig)
+            sightings = TrackSightings(new.track_ids, new.uvs_px[:, None], np.ones((len(points), 1), dtype=bool))
+            linearised = joint_landmarks.linearise(sightings, points, joint.clones, self._at.clones(joint), rig)
+            weighted = linearised.scaled(np.full(len(points), np.sqrt(rig.track_weight)))
+            joint_landmarks.add_tracks(joint, new.track_ids, points, weighted)

@@ -19,10 +19,10 @@ class Filter(Protocol):
 
 
 class OnlineOutput:
-    """Keeps the estimates of a filter."""
+    """Keeps the estimates of a filter; ``log`` is said of the run."""
 
-    def __init__(self, filter_: Filter) -> None:
-        self._filter = filter_
+    def __init__(self, filter_: Filter, log: tuple[str, ...] = ()) -> None:
+        self._filter, self._log = filter_, log
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
@@ -32,7 +32,7 @@ class OnlineOutput:
 
     def finish(self) -> Finished:
         """Return the estimates of every frame and the last estimates of the landmarks."""
-        return Finished(Trajectory.of(self._estimates), self._filter.landmarks())
+        return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._log)
 
 
 @dataclass

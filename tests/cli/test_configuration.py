@@ -59,12 +59,11 @@ def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vis
     assert vislam(*words, "--outliers", "none", "--set", "outliers.filter_huber=3", "--out", "one") == 0
     document = json.loads(Path("one/manifest.json").read_text())["settings"]["outliers"]
     assert (document["policy"], document["gate_probability"], document["filter_huber"]) == ("none", None, 3.0)
-    again = ("--outliers", "robust", "--window", "1.5", "--no-fast", "--workers", "1", "--out", "two")
+    again = ("--outliers", "robust", "--window", "1.5", "--workers", "1", "--out", "two")
     assert vislam("compare", "--config", "one/manifest.json", *again) == 0
     settings = json.loads(Path("two/manifest.json").read_text())["settings"]
     assert settings["outliers"] == msgspec.to_builtins(POLICIES["robust"])
     assert settings["window"]["lag_s"] == 1.5
-    assert settings["arithmetic"] == "numpy"
 
 
 def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vislam: Vislam) -> None:
@@ -85,9 +84,9 @@ def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vi
 
 
 def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
-    """With whatever changed the first: settings, start, seed, cut, arithmetic (which else may say what it compiled)."""
+    """With whatever changed the first: settings, start, seed, cut."""
     words = ("--estimators", "dead-reckoning,ekf", "--max-frames", "12", "--seed", "3", "--start", "truth")
-    changed = ("--set", "noise.pixel_sigma_px=0.7", "--no-repair", "--no-fast")
+    changed = ("--set", "noise.pixel_sigma_px=0.7", "--no-repair")
     assert vislam("compare", "drive", *words, *changed, "--out", "once") == 0
     assert vislam("compare", "--config", "once/manifest.json", "--out", "again") == 0
     assert metrics("again") == metrics("once")

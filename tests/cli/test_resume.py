@@ -20,7 +20,7 @@ Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 Starts = Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]
 # To read what is compiled takes a process longer than these runs.
-QUICK = ("--max-frames", "10", "--figures", "none", "--no-fast")
+QUICK = ("--max-frames", "10", "--figures", "none")
 SWEEP = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--seeds", "3", *QUICK)
 PROJECT = str(Path(__file__).parents[2])
 

@@ -15,7 +15,6 @@ from toolkit.experiment.cluster import Cluster, ClusterError
 from toolkit.experiment.units import Outcome, Unit, run_unit
 from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.progress import SILENT
-from toolkit.settings import Settings
 
 # Asked for by name: to import it takes a twentieth of what all tests take to be found.
 pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra cluster")
@@ -39,8 +38,8 @@ def local() -> Iterator[Any]:
 
 def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local: Any, units: Units) -> None:
     requested = [
-        # A short recording is quickly simulated, and to read what is compiled takes a process longer than its runs.
-        replace(unit, recording=replace(unit.recording, duration_s=3.0), settings=Settings(arithmetic="numpy"))
+        # A short recording is quickly simulated.
+        replace(unit, recording=replace(unit.recording, duration_s=3.0))
         for unit in units((0, 1, 2), ("dead-reckoning", "ekf"))
     ]
     found: dict[int, Outcome] = {}

@@ -16,7 +16,7 @@ from toolkit.metrics import Scores
 from toolkit.metrics.correction_trend import LIMIT, NOTHING_CORRECTED, TREND
 from toolkit.progress import SILENT
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Settings
+from toolkit.settings import Noise
 from toolkit.simulation import DRIVE, faults, simulate
 
 NAMES = ("dead-reckoning", "seed-ekf", "ekf-slam", "msckf")
@@ -76,7 +76,7 @@ def rows_of(sequence: Sequence, noise: Noise) -> list[Row]:
 
 
 def _row_of(name: str, prepared: Prepared) -> Row:
-    run = run_estimator(Unit(prepared, 0, name, Settings(arithmetic="numpy")), prepared, SILENT)
+    run = run_estimator(Unit(prepared, 0, name), prepared, SILENT)
     return Row("causal", (outcome_of(run, prepared.sequence, 0),))
 
 

@@ -132,7 +132,7 @@ def test_processes_equal_one_process_bit_for_bit(units: Units) -> None:
 
 
 def _assert_equal(one: Outcome, other: Outcome) -> None:
-    for name in ("seed", "estimator", "status", "log", "arithmetic", "sequence_hash", "final_is_causal"):
+    for name in ("seed", "estimator", "status", "log", "sequence_hash", "final_is_causal"):
         assert getattr(one, name) == getattr(other, name)
     assert one.outputs.keys() == other.outputs.keys() != set()
     for output, scored in one.outputs.items():
@@ -263,7 +263,7 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
             print("starting", flush=True)
             yield from results(*given)
         Workers.results = told
-        words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--no-fast", "--out", "run"]
+        words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--out", "run"]
         sys.exit(main(["compare", "drive", *words]))
     """)
     vislam = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})

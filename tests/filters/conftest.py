@@ -147,7 +147,7 @@ def with_clones(scenario: Scenario, seed: int, count: int) -> tuple[Sequence, Jo
     joint = JointBelief(model.initial_belief(sequence.prior))
     for packet in list(sequence.packets())[:count]:
         propagate(joint, model, AtLatestEstimates(), packet.motion)
-        joint.clone(packet.index)
+        joint.clone()
     return sequence, joint
 
 

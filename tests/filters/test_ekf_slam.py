@@ -24,7 +24,7 @@ def noisy():
 def test_a_landmark_is_outdated_once_it_has_moved_by_its_share_of_the_distance():
     sequence = simulate(replace(DRIVE_IMU, duration_s=1.0), 0)
     joint = JointBelief(motion_model(sequence.noise, sequence.gravity_world).initial_belief(sequence.prior))
-    joint.clone(0)
+    joint.clone()
     eye, ahead = joint.clones[0, :3, 3], np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
     joint.add_landmarks(np.array([3, 5]), eye + ahead, np.zeros((6, joint.cov.shape[0])), np.eye(6))
     joint.points = joint.points + np.array([[-2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -16,7 +16,7 @@ import pytest
 
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, Linearisation
-from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.msckf import Msckf
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, skew
 from toolkit.measurements import Prior
@@ -33,8 +33,8 @@ SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, 
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
 FILTERS = {
     "ekf-slam": JointEkf,
-    "msckf": SlidingWindowFilter,
-    "msckf-slam": lambda setup, at: SlidingWindowFilter(setup, at, landmarks=15),
+    "msckf": Msckf,
+    "msckf-slam": lambda setup, at: Msckf(setup, at, landmarks=15),
 }
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)

@@ -71,7 +71,7 @@ def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) ->
     rows = np.isin(frame.track_ids, joint.landmark_ids)
     drawn = np.random.default_rng(8).standard_normal(joint.cov.shape[0])
     joint.move(disturbed * np.linalg.cholesky(joint.cov) @ drawn)
-    joint.clone(frames)
+    joint.clone()
     assert len(joint.points) > 5
     return Scene(joint, frame.select(rows), sequence.rig)
 

@@ -25,7 +25,7 @@ def belief(sequence) -> InverseDepthBelief:
     """Return a belief of one clone and two landmarks first seen from it."""
     core = motion_model(sequence.noise, sequence.gravity_world).initial_belief(sequence.prior)
     joint = InverseDepthBelief(core, sequence.rig.T_imu_cam)
-    joint.clone(0)
+    joint.clone()
     points = transform(core.T_world_imu @ sequence.rig.T_imu_cam, POINTS_CAM)
     joint.add_landmarks(IDS, points, np.zeros((6, joint.cov.shape[0])), np.eye(6))
     return joint

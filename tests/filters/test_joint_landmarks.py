@@ -24,7 +24,7 @@ def belief_with_a_landmark(depth_m: float) -> JointBelief:
     assert SEQUENCE.prior is not None
     model = motion_model(SEQUENCE.noise, SEQUENCE.gravity_world)
     joint = JointBelief(model.initial_belief(SEQUENCE.prior))
-    joint.clone(0)
+    joint.clone()
     point = transform(joint.clones[0] @ SEQUENCE.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]]))
     joint.add_landmarks(np.array([7]), point, np.zeros((3, joint.cov.shape[0])), 0.01 * np.eye(3))
     return joint

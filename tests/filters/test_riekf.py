@@ -108,7 +108,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     bias = joint.core.bias
     convert, before = to_invariant(joint), group_element(joint)
     P = convert @ joint.cov @ convert.T
-    joint.clone(0)
+    joint.clone()
     seen = joint_landmarks.linearise_sightings(joint, frame, AT, rig)
     H, residuals = joint_landmarks.stacked(joint, seen).weighed(np.ones(len(seen.depth_m)))
     H_plain = np.zeros((residuals.size, convert.shape[0]))
@@ -160,7 +160,7 @@ def test_its_error_propagates_alike_from_every_state(scenario) -> None:
 def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(scenario) -> None:
     """And a sighting is blind to both, wherever it is linearised."""
     joint, frame, rig = predicted(scenario)
-    joint.clone(0)
+    joint.clone()
     rng = np.random.default_rng(5)
     constant = gauge(joint, turns=np.eye(3))
     for _ in range(3):

@@ -23,15 +23,6 @@ def test_a_baseline_is_read_back_to_the_bit(baseline, path):
     assert load_baseline(path) == baseline
 
 
-def test_a_baseline_says_what_arithmetic_its_times_are_of_and_an_older_one_does_not(baseline, path):
-    assert "arithmetic" not in path.read_text()  # as before it was added, and for an estimator of NumPy alone
-    (case, measured), other = baseline.cases
-    runs = measured.runs | {"two": replace(measured.runs["two"], arithmetic="both")}
-    written = replace(baseline, cases=((case, replace(measured, runs=runs)), other))
-    path.write_text(to_text(written))
-    assert load_baseline(path) == written
-
-
 def test_a_baseline_is_readable(baseline, path):
     text = path.read_text()
     json.loads(text)

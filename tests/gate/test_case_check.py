@@ -273,18 +273,6 @@ def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseli
     assert "last bits" in check.notes[0]
 
 
-def test_other_arithmetic_than_the_baselines_is_noted_where_both_sides_say_theirs(baseline, gate):
-    (case, simulated), recorded = baseline.cases
-    compiled = with_series(simulated, "two", arithmetic="compiled")
-    written = replace(baseline, cases=((case, compiled), recorded))
-    now = with_series(compiled, "two", arithmetic="numpy")
-    (reported,) = (note for note in gate.checked(written, [now, recorded[1]]).notes if "NumPy" in note)
-    assert reported.startswith("flight: two ran compiled for the baseline and runs in NumPy here")
-    assert not gate.checked(written, [now, recorded[1]], speed=False).notes
-    for before, after in ((written, compiled), (baseline, now)):
-        assert not [note for note in gate.checked(before, [after, recorded[1]]).notes if "NumPy" in note]
-
-
 @pytest.mark.parametrize(("factor", "finding"), [(1.25, "same"), (1.4, "regressed"), (0.6, "better")])
 def test_speed_is_checked_by_its_ratio_to_the_reference(baseline, gate, factor, finding):
     simulated, recorded = gate.as_measured(baseline)

@@ -29,6 +29,10 @@ class UsageError(VislamError):
     exit_status: ClassVar[int] = 2
 
 
+# Options of earlier versions, and what holds now.
+_GONE = {"--no-fast": "each part of an estimator exists once, the MSCKFs' tracks compiled and all else in NumPy"}
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that keeps the layout of its epilog, takes no abbreviations and reports an error in one line."""
 
@@ -52,6 +56,8 @@ class Parser(argparse.ArgumentParser):
     def _why_left(self, word: str, given: list[str]) -> str:
         if word.startswith("-"):
             option = word.partition("=")[0]
+            if option in _GONE:
+                return f"there is no option {option} any more: {_GONE[option]}"
             known = list(self._option_string_actions)
             begun = next((name for name in known if name.startswith(option)), "")
             return f"there is no option {option}{f'; did you mean {begun}?' if begun else did_you_mean(option, known)}"
@@ -344,7 +350,6 @@ SETTINGS = (
         "window.lag_s",
         arg("--window SECONDS", "length of the window of windowed filters and smoothers", positive_seconds),
     ),
-    flag("--no-fast", "use NumPy only, even where the extra 'fast' provides compiled code for filters"),
     arg(
         "--set KEY=VALUE",
         "one setting, as in window.lag_s=3 (see 'vislam list settings'); may be repeated",
@@ -366,8 +371,6 @@ def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any
         option, _, key = dest.partition("=")
         if key and value is not None:
             short.append((f"{option} {value:g}" if isinstance(value, float) else f"{option} {value}", key, value))
-    if getattr(options, "no_fast", False):
-        short.append(("--no-fast", "arithmetic", "numpy"))
     by_set = [(f"--set {text}", *assigned(text)) for text in getattr(options, "set", ())]
     changes: dict[str, Any] = {}
     told: dict[str, str] = {}

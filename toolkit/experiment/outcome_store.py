@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from toolkit.answers import Arithmetic, Output, Status
+from toolkit.answers import Output, Status
 from toolkit.errors import DataError, OutputError
 from toolkit.experiment.code_version import code_digest, numeric_versions
 from toolkit.experiment.comparison import plain_name
@@ -78,7 +78,6 @@ class UncheckedRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag
     outputs: dict[Output, ScoredRecord]
     files: Annotated[dict[str, str], Meta(description="SHA-256 of its trajectories by their relative paths")]
     log: tuple[str, ...]
-    arithmetic: Annotated[Arithmetic | None, Meta(description="of an estimator that has both")] = None
 
 
 class OutcomeRecord(UncheckedRecord, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/2"):
@@ -105,7 +104,6 @@ def record_of(outcome: Outcome, unit: UnitKey, requested: tuple[str, ...], files
         outputs={k: _scored_record(v) for k, v in outcome.outputs.items() if not (repeats and k == "final")},
         files=files,
         log=outcome.log,
-        arithmetic=outcome.arithmetic,
         sha256="",
     )
 
@@ -144,7 +142,6 @@ def outcome_of_record(record: OutcomeRecord, requested: tuple[str, ...]) -> Outc
         sequence_hash=record.sequence_hash,
         final_is_causal=record.final_is_causal,
         files=record.files,
-        arithmetic=record.arithmetic,
     )
 
 

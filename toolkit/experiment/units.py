@@ -1,12 +1,12 @@
 """A unit of work: one estimator on one recording, run and scored."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from toolkit import runner
-from toolkit.answers import Arithmetic, ArithmeticOfRuns, Output, Run, Status
+from toolkit.answers import Output, Run, Status
 from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
 from toolkit.estimator import Build
@@ -61,7 +61,6 @@ class Outcome:
     ``sequence_hash`` is that of the recording it read; ``run`` is there where it was asked for. ``final_is_causal``
     tells that the final output only repeats the causal one, as a filter's does. ``tum`` has, where they are to be kept,
     the trajectories as texts; once they are written ``files`` has the SHA-256 of each by its path in the run directory.
-    ``arithmetic`` is the run's.
     """
 
     seed: int
@@ -74,7 +73,6 @@ class Outcome:
     run: Run | None = None
     tum: Mapping[Output, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
-    arithmetic: Arithmetic | None = None
 
     @property
     def why(self) -> str:
@@ -83,12 +81,6 @@ class Outcome:
             return ""
         # A run that failed begins with the reason; the runner appends what diverged to the estimator's log.
         return " ".join(self.log[0 if self.status == "failed" else -1].split())
-
-
-def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
-    """Return whether compiled code or NumPy ran in outcomes of an estimator; None without compiled code or any run."""
-    ran = {outcome.arithmetic for outcome in outcomes} - {None}
-    return "both" if len(ran) > 1 else next(iter(ran), None)
 
 
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
@@ -143,7 +135,6 @@ def outcome_of(run: Run, sequence: Sequence, seed: int, requested: tuple[str, ..
         sequence.content_hash(),
         run.final_is_causal,
         run,
-        arithmetic=run.arithmetic,
     )
 
 

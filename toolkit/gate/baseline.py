@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import ClassVar, Literal
 
-from toolkit.answers import ArithmeticOfRuns, Output, Status
+from toolkit.answers import Output, Status
 from toolkit.errors import VislamError
 from toolkit.settings import DEFAULTS, Settings
 
@@ -98,15 +98,13 @@ class Case:
 class Series:
     """One estimator on one case, by seed: how it ended, its time over the reference's, metrics by kind of output.
 
-    ``why`` is the reason of the first run that did not end well; ``arithmetic`` says whether compiled code or NumPy
-    ran, None where the estimator has no compiled code, or the baseline is too old to say.
+    ``why`` is the reason of the first run that did not end well.
     """
 
     status: tuple[Status, ...]
     speed: Values
     outputs: Mapping[Output, Mapping[str, Values]]
     why: str = ""
-    arithmetic: ArithmeticOfRuns | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
-from toolkit.answers import ArithmeticOfRuns, Output, Status
+from toolkit.answers import Output, Status
 from toolkit.files import documents
 from toolkit.gate.baseline import (
     Baseline,
@@ -64,13 +64,6 @@ class SeriesRecord(Struct, frozen=True, kw_only=True):
 
     status: tuple[Status, ...]
     speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
-    arithmetic: (
-        Annotated[
-            ArithmeticOfRuns,
-            Meta(description="what the times are of; absent without compiled code, and before it was added"),
-        ]
-        | UnsetType
-    ) = UNSET
     causal: MetricValues | UnsetType = UNSET
     final: MetricValues | UnsetType = UNSET
 
@@ -236,7 +229,6 @@ def _series_record(series: Series) -> SeriesRecord:
     return SeriesRecord(
         status=series.status,
         speed=series.speed,
-        arithmetic=series.arithmetic or UNSET,
         causal=given.get("causal", UNSET),
         final=given.get("final", UNSET),
     )
@@ -248,8 +240,7 @@ def _series(record: SeriesRecord) -> Series:
         outputs["causal"] = record.causal
     if record.final is not UNSET:
         outputs["final"] = record.final
-    arithmetic = None if record.arithmetic is UNSET else record.arithmetic
-    return Series(record.status, record.speed, outputs, arithmetic=arithmetic)
+    return Series(record.status, record.speed, outputs)
 
 
 def json_text(value: object) -> str:

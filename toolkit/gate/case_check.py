@@ -16,18 +16,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from toolkit.answers import ArithmeticOfRuns, Status
+from toolkit.answers import Status
 from toolkit.gate.baseline import COVERAGE, SPEED, Bounds, Case, Criterion, Measured, Series, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
 
 _NOTHING = ("", "")
-_ARITHMETIC: dict[ArithmeticOfRuns, str] = {
-    "compiled": "compiled",
-    "numpy": "in NumPy",
-    "both": "compiled under some seeds and in NumPy under others",
-}
 _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
 SHOWN = 1e-6
 # Fewer timed runs than this scatter too much to be checked (docs/gate.md).
@@ -83,7 +78,6 @@ def check_case(
         else:
             _check_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
             if terms.speed:
-                collected.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
                 collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
     few = [name for name, was in before.runs.items() if _timed(was).size < FEWEST_TIMED]
     if terms.speed and few:
@@ -112,16 +106,6 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
         return ""
     which = f" under seed {', '.join(others)}" if case.simulated else ""
     return f"other measurements than the baseline's{which}: the two cannot be compared, make a new baseline"
-
-
-def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -> Iterator[str]:
-    """Say where an estimator's times were measured with other arithmetic, as far as both sides record it."""
-    if before.arithmetic and now.arithmetic and before.arithmetic != now.arithmetic:
-        was, is_ = _ARITHMETIC[before.arithmetic], _ARITHMETIC[now.arithmetic]
-        yield (
-            f"{case.source}: {estimator} ran {was} for the baseline and runs {is_} here: its speed is not that of the "
-            "same code"
-        )
 
 
 def _check_series(

@@ -25,7 +25,6 @@ from toolkit.experiment.units import (
     OUTPUTS,
     Outcome,
     Unit,
-    arithmetic_of,
     outcome_of,
     prepared_of,
     recording_to_prepare,
@@ -192,7 +191,7 @@ def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
     status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
     why = next((one.why for one in outcomes if one.why), "")
-    return Series(status, speed, kept, why, arithmetic_of(outcomes))
+    return Series(status, speed, kept, why)
 
 
 def _repeated(outcome: Outcome) -> tuple[Output, ...]:

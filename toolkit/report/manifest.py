@@ -15,11 +15,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.answers import ArithmeticOfRuns
 from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request
-from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
 from toolkit.files.documents import read
 from toolkit.noise import MeasuredNoise
@@ -73,13 +71,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
         dict[str, int | str | None],
         Meta(description="processors, and the limits of threads: variables, or over seeds workers and threads of each"),
     ]
-    arithmetic: (
-        Annotated[
-            dict[str, ArithmeticOfRuns],
-            Meta(description="that ran, by estimator, of those that have compiled code; both only over seeds"),
-        ]
-        | UnsetType
-    ) = UNSET
     cpu: str
     os: str
     files: (
@@ -114,7 +105,6 @@ def manifest_document(comparison: Comparison, command: str, requested: Configura
         references=tuple(name for name in comparison.estimators if name not in here),
         seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),
         threads=_threads(comparison),
-        arithmetic=_arithmetic(comparison),
         cpu=_cpu_model(),
         os=platform.platform(),
     )
@@ -138,12 +128,6 @@ def _run_here(comparison: Comparison) -> tuple[str, ...]:
     """Return the estimators that were run here, and not read from files."""
     others = {run.estimator for run in comparison.runs if run.timings is None}
     return tuple(name for name in comparison.estimators if name not in others)
-
-
-def _arithmetic(comparison: Comparison) -> dict[str, ArithmeticOfRuns]:
-    """Return by estimator what computed, of those that have compiled code."""
-    of = {name: [one for one in comparison.outcomes if one.estimator == name] for name in comparison.estimators}
-    return {name: ran for name, outcomes in of.items() if (ran := arithmetic_of(outcomes)) is not None}
 
 
 def _threads(comparison: Comparison) -> dict[str, int | str | None]:

@@ -29,6 +29,7 @@ _GONE = {
     ),
     "noise.match_imu": "the IMU's noise is measured once for all estimators; noise.motion_scale sets it",
     "noise.track_fit_s": "noise.measured_s is the length of the beginning on which noise is measured",
+    "arithmetic": "each part of an estimator exists once, the MSCKFs' tracks compiled and all else in NumPy",
     "noise.disparity_scale": "no estimator has such a state any more; the audit's vision-scale reports a scale",
 }
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}

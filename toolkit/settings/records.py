@@ -12,7 +12,6 @@ _NS_PER_S = 1_000_000_000
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
 PolicyName = Literal["robust", "gate", "none", "classic"]
-Arithmetic = Literal["auto", "compiled", "numpy"]
 Auto = Literal["auto"]
 Scalar = bool | int | float | str
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
@@ -220,9 +219,6 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
         Literal["measurements", "truth"], _about("source of the first state; a start from the truth is labelled")
     ] = "measurements"
     card: Annotated[bool, _about("describe the recording's tracks in the report; takes some seconds")] = False
-    arithmetic: Annotated[
-        Arithmetic, _about("of filters that have both kinds: auto is compiled where the extra fast is installed")
-    ] = "auto"
     first_seed: Annotated[int, _about("seed of simulated sequences, the first of several", ge=0)] = 0
     seeds: Annotated[int, _about("how many seeds a simulated sequence is repeated over", ge=1, le=100_000)] = 1
     vary: Annotated[
