@@ -3,17 +3,16 @@
 Which metrics have a column by default is in the metrics' records (:mod:`toolkit.metrics`).
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
-from typing import Literal, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Literal
 
 import numpy as np
 
-from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.noise import MotionScale, TrackWeight
 from toolkit.report.scores import path_length_m
-from toolkit.report.text import MISSING, ShownUnit, Table, cell, heading, number, unit_of
+from toolkit.report.text import MISSING, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Window, outlier_summary
 
@@ -26,13 +25,6 @@ _LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 # The columns of a table: None for the usual ones, "all", or metrics by key or name.
 Columns = None | Literal["all"] | tuple[str, ...]
 _MOTION = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}
-
-
-class _Column(NamedTuple):
-    """Three lines of heading, and the cell of a row."""
-
-    heading: tuple[str, ...]
-    cell: Callable[[Row], str]
 
 
 def requested_columns(names: tuple[str, ...]) -> Columns:
@@ -52,44 +44,34 @@ def comparison_table(comparison: Comparison, columns: Columns = None) -> Table:
     Over seeds a cell is the mean over the runs that are ok. Under the table of a ladder stands what each estimator
     changes. Raises VislamError for an unknown column.
     """
-    ends = _ok_of(comparison) if comparison.over_seeds else _Column(("status", "", ""), lambda row: row.status)
-    chosen = (ends, *_metric_columns(comparison, columns))
-    rows = tuple((row.estimator, row.label, *(column.cell(row) for column in chosen)) for row in comparison.lines)
-    headings = (("estimator", "", ""), ("output", "", ""), *(column.heading for column in chosen))
+    lines, chosen = comparison.lines, list(_columns(comparison, columns))
+    cells = zip(*(column for _, column in chosen), strict=True)
+    rows = tuple((row.estimator, row.label, *of_row) for row, of_row in zip(lines, cells, strict=True))
+    headings = (("estimator", "", ""), ("output", "", ""), *(head for head, _ in chosen))
     under = change_lines((name, comparison.changes.get(name, "")) for name in comparison.estimators)
-    marks = tuple(row.mark for row in comparison.lines)
-    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under), marks)
+    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under), tuple(row.mark for row in lines))
 
 
-def _ok_of(comparison: Comparison) -> _Column:
-    """Return the column of how many runs ended well."""
-    return _Column(("ok", "of", str(len(comparison.seeds))), lambda row: str(row.counts["ok"]))
+def _columns(comparison: Comparison, columns: Columns) -> Iterator[tuple[tuple[str, ...], list[str]]]:
+    """Yield the heading and the cells of each column: how runs ended, then the metrics.
 
-
-def _metric_columns(comparison: Comparison, columns: Columns) -> Iterator[_Column]:
-    """Yield a column for each metric; over seeds also the spread of the first, and how long the NEES is in its band."""
+    Over seeds also the spread of the first metric, and how long the NEES is in its band.
+    """
+    lines = comparison.lines
+    if comparison.over_seeds:
+        yield ("ok", "of", str(len(comparison.seeds))), [str(row.counts["ok"]) for row in lines]
+    else:
+        yield ("status", "", ""), [row.status for row in lines]
     for i, metric in enumerate(shown_metrics(comparison, columns)):
-        good = [row for row in comparison.lines if row.counts["ok"]]
-        unit = unit_of(metric, (row.value(metric.key) for row in good))
-        yield _Column(heading(metric, unit), partial(_value, metric=metric, unit=unit))
+        unit = unit_of(metric, (row.value(metric.key) for row in lines if row.counts["ok"]))
+        yield heading(metric, unit), [cell(row.value(metric.key), metric, unit) for row in lines]
         if comparison.over_seeds and i == 0:
-            yield _Column((metric.heading[0], "std", unit.name), partial(_std, metric=metric, unit=unit))
+            spreads = [row.spread(metric.key) for row in lines]
+            stds = [cell(None if spread is None else spread.std, metric, unit) for spread in spreads]
+            yield (metric.heading[0], "std", unit.name), stds
         if comparison.over_seeds and metric.key == _BANDED:
-            yield _Column(("NEES", "band", "%"), _in_band)
-
-
-def _value(row: Row, metric: Metric, unit: ShownUnit) -> str:
-    return cell(row.value(metric.key), metric, unit)
-
-
-def _std(row: Row, metric: Metric, unit: ShownUnit) -> str:
-    spread = row.spread(metric.key)
-    return cell(None if spread is None else spread.std, metric, unit)
-
-
-def _in_band(row: Row) -> str:
-    nees = row.mean_nees
-    return MISSING if nees is None else number(nees.in_band_percent)
+            means = [row.mean_nees for row in lines]
+            yield ("NEES", "band", "%"), [MISSING if nees is None else number(nees.in_band_percent) for nees in means]
 
 
 def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:

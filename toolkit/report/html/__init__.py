@@ -18,24 +18,8 @@ from toolkit.files.writing import write_text
 __all__ = ["write_html"]
 # In the order in which they build upon each other; together they are the body of one function.
 SCRIPTS = (
-    "dom",
-    "numbers",
-    "state",
-    "hints",
-    "table",
-    "canvas",
-    "gestures",
-    "scene",
-    "top_view",
-    "orbit_view",
-    "axes",
-    "chart",
-    "charts",
-    "seeds",
-    "frames",
-    "words",
-    "case",
-    "main",
+    *("dom", "numbers", "state", "hints", "table", "canvas", "gestures", "scene", "top_view", "orbit_view"),
+    *("axes", "chart", "charts", "seeds", "frames", "words", "case", "main"),
 )
 # Characters that could end the script element or open a comment in it, or that older parsers take as the end of a line.
 _ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
