@@ -5,7 +5,7 @@ result (``diverged``), an array of another shape is a mistake in the estimator's
 anything computes with it.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -145,11 +145,6 @@ def _check_array(what: str, value: Any, shapes: tuple[tuple[int, ...], ...], *, 
 def _check_info(info: Any, where: str) -> None:
     if not isinstance(info, Mapping):
         raise EstimatorError(f"info {where} is {type_of(info)}; it is a dict of numbers by name")
-    for name in _not_numbers(info):
-        raise EstimatorError(f"info {where} has {name!r}: {info[name]!r}; it is a dict of numbers by name")
-
-
-def _not_numbers(info: Mapping[Any, Any]) -> Iterator[Any]:
     for name, value in info.items():
         if not isinstance(name, str) or not isinstance(value, float | int | np.number):
-            yield name
+            raise EstimatorError(f"info {where} has {name!r}: {value!r}; it is a dict of numbers by name")

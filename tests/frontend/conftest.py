@@ -15,6 +15,7 @@ import pytest
 from toolkit.frontend import Camera, RectifiedPair, already_rectified, rectified
 from toolkit.frontend.cameras import Image
 from toolkit.geometry import Array, se3, so3_exp
+from toolkit.simulation.renderer import Eye
 
 SIZE = (320, 240)
 BASELINE_M = 0.12
@@ -59,16 +60,8 @@ def _texture(rng: np.random.Generator) -> Array:
 
 def _rays(camera: Camera) -> Array:
     """Return the direction (height, width, 3) of each pixel."""
-    width, height = camera.size_px
-    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
-    flat = pixels.reshape(-1, 1, 2)
-    if camera.distortion == "equidistant":
-        plain = cv2.fisheye.undistortPoints(flat, camera.K, camera.coefficients)
-    else:
-        plain = cv2.undistortPoints(
-            flat, camera.K, camera.coefficients, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-        )
-    return np.concatenate([plain.reshape(height, width, 2), np.ones((height, width, 1))], axis=2)
+    eye = Eye.of(camera)
+    return np.stack([eye.x, eye.y, np.ones_like(eye.x)], axis=2).astype(np.float64)
 
 
 def _hit(texture: Array, origin: Array, directions: Array, depth_m: float) -> tuple[Array, Array]:
