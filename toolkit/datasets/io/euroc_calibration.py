@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, read_fields, rigid
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import ImuNoise, StereoRig
@@ -56,15 +56,13 @@ _SAME_PLACE_M = 1e-6
 _STATED_NOISE = ImuNoise(
     accel_noise_density=2e-3, gyro_noise_density=1.6968e-4, accel_random_walk=3e-3, gyro_random_walk=1.9393e-5
 )
-_MODELS: dict[str, Distortion] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "equidistant": "equidistant",
-    "none": "none",
+# Of plumb_bob (k1 k2 p1 p2, and with five also k3) and rational_polynomial OpenCV takes the coefficients as they stand.
+_LENSES: dict[str, tuple[Distortion, tuple[int, ...]]] = {
+    **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob"), ("radtan", (4, 5))),
+    "rational_polynomial": ("radtan", (8, 12, 14)),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4"), ("equidistant", (4,))),
+    "none": ("none", ()),
 }
-# Of radtan: k1 k2 p1 p2, and with five also k3.
-_COUNTS: dict[Distortion, tuple[int, ...]] = {"radtan": (4, 5), "equidistant": (4,), "none": (0, 4, 5)}
 _COEFFICIENTS = "distortion_coefficients|distortion_coeffs"
 
 
@@ -278,19 +276,26 @@ def _part(fields: Fields, name: str) -> Fields:
     return Fields(fields.path, inner)
 
 
-def _distortion(fields: Fields) -> tuple[Distortion, np.ndarray]:
-    given = str(fields.arrays["distortion_model"]) if "distortion_model" in fields else "none"
-    if given not in _MODELS:
-        raise DataError(f"{fields.path}: distortion_model {given} is unknown; there are {', '.join(_MODELS)}")
-    model = _MODELS[given]
+def _distortion(fields: Fields) -> tuple[Distortion, Array]:
+    name = str(fields.arrays["distortion_model"]) if "distortion_model" in fields else "none"
+    given = next((key for key in _COEFFICIENTS.split("|") if key in fields), None)
+    if given is None and name != "none" and name in _LENSES:
+        fields.require(_COEFFICIENTS)
+    return lens_of(str(fields.path), name, np.zeros(0) if given is None else fields.vector(given))
+
+
+def lens_of(what: str, name: str, coefficients: Array) -> tuple[Distortion, Array]:
+    """Return the model of a lens, by any name it has, and its coefficients; raises DataError where they do not fit."""
+    if name not in _LENSES:
+        raise DataError(f"{what}: distortion_model {printable(name)[:50]} is unknown; there are {', '.join(_LENSES)}")
+    model, counts = _LENSES[name]
     if model == "none":
         return model, np.zeros(4)
-    fields.require(_COEFFICIENTS)
-    key = fields.first_of(*_COEFFICIENTS.split("|"))
-    coefficients = fields.vector(key)
-    if coefficients.size not in _COUNTS[model] or not np.isfinite(coefficients).all():
-        wanted = " or ".join(map(str, _COUNTS[model]))
+    # Some programs fill up with zeros.
+    count = next((n for n in counts if np.trim_zeros(coefficients, "b").size <= n <= coefficients.size), None)
+    if count is None or not np.isfinite(coefficients).all():
+        wanted = " or ".join(map(str, counts))
         raise DataError(
-            f"{fields.path}: {key} has {coefficients.size} values, expected {wanted} finite ones of {given}"
+            f"{what}: distortion has {coefficients.size} coefficients, expected {wanted} finite ones of {name}"
         )
-    return model, coefficients
+    return model, coefficients[:count]

@@ -29,12 +29,12 @@ from toolkit.datasets.io.bag_reader import (
     Message,
     Topic,
 )
-from toolkit.datasets.io.euroc_calibration import kalibr_noise, read_calibration
+from toolkit.datasets.io.euroc_calibration import kalibr_noise, lens_of, read_calibration
 from toolkit.datasets.io.fields import camera_matrix
+from toolkit.datasets.io.image_pairs import pinhole_of
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
 from toolkit.frontend import Camera, Pinhole, RectifiedPair, already_rectified, rectified
-from toolkit.frontend.cameras import Distortion
 from toolkit.geometry import Array, rotation_from_quaternion, se3, se3_inverse
 from toolkit.measurements import NS_PER_S, MotionNoise
 from toolkit.models.noise import mems_imu, twist_noise
@@ -72,17 +72,6 @@ _COLOURS |= {
     f"{name.removesuffix('8')}16": what for name, what in _COLOURS.items() if name.startswith(("rgb", "bgr", "bayer"))
 }
 _PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
-# Of plumb_bob and rational_polynomial OpenCV takes the coefficients as they stand.
-_MODELS: dict[str, tuple[Distortion, tuple[int, ...]]] = {
-    "plumb_bob": ("radtan", (4, 5)),
-    "radtan": ("radtan", (4, 5)),
-    "rational_polynomial": ("radtan", (8, 12, 14)),
-    "equidistant": ("equidistant", (4,)),
-    "fisheye": ("equidistant", (4,)),
-    "kannala_brandt4": ("equidistant", (4,)),
-    "none": ("none", (0, 4, 5)),
-}
-
 Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 _NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
 _STATED = "the noise of the IMU is as its file states it"
@@ -146,19 +135,11 @@ def image_file(message: Any, what: str) -> tuple[str, bytes]:
 def camera(info: Any, what: str) -> Camera:
     """Return the camera of a CameraInfo; raises DataError where it is not calibrated or its lens is not known."""
     K = camera_matrix_of(info, what)
-    name, coefficients = str(info.distortion_model) or "none", np.asarray(_field(info, "D"), dtype=np.float64)
-    if name not in _MODELS:
-        raise DataError(f"{what}: distortion_model {printable(name)[:50]} is unknown; there are {', '.join(_MODELS)}")
-    model, counts = _MODELS[name]
-    # Some programs fill up with zeros.
-    count = next((n for n in counts if np.trim_zeros(coefficients, "b").size <= n <= coefficients.size), None)
-    if not coefficients.any():
-        model, coefficients = "none", np.zeros(4)
-    elif count is None or not np.isfinite(coefficients).all():
-        wanted = " or ".join(map(str, counts))
-        raise DataError(f"{what}: {coefficients.size} distortion coefficients, expected {wanted} of {name}")
+    coefficients = np.asarray(_field(info, "D"), dtype=np.float64)
+    name = str(info.distortion_model) if coefficients.any() else "none"
+    model, coefficients = lens_of(what, name or "none", coefficients)
     size_px = (int(info.width), int(info.height))
-    return Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), model, coefficients[:count], size_px)
+    return Camera(pinhole_of(K), model, coefficients, size_px)
 
 
 def camera_matrix_of(info: Any, what: str) -> Array:
@@ -187,9 +168,8 @@ def rectification(info: Any) -> Rectification:
     """Return how the images of a CameraInfo are rectified."""
     P = np.asarray(_field(info, "P"), dtype=np.float64).reshape(3, 4)
     right_m = -float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0
-    pinhole_px = (float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
     R_rect_cam = np.asarray(_field(info, "R"), dtype=np.float64).reshape(3, 3)
-    return Rectification(R_rect_cam if R_rect_cam.any() else np.eye(3), pinhole_px, right_m)
+    return Rectification(R_rect_cam if R_rect_cam.any() else np.eye(3), pinhole_of(P), right_m)
 
 
 def _field(info: Any, name: str) -> Any:
