@@ -245,11 +245,11 @@ MOST_OFF = 0.5
 LEAST_TURNING = 1.0 / 3.0
 # Limits of a step between true poses: a distance (m), a multiple of the usual speed, and a speed (m/s).
 LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
-# The camera drives if it moves by so many times LEAST_MOVED_M in a window. The truth must stand in this share of the
+# The camera drives if it moves by this many times LEAST_MOVED_M in a window. The truth must stand in this share of the
 # windows, longer than another vehicle fills the view; a measured truth does not repeat a pose exactly.
 DRIVES, MOST_STANDING = 5.0, 0.5
 # From this root mean square difference on, as a share of the motion, other readings of the truth are tried. One is
-# reported if it makes the difference so many times smaller, which no sound recording at hand has.
+# reported if it makes the difference this many times smaller, which no sound recording at hand has.
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
 # Units of length (m) that a truth may be in and that are only named; millimetres and centimetres are converted
 # (`units`).

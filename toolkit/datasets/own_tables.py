@@ -128,7 +128,7 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
     # A single row v is that of both images, or of the left one.
     right_px[:, 1] = np.where(np.isnan(right_px[:, 0]) & (rows == ONE_ROW), np.nan, right_px[:, 1])
     if rows == TWO_ROWS:
-        # Half of a right image is none; the left one is a sighting without it.
+        # Where only one of uR and vR is given, the right image counts as missing; the left one is used.
         right_px[_is_filler(left_px, right_px) | np.isnan(right_px).any(axis=1)] = np.nan
     corners_px = np.hstack([left_px, right_px])
     if rows == TWO_ROWS:

@@ -195,7 +195,7 @@ class _SideCheck:
         return 0 if isinstance(images, Unusable) else self._matched(images[1], images[0])
 
     def matched_with(self, place: int, offset: int) -> int:
-        """Return how many corners of a left image are found in the right image of a pair so many pairs away."""
+        """Return how many corners of a left image are found in the right image of a pair ``offset`` pairs later."""
         if not 0 <= place + offset < len(self.pairs):
             return 0
         pair = replace(self.pairs[place], right=self.pairs[place + offset].right)
@@ -227,7 +227,8 @@ def _check_sides(check: _SideCheck) -> None:
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
     places, wanted, matched = check.looked_at()
     least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
-    # A pair begins so many tracks at most: where enough are found as called, no other way can find more by the factor.
+    # A pair begins at most this many tracks: where enough are found as called, no other way can find more by the
+    # factor.
     most = settings.max_tracks * len(places)
     if most > least and sum(map(check.exchanged, places)) > least:
         raise DataError(

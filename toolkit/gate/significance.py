@@ -92,7 +92,7 @@ class Pairs(Compared):
         before, after, margin = log_of(self.before), log_of(self.after), self.criterion.margin
         if self.criterion.worse == "larger":
             return paired_p(after - before, margin)
-        # The mean NEES over runs scatters by chance; a NIS is a mean over so many innovations that it hardly does.
+        # The mean NEES over runs scatters by chance; a NIS is a mean over thousands of innovations and hardly does.
         with_band = self.where.metric == "nees_pose_mean"
         low, high = nees_band(POSE_DOF, before.shape[-1]) if with_band else (1.0, 1.0)
         return _away_p(before, after, margin, (float(np.log(low)), float(np.log(high))))
