@@ -225,12 +225,8 @@ def _carried(H: Array, cov: Array) -> Array:
     return np.asarray(H @ cov @ np.swapaxes(H, 1, 2))
 
 
-def aligned(expected: Belief, frame: StereoFrame, landmarks: KnownLandmarks, rig: StereoRig) -> Belief:
-    """Return the belief with its pose corrected by a frame's sightings of known landmarks; its covariance stays."""
-    return _aligned(expected, _KnownSightings.of(frame, landmarks), rig)
-
-
 def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig) -> Belief:
+    """Return the belief with its pose corrected by the sightings of known landmarks; its covariance stays."""
     if not len(known.points):
         return expected
     uvs_px, landmarks = known.uvs_px, known.points

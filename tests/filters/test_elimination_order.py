@@ -44,16 +44,6 @@ def test_where_the_order_of_time_takes_more_operations_it_is_colamds(scenario, m
     assert cheaper_order(*_problem(simulate(replace(scenario, duration_s=10.0), 1))) is by_colamd
 
 
-def test_operations_are_those_of_a_chain_counted_by_hand():
-    """Each of three poses is eliminated together with the next one: 6 rows of 12, twice, and 6 of 6."""
-    graph, ordering = gtsam.SymbolicFactorGraph(), gtsam.Ordering()
-    for k in range(3):
-        ordering.push_back(X(k))
-    graph.push_factor(X(0), X(1))
-    graph.push_factor(X(1), X(2))
-    assert elimination_order._operations(graph, ordering) == 2 * 6 * 12**2 + 6 * 6**2
-
-
 def test_both_orders_have_every_variable_once_and_lead_to_one_solution():
     sequence = _standing(8.0)
     graph, frames = _problem(sequence)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck, aligned
+from filters.smoothing.outlier_check import KnownLandmarks, OutlierCheck
 from toolkit.geometry import se3_exp, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
@@ -43,6 +43,11 @@ def known(points: dict[int, np.ndarray]) -> KnownLandmarks:
     return landmarks
 
 
+def placed(before: Belief, frame: StereoFrame, landmarks: KnownLandmarks) -> Belief:
+    """Return where the frame puts the state."""
+    return OutlierCheck(RIG, POLICIES["robust"]).placed(before, frame, landmarks)[0]
+
+
 def moved_px(T_world_imu: np.ndarray, points: dict[int, np.ndarray]) -> float:
     """Return how far the images from a pose are from those from the origin, the root of the mean square."""
     places = np.array(list(points.values()))
@@ -53,9 +58,9 @@ def moved_px(T_world_imu: np.ndarray, points: dict[int, np.ndarray]) -> float:
 def test_a_state_begins_where_its_sightings_put_it_though_the_motion_is_off_and_some_are_mismatched():
     """Noise of half a pixel on 40 points: a tenth of a pixel of the pose, where the motion is off by eight."""
     frame, points = frame_and_points(np.random.default_rng(2).uniform(20.0, 60.0, (10, 3)))
-    assert moved_px(aligned(expected(), frame, known(points), RIG).T_world_imu, points) < 0.3
+    assert moved_px(placed(expected(), frame, known(points)).T_world_imu, points) < 0.3
     alone = expected()
-    assert aligned(alone, frame, known({}), RIG) is alone
+    assert placed(alone, frame, known({})) is alone
 
 
 def test_what_moves_by_itself_is_an_outlier_though_the_motion_might_explain_it():
@@ -80,4 +85,4 @@ def test_a_state_that_is_certain_stays_where_it_is():
     """Sightings have nothing to say where the motion leaves no doubt."""
     frame, points = frame_and_points(np.empty((0, 3)))
     certain = replace(expected(), cov=np.zeros((9, 9)))
-    np.testing.assert_array_equal(aligned(certain, frame, known(points), RIG).T_world_imu, OFF)
+    np.testing.assert_array_equal(placed(certain, frame, known(points)).T_world_imu, OFF)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, se3, se3_exp, se3_inverse, so3_exp, so3_log
+from toolkit.geometry import Array, BoolArray, se3, so3_exp, so3_log
 from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import huber_weights
@@ -78,10 +78,8 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
 
 def _vision_motion(sequence: Sequence) -> _SeenMotion:
     moved = camera_motion(sequence)
-    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
-    T_imu_cam = sequence.rig.T_imu_cam
-    T_before_after = se3_exp(np.hstack([moved.w_radps, moved.v_mps]) * dt_s)
-    return _SeenMotion(np.asarray(T_imu_cam @ T_before_after @ se3_inverse(T_imu_cam)), moved.known)
+    dt_s = np.diff(sequence.frames_t_ns) / NS_PER_S
+    return _SeenMotion(moved.steps_of_imu(dt_s, sequence.rig.T_imu_cam), moved.known)
 
 
 def _gyro_bias_residual(pieces: list[Preintegration], seen: _SeenMotion) -> Array:

@@ -46,6 +46,16 @@ class CameraMotion(NamedTuple):
     v_mps: Array
     known: BoolArray
 
+    def of_imu(self, T_imu_cam: Array) -> Array:
+        """Return the twists (K - 1, 6) [rad/s, m/s] of an IMU that the camera is fixed to, in its own axes."""
+        w_radps = self.w_radps @ T_imu_cam[:3, :3].T
+        return np.hstack([w_radps, self.v_mps @ T_imu_cam[:3, :3].T - np.cross(w_radps, T_imu_cam[:3, 3])])
+
+    def steps_of_imu(self, dt_s: Array, T_imu_cam: Array) -> Array:
+        """Return the IMU's motions T_before_after (K - 1, 4, 4) over the intervals, which last dt_s (K - 1,)."""
+        steps = se3_exp(np.hstack([self.w_radps, self.v_mps]) * dt_s[:, None])
+        return np.asarray(T_imu_cam @ steps @ se3_inverse(T_imu_cam))
+
     def first(self, intervals: int) -> "CameraMotion":
         """Return the motion over the first ``intervals`` intervals."""
         return CameraMotion(self.w_radps[:intervals], self.v_mps[:intervals], self.known[:intervals])

@@ -153,9 +153,7 @@ def _scale(sequence: Sequence, known: BoolArray) -> Scalar | None:
         return None
     moved = camera_motion(replace(sequence, observations=sequence.visible, track_budget=None))
     known = known & moved.known
-    R_imu_cam, arm = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
-    w_radps = moved.w_radps @ R_imu_cam.T
-    seen_mps = moved.v_mps @ R_imu_cam.T - np.cross(w_radps, arm)
+    seen_mps = moved.of_imu(sequence.rig.T_imu_cam)[:, 3:]
     measured_mps = interval_means(motion.t_ns, motion.values, sequence.frames_t_ns)[:, :3]
     middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:])
     if middle.size < _FEWEST_INTERVALS:

@@ -56,9 +56,7 @@ def with_gap_twists(sequence: Sequence) -> Sequence:
 def _improved(sequence: Sequence, gaps: BoolArray, noise: TwistNoise) -> GapTwists | None:
     t_ns, dt_s = sequence.frames_t_ns, np.diff(sequence.frames_t_ns) / NS_PER_S
     moved = camera_motion(replace(sequence, observations=sequence.visible, track_budget=None))
-    R_imu_cam, arm = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
-    w_radps = moved.w_radps @ R_imu_cam.T
-    seen = np.hstack([w_radps, moved.v_mps @ R_imu_cam.T - np.cross(w_radps, arm)])
+    seen = moved.of_imu(sequence.rig.T_imu_cam)
     known = moved.known & ~gaps
     changes_per_s = _change_variance(seen, known, dt_s)
     if changes_per_s is None:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from toolkit.audit.edits import keep_frames
-from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse
+from toolkit.geometry import Array, IntArray
 from toolkit.initialization.first_guess import guess_with_imu
 from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior, StereoRig
 from toolkit.models import stereo
@@ -122,8 +122,7 @@ def _started(part: Sequence, packets: tuple[Packet, ...]) -> Iterator[Belief]:
             yield replace(state, T_world_imu=pose, v_world=v_world, bias=guess.bias)
         return
     moved, dt_s = camera_motion(seen), np.diff(part.frames_t_ns) / NS_PER_S
-    T_imu_cam = part.rig.T_imu_cam
-    steps = T_imu_cam @ se3_exp(dt_s[:, None] * np.hstack([moved.w_radps, moved.v_mps])) @ se3_inverse(T_imu_cam)
+    steps = moved.steps_of_imu(dt_s, part.rig.T_imu_cam)
     yield state
     for motion, step, known, lasting_s in zip(motions, steps, moved.known, dt_s, strict=True):
         prediction = model.integrate(motion, state.bias).predict(state)
