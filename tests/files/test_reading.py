@@ -15,7 +15,7 @@ from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError, VislamError
 from toolkit.experiment.configuration import read_configuration
 from toolkit.files.reading import read_input
-from toolkit.gate.baseline_file import load_baseline
+from toolkit.gate.baseline import load_baseline
 
 
 def _archive(path: Path) -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.gate import interleaved
-from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series, installed_releases
-from toolkit.gate.baseline_file import to_text
+from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series, installed_releases, to_text
 from toolkit.gate.interleaved import (
     FEWEST_PAIRS,
     MARGIN,

@@ -18,7 +18,7 @@ from toolkit.errors import DataError
 from toolkit.evaluation import against_baseline
 from toolkit.experiment.comparison import Comparison, Row, consistency_of
 from toolkit.files.documents import parse, read, to_line, to_text
-from toolkit.gate import baseline_file
+from toolkit.gate import baseline
 from toolkit.metrics import Evaluation, Scores, describe
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.consistency import body_errors
@@ -54,7 +54,7 @@ CASES = {
 
 # Baselines are made to be reviewed, and laid out otherwise than other documents.
 REVIEWED = {
-    "baseline.json": lambda path: baseline_file.to_text(baseline_file.load_baseline(path)),
+    "baseline.json": lambda path: baseline.to_text(baseline.load_baseline(path)),
     "trajectory-baseline.json": lambda path: against_baseline.to_text(against_baseline.load_trajectory_baseline(path)),
 }
 

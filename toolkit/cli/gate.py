@@ -93,8 +93,7 @@ def baseline(options: argparse.Namespace) -> int:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.files.writing import check_writable, write_text
-    from toolkit.gate.baseline import releases_in_a_name
-    from toolkit.gate.baseline_file import to_text
+    from toolkit.gate.baseline import releases_in_a_name, to_text
     from toolkit.gate.checking import new_baseline
     from toolkit.report.manifest import made_here
 
@@ -264,7 +263,7 @@ def check(options: argparse.Namespace) -> int:
 def _check_of_estimators(options: argparse.Namespace) -> Check:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.gate.baseline_file import check_releases, load_baseline
+    from toolkit.gate.baseline import check_releases, load_baseline
     from toolkit.gate.checking import How, check
 
     if options.speed_against and options.skip_speed:

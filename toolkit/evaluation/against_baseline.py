@@ -20,8 +20,7 @@ from toolkit.evaluation.document import EvaluationRecord, RunRecord, read_evalua
 from toolkit.evaluation.gathering import files_by_sequence
 from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth, score_file
 from toolkit.files import documents
-from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, Values
-from toolkit.gate.baseline_file import MetricValues, Percent, json_text
+from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, MetricValues, Percent, Values, json_text
 from toolkit.gate.case_check import check_recorded
 from toolkit.gate.measuring import place_of
 from toolkit.gate.significance import FEWEST_RUNS, Repeats, Where, check_metrics

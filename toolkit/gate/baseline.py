@@ -1,17 +1,28 @@
-"""The content of a baseline: cases, releases, hashes of the measurements, results, and the criteria for "worse"."""
+"""A baseline: cases, releases, hashes of the measurements, results, and the criteria for "worse"; and its file.
 
+The file is JSON that people can read and review, the values of all seeds of a metric on one line. The contract is
+``vislam.baseline/1`` (docs/gate.md). Whatever is wrong with a file is said in one line, with the place.
+"""
+
+import dataclasses
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType, field, to_builtins
 
 from toolkit.answers import Output, Status
 from toolkit.errors import VislamError
-from toolkit.settings import DEFAULTS, Settings
+from toolkit.files import documents
+from toolkit.settings import DEFAULTS, Settings, changes_of, settings_of
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]
+Percent = Annotated[float, Meta(ge=0)]
 # Another GTSAM may linearise differently, another NumPy draw other numbers; NumPy's patch releases do not.
 _DIGITS_THAT_MATTER = {"gtsam": 3, "numpy": 2}
 
@@ -22,16 +33,14 @@ class BaselineError(VislamError):
     exit_status: ClassVar[int] = 3
 
 
-@dataclass(frozen=True)
-class Criterion:
+class Criterion(Struct, frozen=True):
     """When a metric is worse, and by how many percent it may be.
 
-    On simulated sequences ``percent`` is a margin: the mean worsening that is accepted. On recorded ones it is the
-    bound for the single value. For ``away from 1`` it is in percent of the ratio to 1.
+    For ``away from 1`` it is in percent of the ratio to 1.
     """
 
     worse: Worse
-    percent: float
+    percent: Percent
 
     @property
     def margin(self) -> float:
@@ -39,36 +48,45 @@ class Criterion:
         return math.log1p(self.percent / 100.0)
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Criteria for "worse" by metric, for simulated and for recorded sequences, and limits for all.
+class MarginRecord(Criterion, frozen=True):
+    """When a metric of simulated sequences is worse."""
 
-    Under any seed a run may lose ``coverage_points`` (percent of the frames) of its coverage, and may become
-    ``speed_ratio`` times slower against the reference workload.
-    """
+    percent: Annotated[Percent, Meta(description="the mean worsening that is tolerated")] = field(name="margin_percent")
 
-    simulated: Mapping[str, Criterion]
-    recorded: Mapping[str, Criterion]
-    coverage_points: float
-    speed_ratio: float
+
+class BoundRecord(Criterion, frozen=True):
+    """When a metric of a recording is worse."""
+
+    percent: Annotated[Percent, Meta(description="the worsening that a single value must keep below")] = field(
+        name="bound_percent"
+    )
+
+
+class BoundsRecord(Struct, frozen=True):
+    """What counts as worse."""
+
+    simulated: Annotated[dict[str, MarginRecord], Meta(description="by metric key")]
+    recorded: Annotated[dict[str, BoundRecord], Meta(description="by metric key")]
+    coverage_points: Annotated[float, Meta(description="percent of the frames that may be lost", ge=0)]
+    speed_ratio: Annotated[float, Meta(description="how many times slower a run may become", gt=1)]
 
 
 # How the numbers were chosen: docs/gate.md.
-DEFAULT_BOUNDS = Bounds(
+DEFAULT_BOUNDS = BoundsRecord(
     simulated={
-        "ate_se3_m": Criterion("larger", 0.5),
-        "ate_yaw_m": Criterion("larger", 0.5),
-        "nees_pose_mean": Criterion("away from 1", 1.0),
-        "nis_mean": Criterion("away from 1", 1.0),
-        "heldout_reproj_median_px": Criterion("larger", 0.5),
+        "ate_se3_m": MarginRecord("larger", 0.5),
+        "ate_yaw_m": MarginRecord("larger", 0.5),
+        "nees_pose_mean": MarginRecord("away from 1", 1.0),
+        "nis_mean": MarginRecord("away from 1", 1.0),
+        "heldout_reproj_median_px": MarginRecord("larger", 0.5),
     },
     recorded={
-        "ate_se3_m": Criterion("larger", 5.0),
-        "ate_yaw_m": Criterion("larger", 5.0),
-        "rpe_100m_percent": Criterion("larger", 5.0),
-        "nees_pose_mean": Criterion("away from 1", 10.0),
-        "nis_mean": Criterion("away from 1", 10.0),
-        "heldout_reproj_median_px": Criterion("larger", 2.0),
+        "ate_se3_m": BoundRecord("larger", 5.0),
+        "ate_yaw_m": BoundRecord("larger", 5.0),
+        "rpe_100m_percent": BoundRecord("larger", 5.0),
+        "nees_pose_mean": BoundRecord("away from 1", 10.0),
+        "nis_mean": BoundRecord("away from 1", 10.0),
+        "heldout_reproj_median_px": BoundRecord("larger", 2.0),
     },
     coverage_points=1.0,
     speed_ratio=1.3,
@@ -117,7 +135,7 @@ class Measured:
     hashes: tuple[str, ...]
     fingerprints: tuple[str, ...]
     runs: Mapping[str, Series]
-    absent: Mapping[str, str] = field(default_factory=dict)
+    absent: Mapping[str, str] = dataclasses.field(default_factory=dict)
     unreadable: str = ""
 
 
@@ -130,9 +148,9 @@ class Baseline:
 
     releases: Mapping[str, str]
     cases: tuple[tuple[Case, Measured], ...]
-    bounds: Bounds = DEFAULT_BOUNDS
+    bounds: BoundsRecord = DEFAULT_BOUNDS
     false_alarm_rate: float = FALSE_ALARM_RATE
-    made_by: Mapping[str, str] = field(default_factory=dict)
+    made_by: Mapping[str, str] = dataclasses.field(default_factory=dict)
     settings: Settings = DEFAULTS
 
 
@@ -157,3 +175,198 @@ def _matters(name: str, release: str) -> list[str]:
 def releases_in_a_name() -> str:
     """Return the installed releases as part of a file name."""
     return "_".join(f"{name}-{'.'.join(_matters(name, release))}" for name, release in installed_releases().items())
+
+
+_REMEDY = "make the baseline with vislam baseline"
+
+Seed = Annotated[int, Meta(ge=0)]
+MetricValues = Annotated[
+    dict[str, Values], Meta(description="by metric key, a value for each seed; null where it was not computed")
+]
+
+
+class SeriesRecord(Struct, frozen=True, kw_only=True):
+    """One estimator on one sequence, by seed; an output it does not give is left out."""
+
+    status: tuple[Status, ...]
+    speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
+    causal: MetricValues | UnsetType = UNSET
+    final: MetricValues | UnsetType = UNSET
+
+
+class CaseRecord(Struct, frozen=True, kw_only=True):
+    """One sequence, on which measurements it was run, and what came of it."""
+
+    source: str
+    kind: Literal["simulated", "recorded"]
+    duration_s: Annotated[float, Meta(description="how long to simulate, or where to cut", gt=0)] | None
+    truth: Annotated[str | None, Meta(description="a file beside the recording")]
+    seeds: Annotated[tuple[Seed, ...], Meta(min_length=1)]
+    hashes: Annotated[tuple[str, ...], Meta(description="of what was read under each seed")]
+    fingerprints: Annotated[tuple[str, ...], Meta(description="the same, rounded to six digits")]
+    runs: Annotated[dict[str, SeriesRecord], Meta(description="by estimator", min_length=1)]
+
+    def __post_init__(self) -> None:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError("seeds names one twice")
+        columns: dict[str, tuple[object, ...]] = {"hashes": self.hashes, "fingerprints": self.fingerprints}
+        for name, run in self.runs.items():
+            columns |= {f"runs.{name}.status": run.status, f"runs.{name}.speed": run.speed}
+            for output, metrics in (("causal", run.causal), ("final", run.final)):
+                for key, values in ({} if metrics is UNSET else metrics).items():
+                    columns[f"runs.{name}.{output}.{key}"] = values
+        for place, column in columns.items():
+            if len(column) != len(self.seeds):
+                raise ValueError(f"{place} does not have an entry a seed")
+
+
+class BaselineRecord(Struct, frozen=True, kw_only=True):
+    """What was run, with which releases, what came of it, and what counts as worse."""
+
+    schema: Literal["vislam.baseline/1"]
+    made_by: Annotated[dict[str, str | int | float], Meta(description="how, when and where it was made")]
+    releases: Annotated[dict[str, str], Meta(description="what it was made with and is valid for")]
+    false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
+    bounds: BoundsRecord
+    sequences: Annotated[tuple[CaseRecord, ...], Meta(min_length=1)]
+    settings: (
+        Annotated[
+            dict[str, Any],
+            Meta(description="those of every run that are no defaults; a default that changes is measured"),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+def load_baseline(path: Path) -> Baseline:
+    """Read a baseline from its file, or from a folder the one made with the releases installed here.
+
+    Raises BaselineError where there is none, or it is not one.
+    """
+    if path.is_dir():
+        return _of_these_releases(path)
+    try:
+        return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+    except BaselineError as error:
+        if "'vislam.trajectory-baseline/" not in str(error):
+            raise
+        raise BaselineError(f"{path} is a baseline of trajectories; check it with --trajectories DIR") from error
+
+
+def _of_these_releases(folder: Path) -> Baseline:
+    known = {path: load_baseline(path) for path in sorted(folder.glob("*.json"))}
+    fitting = {path: one for path, one in known.items() if not other_releases(one.releases)}
+    if len(fitting) == 1:
+        return next(iter(fitting.values()))
+    here = ", ".join(f"{name} {release}" for name, release in installed_releases().items())
+    if not known:
+        raise BaselineError(f"{folder}: it holds no baseline (*.json); {_REMEDY}")
+    if not fitting:
+        raise BaselineError(f"{folder}: none of {len(known)} baselines is for {here}; make one with vislam baseline")
+    raise BaselineError(f"{folder}: {', '.join(path.name for path in fitting)} are all for {here}; name one of them")
+
+
+def check_releases(baseline: Baseline, name: str) -> None:
+    """Raise BaselineError where the baseline was made with other releases than are installed."""
+    others = other_releases(baseline.releases)
+    if others:
+        raise BaselineError(
+            f"{name}: made with {'; '.join(others)}, which alone may change results; make a baseline with these "
+            "releases, or compare all the same with --allow-other-releases"
+        )
+
+
+def to_text(baseline: Baseline) -> str:
+    """Return the document; refuses NaN and infinity, which are not JSON."""
+    return json_text(to_builtins(document(baseline)))
+
+
+def document(baseline: Baseline) -> BaselineRecord:
+    """Return a baseline as a record."""
+    return BaselineRecord(
+        schema="vislam.baseline/1",
+        made_by=dict(baseline.made_by),
+        releases=dict(baseline.releases),
+        false_alarm_rate=baseline.false_alarm_rate,
+        bounds=baseline.bounds,
+        settings=changes_of(baseline.settings) or UNSET,
+        sequences=tuple(_case_record(case, measured) for case, measured in baseline.cases),
+    )
+
+
+def from_document(record: BaselineRecord) -> Baseline:
+    """Return the baseline of a record."""
+    return Baseline(
+        record.releases,
+        tuple(_case(case) for case in record.sequences),
+        record.bounds,
+        record.false_alarm_rate,
+        {name: str(value) for name, value in record.made_by.items()},
+        settings_of({} if record.settings is UNSET else record.settings, "the baseline's settings"),
+    )
+
+
+def _case_record(case: Case, measured: Measured) -> CaseRecord:
+    return CaseRecord(
+        source=case.source,
+        kind="simulated" if case.simulated else "recorded",
+        duration_s=case.duration_s,
+        truth=case.truth,
+        seeds=case.seeds,
+        hashes=measured.hashes,
+        fingerprints=measured.fingerprints,
+        runs={name: _series_record(series) for name, series in measured.runs.items()},
+    )
+
+
+def _case(record: CaseRecord) -> tuple[Case, Measured]:
+    case = Case(
+        source=record.source,
+        simulated=record.kind == "simulated",
+        seeds=record.seeds,
+        estimators=tuple(record.runs),
+        duration_s=record.duration_s,
+        truth=record.truth,
+    )
+    runs = {name: _series(series) for name, series in record.runs.items()}
+    return case, Measured(record.hashes, record.fingerprints, runs)
+
+
+def _series_record(series: Series) -> SeriesRecord:
+    given = {output: dict(metrics) for output, metrics in series.outputs.items()}
+    return SeriesRecord(
+        status=series.status,
+        speed=series.speed,
+        causal=given.get("causal", UNSET),
+        final=given.get("final", UNSET),
+    )
+
+
+def _series(record: SeriesRecord) -> Series:
+    outputs: dict[Output, dict[str, Values]] = {}
+    if record.causal is not UNSET:
+        outputs["causal"] = record.causal
+    if record.final is not UNSET:
+        outputs["final"] = record.final
+    return Series(record.status, record.speed, outputs)
+
+
+def json_text(value: object) -> str:
+    """Return JSON for people to review: a list of numbers or of short words is one line."""
+    return _text(value, "") + "\n"
+
+
+def _text(value: object, indent: str) -> str:
+    """Return JSON in which a list of numbers or short words is one line, and of hashes a line each."""
+    inner = indent + "  "
+    if isinstance(value, Mapping):
+        entries = [f"{json.dumps(key)}: {_text(entry, inner)}" for key, entry in value.items()]
+        brackets = "{}"
+    elif isinstance(value, tuple) and any(isinstance(entry, Mapping) or len(str(entry)) > 40 for entry in value):
+        entries = [_text(entry, inner) for entry in value]
+        brackets = "[]"
+    else:
+        return json.dumps(value, allow_nan=False)
+    if not entries:
+        return brackets
+    return brackets[0] + "\n" + ",\n".join(inner + entry for entry in entries) + f"\n{indent}" + brackets[1]

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from toolkit.answers import Status
-from toolkit.gate.baseline import COVERAGE, SPEED, Bounds, Case, Criterion, Measured, Series, Values
+from toolkit.gate.baseline import COVERAGE, SPEED, BoundsRecord, Case, Criterion, Measured, Series, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
@@ -54,7 +54,7 @@ class CaseVerdicts:
 
 
 def check_case(
-    case: Case, before: Measured, now: Measured, bounds: Bounds, terms: CheckTerms = USUAL_TERMS
+    case: Case, before: Measured, now: Measured, bounds: BoundsRecord, terms: CheckTerms = USUAL_TERMS
 ) -> CaseVerdicts:
     """Judge one case on the terms given."""
     collected = CaseVerdicts()
@@ -109,7 +109,13 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
 
 
 def _check_series(
-    case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, bounds: Bounds, terms: CheckTerms
+    case: Case,
+    estimator: str,
+    before: Series,
+    now: Series,
+    collected: CaseVerdicts,
+    bounds: BoundsRecord,
+    terms: CheckTerms,
 ) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
     collected.verdicts += _ends(case, estimator, before, now, collected, terms)
@@ -239,7 +245,7 @@ def _distance(before: float, after: float) -> float:
     return math.expm1(abs(math.log(after / before)))
 
 
-def check_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
+def check_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: BoundsRecord) -> Iterator[Verdict]:
     """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
     for output, metrics in before.outputs.items():
         pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
@@ -258,7 +264,7 @@ def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
     return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
 
 
-def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
+def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: BoundsRecord) -> Iterator[Verdict]:
     """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
     was, is_ = _timed(before), _timed(now)
     if was.size < FEWEST_TIMED:

@@ -31,7 +31,7 @@ from toolkit.experiment.units import (
     run_estimator,
 )
 from toolkit.experiment.workers import LostUnit, results_of
-from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
+from toolkit.gate.baseline import COVERAGE, BoundsRecord, Case, Measured, Series, Values
 from toolkit.geometry import Array
 from toolkit.progress import Progress
 from toolkit.registry import find
@@ -136,7 +136,7 @@ def fingerprint(sequence: Sequence) -> str:
     return sequence.content_hash(_DIGITS)[:_LENGTH]
 
 
-def metrics_of(case: Case, bounds: Bounds) -> tuple[str, ...]:
+def metrics_of(case: Case, bounds: BoundsRecord) -> tuple[str, ...]:
     """Return the metrics a case is checked by."""
     return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
 

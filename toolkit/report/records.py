@@ -16,7 +16,7 @@ from toolkit.evaluation.against_baseline import TrajectoryBaselineRecord
 from toolkit.evaluation.document import EvaluationRecord
 from toolkit.files.documents import read, schema
 from toolkit.files.writing import write_text
-from toolkit.gate.baseline_file import BaselineRecord
+from toolkit.gate.baseline import BaselineRecord
 from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
 from toolkit.report.card import CardRecord, read_card
 from toolkit.report.differences import DiffRecord

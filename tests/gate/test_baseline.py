@@ -7,8 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.gate.baseline import BaselineError, installed_releases, other_releases
-from toolkit.gate.baseline_file import check_releases, load_baseline, to_text
+from toolkit.gate.baseline import (
+    BaselineError,
+    check_releases,
+    installed_releases,
+    load_baseline,
+    other_releases,
+    to_text,
+)
 from toolkit.metrics import describe
 
 
