@@ -7,7 +7,6 @@ installed) and the run's files but for its figures. The same directory gives the
 import hashlib
 import zipfile
 import zlib
-from collections.abc import Mapping
 from importlib.metadata import distributions
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
@@ -17,7 +16,6 @@ from msgspec import UNSET, Meta, Struct
 from toolkit.answers import Output
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
-from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import TRUTH
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
@@ -49,10 +47,13 @@ def export(directory: Path, estimator: str | None, output: Output | None, format
         )
     what, name = _chosen(directory, run.report, estimator, output)
     trajectory = tum.read(directory / name, "a run that diverged may leave no finite pose")
-    if format_name == "kitti":
-        _check_every_frame(what, trajectory, run.scores.sequence.frames)
-    text = FORMATS[format_name].text(trajectory)
-    write_text(target, text)
+    frames = run.scores.sequence.frames
+    if format_name == "kitti" and len(trajectory) != frames:
+        raise DataError(
+            f"{what} has {len(trajectory)} poses for {frames} frames, and KITTI's rows are the frames; "
+            "choose a format with stamps"
+        )
+    write_text(target, FORMATS[format_name].text(trajectory))
     return f"{what}, {len(trajectory)} poses"
 
 
@@ -75,14 +76,6 @@ def _chosen(directory: Path, report: Report, estimator: str | None, output: Outp
     if wanted not in outputs:
         raise DataError(f"{directory} has no {wanted} trajectory of {name}, only a {outputs[0]} one")
     return f"{name} {wanted}", files[name, wanted]
-
-
-def _check_every_frame(what: str, trajectory: Trajectory, frames: int) -> None:
-    if len(trajectory) != frames:
-        raise DataError(
-            f"{what} has {len(trajectory)} poses for {frames} frames, and KITTI's rows are the frames; "
-            "choose a format with stamps"
-        )
 
 
 class BundleRecord(Struct, frozen=True, kw_only=True):
@@ -141,46 +134,43 @@ def installed_packages() -> dict[str, str]:
 def unpack_bundle(path: Path, directory: Path) -> BundleRecord:
     """Write the run's files of a bundle into an empty directory and return what it says of them.
 
-    Only files that bundle.json lists are written, each after its hash has been checked. Raises DataError, in one line,
-    where the file is no bundle, or damaged.
+    Only files that bundle.json lists are written, after the hash of each has been checked. Raises DataError, in one
+    line, where the file is no bundle, or damaged.
     """
-    try:
-        with open_input(path) as file, zipfile.ZipFile(file) as archive:
-            if BUNDLE not in archive.namelist():
-                raise DataError(f"{path}: it is a zip archive without {BUNDLE}; {_REMEDY}")
-            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
-                raise DataError(f"{path}: it would unpack to more than 4 GB, which no bundle does")
-            record = _record(path, archive.read(BUNDLE))
-            contents = {name: _checked(path, archive, name, digest) for name, digest in record.files.items()}
-    except DataError:
-        raise
-    except _DAMAGED as error:
-        raise DataError(f"{path}: it cannot be read as a bundle ({error}); {_REMEDY}") from error
-    _write(contents, directory)
-    return record
-
-
-def _record(path: Path, content: bytes) -> BundleRecord:
-    try:
-        return documents.parse(content, BundleRecord)
-    except DataError as error:
-        raise DataError(f"{path}: {BUNDLE} {error}; {_REMEDY}") from error
-
-
-def _checked(path: Path, archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
-    if name not in archive.namelist():
-        raise DataError(f"{path}: {name} is missing; {_REMEDY}")
-    content = archive.read(name)
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise DataError(f"{path}: {name} is not as it was when the bundle was made; {_REMEDY}")
-    return content
-
-
-def _write(contents: Mapping[str, bytes], directory: Path) -> None:
+    with open_input(path) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                record, contents = _read_bundle(archive)
+        except DataError as error:
+            raise DataError(f"{path}: {error}; {_REMEDY}") from error
+        except _DAMAGED as error:
+            raise DataError(f"{path}: it cannot be read as a bundle ({error}); {_REMEDY}") from error
     for name, content in contents.items():
         place = directory / name
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
+    return record
+
+
+def _read_bundle(archive: zipfile.ZipFile) -> tuple[BundleRecord, dict[str, bytes]]:
+    """Return what a bundle says of its files, and their contents; raises DataError where the two do not agree."""
+    entries = {entry.filename: entry.file_size for entry in archive.infolist()}
+    if BUNDLE not in entries:
+        raise DataError(f"it is a zip archive without {BUNDLE}")
+    if sum(entries.values()) > _MOST_BYTES:
+        raise DataError("it would unpack to more than 4 GB, which no bundle does")
+    try:
+        record = documents.parse(archive.read(BUNDLE), BundleRecord)
+    except DataError as error:
+        raise DataError(f"{BUNDLE} {error}") from error
+    contents = {}
+    for name, digest in record.files.items():
+        if name not in entries:
+            raise DataError(f"{name} is missing")
+        contents[name] = archive.read(name)
+        if hashlib.sha256(contents[name]).hexdigest() != digest:
+            raise DataError(f"{name} is not as it was when the bundle was made")
+    return record, contents
 
 
 def _names(run: RunFiles | SeedsFiles) -> list[str]:

@@ -26,7 +26,7 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
-# A length below this (m) is told in millimetres; a value has at most this many digits.
+# A length below this (m) is written in millimetres; a value has at most this many digits.
 _SHORT_M, _MOST_DIGITS = 0.1, 7
 _NUMBERS = (
     ("before", "", ""),

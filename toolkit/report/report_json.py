@@ -466,7 +466,7 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
 
 
 def _map(run: Run) -> DrawnMap:
-    """Return where a run's landmarks are; they move with the run's last word onto the truth."""
+    """Return where a run's landmarks are; they are aligned to the truth as its final answer is."""
     return DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=shown_output(run))
 
 

@@ -192,7 +192,7 @@ def _files_in(directory: Path) -> tuple[str, ...]:
 
 
 def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
-    """Write the images that the report shows, where the recording has any, and return what is told of them."""
+    """Write the images that the report shows, where the recording has any, and return their records."""
     seen = camera_frames(comparison)
     for frame, jpeg in seen:
         place = directory / frame.image

@@ -99,7 +99,7 @@ def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
 
 
 def track_of(comparison: Comparison, run: Run) -> PathFromAbove:
-    """Return a run's last word from above, without poses that are not finite; the run must have a trajectory."""
+    """Return a run's final answer from above, without poses that are not finite; the run must have a trajectory."""
     trajectory = run.trajectory(shown_output(run))
     assert trajectory is not None, "only runs with a trajectory are drawn"
     finite = np.isfinite(trajectory.positions).all(axis=1)

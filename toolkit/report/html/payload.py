@@ -174,7 +174,7 @@ def _drawn(track: DrawnPath) -> Json:
 
 
 def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
-    """Return a run's landmarks, moved with its last word onto the truth."""
+    """Return a run's landmarks, aligned to the truth as its final answer is."""
     points, name = files.landmarks[one.landmarks], one.estimator
     last = next(run for run in files.report.runs if (run.estimator, run.output) == (name, one.output))
     shown = _moved(points[evenly(len(points), _MOST_LANDMARKS)], last)
