@@ -6,14 +6,13 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
 
-from toolkit.datasets.trajectories import euroc, tum
+from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Exchange
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
@@ -379,10 +378,3 @@ def test_an_offset_brings_clocks_together(scene, vislam, capsys) -> None:
     assert vislam("evaluate", "truth.tum", "late.tum") == 3
     assert vislam("evaluate", "truth.tum", "late.tum", "--offset", "-100") == 0
     assert "-100 s added to the stamps" in capsys.readouterr().out
-
-
-def test_euroc_files_need_no_conversion(scene, vislam: Callable[..., int]) -> None:
-    t_ns = scene.stamps(20.0)
-    Path("data.csv").write_text(euroc.text(Trajectory(t_ns, scene.poses_at(t_ns))))
-    scene.write("other.tum", t_ns, scene.estimated(t_ns, 0.1))
-    assert vislam("evaluate", "data.csv", "other.tum", "--quiet") == 0

@@ -5,13 +5,11 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from toolkit.datasets import is_drawn_from_a_seed
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means, spread_of
@@ -20,7 +18,6 @@ from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
-from toolkit.report.figures import bands as figures
 from toolkit.report.messages import note_lines, paired_lines
 from toolkit.report.scores import Seeds, seeds_document
 
@@ -33,11 +30,6 @@ def test_spread_is_numpys():
     assert (spread.n, spread.mean, spread.median) == (4, 4.0, 2.5)
     assert spread.std == pytest.approx(np.std(values, ddof=1))
     assert (spread.least, spread.lower_quartile, spread.upper_quartile, spread.most) == (1.0, 1.75, 4.75, 10.0)
-
-
-def test_one_value_has_no_deviation_and_none_has_no_spread():
-    assert spread_of([2.0]).std is None
-    assert spread_of([]) is None
 
 
 @pytest.mark.parametrize("seeds", [1, 5, 40])
@@ -71,13 +63,6 @@ def test_a_seed_that_diverged_is_counted_and_in_no_mean(over: Comparison) -> Non
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
     assert astray.values("ate_none_m") == [3.0, 4.0, 5.0, 6.0]
     assert not over.all_ok
-
-
-def test_quartiles_over_all_runs_are_the_sound_ones_where_no_run_is_bad():
-    found = quantiles_of_all([3.0, 1.0, 2.0, 7.0, 5.0], 0, "least")
-    assert (found.lower_quartile, found.median, found.upper_quartile, found.reason) == (2.0, 3.0, 5.0, "")
-    between = quantiles_of_all([1.0, 2.0, 3.0, 4.0], 0, "most")
-    assert (between.lower_quartile, between.median, between.upper_quartile) == (1.75, 2.5, 3.25)
 
 
 def test_a_bad_run_spoils_the_quartiles_it_reaches():
@@ -224,15 +209,3 @@ def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment() -> 
     assert values.mean() == pytest.approx(2.0, abs=0.005)  # its standard error is 0.001
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(values.std(), rel=0.05)
     assert ratio_of_means([1.0, None], [None, 1.0]) is None
-
-
-def test_both_figures_are_drawn(over: Comparison, tmp_path: Path) -> None:
-    drawn = list(figures.draw_over_seeds(over))
-    assert [figure.name for figure in drawn] == ["errors_over_seeds", "nees_over_seeds"]
-    for figure in drawn:
-        figure.figure.savefig(tmp_path / f"{figure.name}.png")
-
-
-def test_simulated_sequences_are_drawn_from_a_seed_and_recordings_are_not():
-    assert is_drawn_from_a_seed("drive")
-    assert not is_drawn_from_a_seed(str(Path(__file__).parents[2] / "data" / "drive_small"))

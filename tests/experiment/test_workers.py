@@ -52,9 +52,6 @@ def dies_once(unit, progress):
         os.kill(os.getpid(), signal.SIGKILL)
     return unit.estimator, unit.seed
 
-def leaves(unit, progress):
-    os._exit(3)
-
 def is_short_of_memory(unit, progress):
     if unit.seed == 1:
         raise MemoryError
@@ -169,10 +166,6 @@ def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs: Jobs, work:
 def test_a_process_that_dies_once_loses_nothing(jobs: Jobs, work: ModuleType) -> None:
     results = by_place(jobs((0, 1)), 2, work.dies_once)
     assert results == [(name, seed) for seed in (0, 1) for name in ("dead-reckoning", "ekf")]
-
-
-def test_a_process_that_ends_silently_is_reported_with_its_status(jobs: Jobs, work: ModuleType) -> None:
-    assert by_place(jobs((0,)), 2, work.leaves) == [LostUnit("its process ended with status 3 before it answered")] * 2
 
 
 def test_a_unit_without_memory_is_lost_alone(jobs: Jobs, work: ModuleType) -> None:

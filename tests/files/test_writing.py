@@ -57,14 +57,6 @@ def test_an_array_that_is_not_finite_everywhere_is_rounded_by_what_is() -> None:
     assert content_digest([array * (1.0 + 1e-12)], 6) == content_digest([array], 6)
 
 
-def test_a_pipe_is_never_replaced_by_a_file(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    with pytest.raises(OutputError, match="a device or a pipe"), replaced_file(pipe) as partial:
-        partial.write_text("lost")
-    assert pipe.is_fifo()
-
-
 def test_of_a_link_the_file_behind_it_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "file")
     with replaced_file(tmp_path / "link") as partial:

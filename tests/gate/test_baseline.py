@@ -9,7 +9,6 @@ import pytest
 
 from toolkit.gate.baseline import (
     BaselineError,
-    check_releases,
     installed_releases,
     load_baseline,
     other_releases,
@@ -51,31 +50,23 @@ def _run(document):
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
-        (lambda d: d.pop("schema"), "has not the schema vislam.baseline/1"),
         (lambda d: d.update(schema="vislam.baseline/9"), "its schema is 'vislam.baseline/9'"),
-        (lambda d: d.pop("releases"), "releases"),
-        (lambda d: d.update(false_alarm_rate=0.0), "false_alarm_rate"),
         (lambda d: d.update(false_alarm_rate=1.5), "false_alarm_rate"),
         (lambda d: d.update(sequences=[]), "sequences: expected list of length >= 1"),
-        (lambda d: d.update(sequences=[3]), r"sequences\[0\]: expected object"),
-        (lambda d: d["bounds"].pop("speed_ratio"), "speed_ratio"),
         (lambda d: d["bounds"].update(speed_ratio=0.9), "speed_ratio"),
         (
             lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"),
             "'smaller', only away from 1, larger",
         ),
-        (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(margin_percent="1"), "margin_percent"),
         (lambda d: d["sequences"][0].update(seeds=[0, 0]), "seeds"),
         (lambda d: d["sequences"][0].update(runs={}), r"sequences\[0\].runs: expected object of length >= 1"),
         (lambda d: d["sequences"][0]["hashes"].pop(), "hashes"),
-        (lambda d: _run(d)["status"].__setitem__(0, "fine"), "status"),
         (lambda d: _run(d)["causal"]["ate_se3_m"].pop(), "ate_se3_m"),
         (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, float("nan")), r"ate_se3_m\[3\].*NaN"),
         (
             lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, "0.1"),
             r"\[0\]\.runs\.one\.causal\.ate_se3_m\[3\]",
         ),
-        (lambda d: _run(d)["causal"].update(ate_se3_m=None), "ate_se3_m"),
     ],
 )
 def test_a_spoilt_baseline_is_reported_in_one_line_with_the_place(path, spoil, expected):
@@ -86,33 +77,6 @@ def test_a_spoilt_baseline_is_reported_in_one_line_with_the_place(path, spoil, e
         load_baseline(path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '{"schema": "vislam.baseline/1"}', "\x00"])
-def test_a_file_that_is_no_baseline_is_reported(path, text):
-    path.write_text(text)
-    with pytest.raises(BaselineError, match=r"here\.json"):
-        load_baseline(path)
-
-
-def test_a_file_cut_anywhere_is_reported(path):
-    text = path.read_text()
-    for end in range(0, len(text) - 2, max(1, len(text) // 60)):
-        path.write_text(text[:end])
-        with pytest.raises(BaselineError):
-            load_baseline(path)
-
-
-def test_a_file_that_is_not_there_is_reported(tmp_path):
-    with pytest.raises(BaselineError, match="is missing; make the baseline with vislam baseline"):
-        load_baseline(tmp_path / "missing.json")
-
-
-def test_other_releases_are_refused_with_the_way_out(baseline):
-    check_releases(baseline, "here.json")
-    with pytest.raises(BaselineError, match=r"gtsam 4\.2\.0, here .*--allow-other-releases") as raised:
-        check_releases(replace(baseline, releases=installed_releases() | {"gtsam": "4.2.0"}), "here.json")
-    assert raised.value.exit_status == 3
 
 
 @pytest.mark.parametrize(("release", "same"), [("1.2.3", True), ("1.2.9", True), ("1.3.3", False), ("2.2.3", False)])
