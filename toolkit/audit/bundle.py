@@ -215,7 +215,7 @@ POSE, COMMON = 6, 21
 # the change of the delay from the first half of the recording to the second (s); the biases of gyro and accelerometer,
 # or with odometry of the gyro and the rotation of the velocities (rad); the shift of the columns of the right image
 # (px); the roll of the right camera about the optical axis (rad).
-FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE, CHANGE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11, 12
+BASELINE, TURN, LEVER, LATE, CHANGE = 4, slice(5, 8), slice(8, 11), 11, 12
 GYRO_BIAS, _BIASES, RIGHT_SHIFT, RIGHT_ROLL = slice(13, 16), slice(13, 19), 19, 20
 # Those on which sightings depend.
 _OF_CAMERA = np.r_[:13, RIGHT_SHIFT, RIGHT_ROLL]

@@ -11,7 +11,7 @@ and spatial calibration for multi-sensor systems" (2013), section III, reduced t
 """
 
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -212,23 +212,6 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
     return TruthClock(offset, rate, 0.5 * sequence.duration_s)
 
 
-def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar | None:
-    """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
-
-    ``as_gyro`` is the recording with the truth's rates of rotation in place of its motion samples, ``offset_s`` an
-    approximation of the delay (s) of the middle frame by the truth's clock. The standard error is that of a jackknife
-    over stretches of the recording.
-    """
-    try:
-        fitted = _Clocks.of(as_gyro, seen).fitted(offset_s)
-        if fitted is None:
-            return None
-        found, at = fitted
-        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
-    except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
-        return None
-
-
 class _Linearised(NamedTuple):
     """The camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate (m, 3, 2)."""
 
@@ -236,76 +219,58 @@ class _Linearised(NamedTuple):
     jacobian: Array
 
 
-class _Clocks(NamedTuple):
-    """The integral of the truth's rates, stamps of the frames (K,), and the camera's rates (M, 3) over M intervals.
+def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar | None:
+    """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
 
-    ``since_s`` (K,) is the time since the middle of the frames.
+    ``as_gyro`` is the recording with the truth's rates of rotation in place of its motion samples, ``offset_s`` an
+    approximation of the delay (s) of the middle frame by the truth's clock. The rate must lower the residuals of the
+    offset alone where it shifts the ends by a step or more; with a smaller shift, other turns cannot fit by chance.
     """
-
-    truth: Integral
-    frames_t_ns: IntArray
-    since_s: Array
-    interval: IntArray
-    w_imu_radps: Array
-
-    @classmethod
-    def of(cls, as_gyro: Sequence, seen: Intervals) -> Self:
-        motion, t_ns = as_gyro.motion, as_gyro.frames_t_ns
-        since_s = (t_ns - t_ns[0]) / NS_PER_S
-        truth = Integral.of(motion.t_ns, motion.values[:, 3:])
-        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], seen.interval, seen.w_seen_radps)
-
-    @property
-    def step_s(self) -> float:
-        return float(np.median(np.diff(self.since_s)))
-
-    def rates(self, shift_s: Array) -> Array:
-        """Return the truth's mean rates (M, 3) over the intervals, whose frames are shifted (K,)."""
-        return self.truth.means(self.frames_t_ns + np.rint(shift_s * NS_PER_S).astype(np.int64))[self.interval]
-
-    def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
-        """Return the equations of the rows that the truth covers; None where these are too few.
-
-        A fast clock lowers all rates of rotation, as a wrong focal length does, so this effect is not used for the
-        rate.
-        """
-        shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
-        at_ns = self.frames_t_ns + shift_s * NS_PER_S
-        inside = (at_ns[self.interval] >= self.truth.t_ns[0]) & (at_ns[self.interval + 1] <= self.truth.t_ns[-1])
-        used = rows[inside[rows]]
-        if used.size < LEAST_INTERVALS:
-            return None
-        slope = (self.rates(shift_s + apart_s) - self.rates(shift_s - apart_s))[used] / (2.0 * apart_s)
-        middle_s = 0.5 * (self.since_s[:-1] + self.since_s[1:])[self.interval[used]]
-        unexplained = self.w_imu_radps[used] - (1.0 + found[1]) * self.rates(shift_s)[used]
-        return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
-
-    def fitted(self, offset_s: float) -> tuple[Array, "_Linearised"] | None:
-        """Return offset and rate (2,) and the equations at them; None where they do not fit the camera's rotation."""
-        found, count, at = np.array([offset_s, 0.0]), self.interval.size, None
+    found, count, at = np.array([offset_s, 0.0]), seen.interval.size, None
+    try:
         for share, steps in zip(SHARES, STEPS, strict=True):
             aside = min(round(0.5 * (1.0 - share) * count), max(count - FEWEST, 0) // 2)
-            rows = np.arange(aside, count - aside)
             for _ in range(steps):
-                at = self.linearised(found, rows)
+                at = _linearised(as_gyro, seen, found, np.arange(aside, count - aside))
                 if at is None:
                     return None
                 found = found + _solved(*at)
                 found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
-        is_one = at is not None and abs(found[1]) < MOST_RATE and self.fits(found, offset_s)
-        return (found, at) if at is not None and is_one else None
+        if at is None or abs(found[1]) >= MOST_RATE:
+            return None
+        step_s = float(np.median(np.diff(as_gyro.frames_t_ns))) / NS_PER_S
+        if abs(found[1]) * 0.5 * as_gyro.duration_s >= step_s:
+            both = [_linearised(as_gyro, seen, one, np.arange(count)) for one in (found, np.array([offset_s, 0.0]))]
+            left, without = (np.inf if one is None else float(np.sum(spread(one.unexplained) ** 2)) for one in both)
+            if not left < MOST_UNEXPLAINED * without:
+                return None
+        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
+    except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
+        return None
 
-    def fits(self, found: Array, offset_s: float) -> bool:
-        """Say whether the rate lowers the residuals of the offset alone, where it shifts the ends by a step or more.
 
-        With a smaller shift, other turns cannot fit by chance, and the result is True.
-        """
-        if abs(found[1]) * self.since_s[-1] < self.step_s:
-            return True
-        rows = np.arange(self.interval.size)
-        both = [self.linearised(one, rows) for one in (found, np.array([offset_s, 0.0]))]
-        with_rate, without = (np.inf if at is None else float(np.sum(spread(at.unexplained) ** 2)) for at in both)
-        return with_rate < MOST_UNEXPLAINED * without
+def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray) -> _Linearised | None:
+    """Return the equations of the rows that the truth covers; None where these are too few.
+
+    A fast clock lowers all rates of rotation, as a wrong focal length does, so this effect is not used for the rate.
+    """
+    t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion.t_ns, as_gyro.motion.values[:, 3:])
+    since_s = (t_ns - t_ns[0]) / NS_PER_S
+    since_s = since_s - 0.5 * since_s[-1]
+    shift_s, apart_s = found[0] + found[1] * since_s, SLOPE_STEP * float(np.median(np.diff(since_s)))
+    at_ns = t_ns + shift_s * NS_PER_S
+    inside = (at_ns[seen.interval] >= truth.t_ns[0]) & (at_ns[seen.interval + 1] <= truth.t_ns[-1])
+    used = rows[inside[rows]]
+    if used.size < LEAST_INTERVALS:
+        return None
+    before, now, after = (
+        truth.means(t_ns + np.rint(at_s * NS_PER_S).astype(np.int64))[seen.interval[used]]
+        for at_s in (shift_s - apart_s, shift_s, shift_s + apart_s)
+    )
+    slope = (after - before) / (2.0 * apart_s)
+    middle_s = 0.5 * (since_s[:-1] + since_s[1:])[seen.interval[used]]
+    unexplained = seen.w_seen_radps[used] - (1.0 + found[1]) * now
+    return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
 
 
 def _solved(unexplained: Array, jacobian: Array) -> Array:

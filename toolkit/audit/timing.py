@@ -667,34 +667,46 @@ def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided
     the clock), nor where the velocities of the twists then fit worse: the rates of rotation alone are late.
     """
     sequence = evidence.sequence
+    at_frames, is_twist = is_stamped_at_frames(sequence), isinstance(sequence.motion, TwistSamples)
     found = _refined(camera_offset(sequence, intervals), evidence)
     if found is None:
         return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
     expected_s, least_s = _expected(sequence)
-    offset_s = found.value - expected_s
-    beyond_s = found.value if is_stamped_at_frames(sequence) else offset_s
-    surely_s = _largest_error_s(sequence) * (1.0 if is_stamped_at_frames(sequence) else LARGEST_BEYOND)
+    offset_s, largest_s = found.value - expected_s, LARGEST_TWIST_ERROR_S if is_twist else LARGEST_ERROR_S
+    beyond_s = found.value if at_frames else offset_s
+    surely_s = largest_s * (1.0 if at_frames else LARGEST_BEYOND)
     if abs(beyond_s) < max(least_s, OFFSET_SIGMAS * found.error) or found.error > surely_s:
-        return _as_often(sequence, Scalar(offset_s, found.error)) or _unknown(sequence, found)
-    late = "late" if offset_s < 0.0 else "early"
+        return _as_often(sequence, Scalar(offset_s, found.error)) or _unseen_offset(found, largest_s, is_twist)
     seen = (
         f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
         f"{1e3 * found.error:.1f} ms"
     )
-    detail = f"{seen}: frames are stamped {late}"
+    detail = f"{seen}: frames are stamped {'late' if offset_s < 0.0 else 'early'}"
     change = change_of_offset(sequence, intervals)
     if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
-        return _changing(detail, change)
+        parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms more in the second half than in the first"
+        why = "a clock drifts or was set: stamp both by one clock, or cut the recording there"
+        return Symptom.warning(1, f"{detail}, but by {parted}", why)
     remedy = _shifted(sequence, offset_s)
     if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
-        return Symptom.warning(
-            count=1,
-            detail=(
-                f"{seen}, but then the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
-            ),
-            treatment="stamp rates of rotation and velocities by one clock, the camera's",
-        )
+        fit_worse = f"the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
+        why = "stamp rates of rotation and velocities by one clock, the camera's"
+        return Symptom.warning(1, f"{seen}, but then {fit_worse}", why)
     return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
+
+
+def _unseen_offset(found: Scalar, largest_s: float, is_twist: bool) -> Undecided | None:
+    """Return an offset that is known badly or, with an IMU, beyond chance and below the limit of a finding."""
+    if found.error > largest_s:
+        known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
+        return Undecided(f"too little change of rotation: {known}")
+    if is_twist or abs(found.value) < max(LEAST_OFFSET_S, DOUBTFUL_SIGMAS * found.error):
+        return None
+    late = "late" if found.value < 0.0 else "early"
+    seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
+    return Undecided(
+        f"frames look as if stamped {late} by {seen}, too little change of rotation to distinguish that from chance"
+    )
 
 
 def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) -> float:
@@ -711,16 +723,6 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
     return mean_in_sigmas(costs[1] - costs[0])
 
 
-def _changing(detail: str, change: Scalar) -> Symptom:
-    """Report an offset that differs between the halves, so that no constant shift is right."""
-    parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms"
-    return Symptom.warning(
-        count=1,
-        detail=f"{detail}, but by {parted} more in the second half than in the first",
-        treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
-    )
-
-
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
     """Return the self-calibration's offset, unless that of the rotations is large and a self-calibration confirms it.
 
@@ -734,31 +736,6 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
         if shifted.self_calibration is not None:
             return found
     return Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
-
-
-def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
-    """Return the standard error of an offset that is within chance, where it is large."""
-    if found.error <= _largest_error_s(sequence):
-        return _doubtful(sequence, found)
-    known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
-    return Undecided(f"too little change of rotation: {known}")
-
-
-def _doubtful(sequence: Sequence, found: Scalar) -> Undecided | None:
-    """Return, with an IMU, an offset that is beyond chance and below the limit of a finding."""
-    if isinstance(sequence.motion, TwistSamples) or abs(found.value) < max(
-        LEAST_OFFSET_S, DOUBTFUL_SIGMAS * found.error
-    ):
-        return None
-    late = "late" if found.value < 0.0 else "early"
-    seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
-    return Undecided(
-        f"frames look as if stamped {late} by {seen}, too little change of rotation to distinguish that from chance"
-    )
-
-
-def _largest_error_s(sequence: Sequence) -> float:
-    return LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
 
 
 def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
