@@ -16,7 +16,14 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates, Linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
-from filters.kalman.tracks import AcceptedTracks, TrackSightings, Window, WindowTracks, accepted_tracks, load_kernels
+from filters.kalman.tracks import (
+    AcceptedTracks,
+    TrackSightings,
+    WindowPoses,
+    WindowTracks,
+    accepted_tracks,
+    load_kernels,
+)
 from filters.kalman.tracks_in_view import given_tracks_in_view
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
@@ -82,9 +89,9 @@ class Msckf:
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
-    def _window(self) -> Window:
+    def _window(self) -> WindowPoses:
         columns = self._joint.clone_columns
-        return Window(self._joint.clones, self._at.clones(self._joint), self._joint.cov[columns, columns])
+        return WindowPoses(self._joint.clones, self._at.clones(self._joint), self._joint.cov[columns, columns])
 
     def _without_landmarks(self, frame: StereoFrame) -> StereoFrame:
         """Return the frame without the sightings of landmarks in the state."""
@@ -123,7 +130,7 @@ class Msckf:
         first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
         self._update(accepted.H[:, first:], accepted.residuals)
 
-    def _add_landmarks(self, accepted: AcceptedTracks, kept: IntArray, window: Window) -> None:
+    def _add_landmarks(self, accepted: AcceptedTracks, kept: IntArray, window: WindowPoses) -> None:
         """Add accepted tracks (m,) to the state."""
         sightings, points = accepted.sightings.select(kept), accepted.points[kept]
         linearised = joint_landmarks.linearise(sightings, points, window.poses, window.poses_at, self._rig)

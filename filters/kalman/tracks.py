@@ -119,7 +119,7 @@ class WindowTracks:
 _COLUMNS = ((3,), float), ((), bool), ((), float)
 
 
-class Window(NamedTuple):
+class WindowPoses(NamedTuple):
     """The poses (W, 4, 4) of the window, where they are linearised (W, 4, 4), and their covariance (6 W, 6 W)."""
 
     poses: Array
@@ -158,7 +158,7 @@ class AcceptedTracks(NamedTuple):
         return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
 
 
-def accepted_tracks(sightings: TrackSightings, window: Window, rig: StereoRig, gate: FrameGate) -> AcceptedTracks:
+def accepted_tracks(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate) -> AcceptedTracks:
     """Return the tracks that pass, some of them without one of their sightings.
 
     ``gate`` counts every test, so a track that is tested twice counts twice.
@@ -168,7 +168,7 @@ def accepted_tracks(sightings: TrackSightings, window: Window, rig: StereoRig, g
 
 
 def _tested(
-    sightings: TrackSightings, window: Window, rig: StereoRig, gate: FrameGate
+    sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate
 ) -> tuple[AcceptedTracks, TrackSightings]:
     """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, to retest."""
     from filters.kalman import kernels

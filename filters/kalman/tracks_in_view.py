@@ -23,7 +23,7 @@ from filters.kalman.joint import (
     transposed_root_times,
     without_products,
 )
-from filters.kalman.tracks import Window, WindowTracks, camera_for_kernels
+from filters.kalman.tracks import WindowPoses, WindowTracks, camera_for_kernels
 from toolkit.geometry import Array, se3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
@@ -32,7 +32,7 @@ from toolkit.models.state import POSE, Belief
 
 
 def given_tracks_in_view(
-    joint: JointBelief, window: Window, tracks: WindowTracks, rig: StereoRig, gate: FrameGate
+    joint: JointBelief, window: WindowPoses, tracks: WindowTracks, rig: StereoRig, gate: FrameGate
 ) -> Belief:
     """Return the present state given also the tracks that the newest of W poses sees and that have not corrected yet.
 

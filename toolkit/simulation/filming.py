@@ -30,7 +30,7 @@ from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
-from toolkit.simulation.renderer import Eye, Sensor, exposed, light
+from toolkit.simulation.renderer import Eye, SensorNoise, exposed, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
 from toolkit.simulation.sensors import Imu
 from toolkit.simulation.surfaces import Floats, Surfaces, atlas, furnished_hall
@@ -170,7 +170,7 @@ class _Crew:
         self, trajectory: SmoothTrajectory, surfaces: Surfaces, pair: _Pair, filming: Filming, seed: int
     ) -> None:
         self._trajectory, self._surfaces, self._pair, self._seed = trajectory, surfaces, pair, seed
-        self._filming, self._sensor = filming, Sensor()
+        self._filming, self._sensor = filming, SensorNoise()
         atlas()  # before any thread asks for it
         self._eye = Eye.of(pair.camera)
         self._swing_rad = 2.0 * np.pi * float(self._rng(0, 2).uniform())

@@ -178,7 +178,7 @@ def _wrapped(x: Floats, period: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorNoise:
     """Sensor noise: standard deviation in the dark (grey values), and variance for each grey value of light.
 
     The variance grows with the light, as photon noise does.
