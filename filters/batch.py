@@ -30,7 +30,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from filters.kalman.correction import KnownPoseMapper
+from filters.kalman.landmark_map import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.msckf import Msckf
 from filters.smoothing.elimination_order import cheaper_order

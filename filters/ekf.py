@@ -6,23 +6,23 @@ landmark, but the filter is overconfident: its covariance does not grow with the
 
 import numpy as np
 
-from filters.kalman.correction import (
-    added_noise,
-    carried_pose_cov,
-    correct_landmarks_below,
-    residuals_with_jacobians,
-    updated_by_pose_sightings,
-)
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.landmark_map import LandmarkMap, TrackedMap
+from filters.kalman.landmark_map import (
+    LandmarkMap,
+    TrackedMap,
+    carried,
+    correct_landmarks_below,
+    informed,
+    residuals_with_jacobians,
+)
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.measurements import Packet, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import huber_threshold, huber_weights, mahalanobis_squared
-from toolkit.models.motion import motion_model, predicted
+from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, Belief
 
 CITES = ("kang_vislam",)
@@ -46,14 +46,16 @@ class DecoupledEkf(Filter):
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        self._belief = predicted(self._belief, self._motion, packet.motion)
+        if packet.motion is not None:
+            increment = self._motion.integrate(packet.motion, self._belief.bias)
+            self._belief = self._belief.predicted(increment.predict(self._belief))
         seen, uvs_px = self._map.seen_again(packet.frame)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
             self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate)
-            # The landmarks whose sighting passed, by the corrected pose, which is taken as uncertain and independent.
-            bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
+            # By the corrected pose, as uncertain as it is then and as if it were independent of the landmarks.
             pose_cov = self._belief.cov[POSE, POSE]
+            bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
             seen = correct_landmarks_below(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
@@ -72,22 +74,20 @@ def correct_pose(
 ) -> tuple[Belief, BoolArray]:
     """Return the belief with its pose corrected by sightings (N, 3) px of N landmarks, and which of them passed (N,).
 
-    The landmarks' uncertainty is part of the innovation covariance, as if it were independent of the pose's.
-
-    A sighting outside the gate is left out. The others are weighted by the gate's robust loss of the norm of their
-    residual, whitened by the covariance of sighting and landmark. Gate and loss use the stated noise, the update the
-    rig's weight of tracks.
+    The landmarks' uncertainty is part of the innovation covariance S, as if it were independent of the pose's. A
+    sighting outside the gate is left out; the others are weighted by the robust loss of their residuals, whitened
+    without the pose's own uncertainty, which over seeds is the more accurate. Gate and loss are by the stated noise,
+    the update by the rig's weight of tracks.
     """
     residual_px, H_pose, H_point, depth_m = residuals_with_jacobians(landmarks, uvs_px, belief.T_world_imu, rig)
-    noise_px2 = stereo.noise_px2(uvs_px, rig)
-    own_cov = H_point @ landmarks.covs @ transposed(H_point) + noise_px2
-    nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
-    dof = stereo.degrees_of_freedom(uvs_px)
-    accepted = gate.accepts(nis, dof, depth_m > 0.0)
-    weights = accepted.astype(float)
-    if gate.huber is not None:
-        threshold = gate.huber if isinstance(dof, int) else huber_threshold(dof, gate.huber)
-        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
-    informed = np.linalg.solve(own_cov + added_noise(noise_px2, rig), H_pose)
-    weighted = weights[:, None, None] * informed
-    return updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted
+    noise_px2, dof = stereo.noise_px2(uvs_px, rig), stereo.degrees_of_freedom(uvs_px)
+    landmark_px2 = H_point @ landmarks.covs @ transposed(H_point)
+
+    S = carried(H_pose, belief.cov[POSE, POSE]) + landmark_px2 + noise_px2
+    accepted = gate.accepts(mahalanobis_squared(residual_px, S), dof, depth_m > 0.0)
+    weights = gate.weights(mahalanobis_squared(residual_px, landmark_px2 + noise_px2), dof, accepted)
+
+    # The gain K = P H^T S^-1 of all sightings in information form: sums of 3x3 blocks (see landmark_map).
+    weighted = weights[:, None, None] * np.linalg.solve(landmark_px2 + noise_px2 / rig.track_weight, H_pose)
+    rows = weighted.reshape(-1, 6)
+    return informed(belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)), accepted

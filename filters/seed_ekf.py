@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
-from filters.kalman.landmark_map import LandmarkMap, TrackedMap
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, informed
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
@@ -60,8 +59,8 @@ class SeedEkf(Filter):
         residual_px = stereo.residuals_px(uvs_px, predicted.uv_px)
         H_pose = stereo.seen_rows(uvs_px, predicted.d_uv_d_pose)
         noise_px2 = stereo.noise_px2(uvs_px, self._rig) / self._rig.track_weight
-        weighted = np.asarray(np.linalg.solve(noise_px2, H_pose))
-        self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, weighted)
+        rows = np.asarray(np.linalg.solve(noise_px2, H_pose)).reshape(-1, 6)
+        self._belief = informed(self._belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1))
 
     def landmarks(self) -> Landmarks:
         """Return the last estimate of every landmark of the run."""

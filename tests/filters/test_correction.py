@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from filters.ekf import correct_pose
-from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.landmark_map import LandmarkMap
+from filters.kalman.landmark_map import LandmarkMap, correct_landmarks, informed
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
@@ -66,6 +65,12 @@ def by_the_book(belief: Belief, H_pose: Array, residual: Array, noise: Array) ->
     return gain @ residual, (np.eye(belief.layout.size) - gain @ H) @ belief.cov
 
 
+def information_of(H_pose: Array, residual_px: Array, information: Array) -> tuple[Array, Array]:
+    """Return the sums of ``H^T W H`` and ``H^T W r`` of sightings with information matrices W (N, 3, 3)."""
+    weighted = information @ H_pose
+    return np.einsum("nij,nik->jk", weighted, H_pose), np.einsum("nij,ni->j", weighted, residual_px)
+
+
 def assert_same(updated: Belief, belief: Belief, correction: Array, cov: Array) -> None:
     expected = belief.moved(correction, cov)
     np.testing.assert_allclose(updated.cov, expected.cov, rtol=0.0, atol=RELATIVE * np.abs(cov).max())
@@ -84,9 +89,7 @@ def test_information_form_is_the_reports_update_with_all_measurements_in_one_mat
     for i in range(N):
         noise[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = own_cov[i]
     expected = by_the_book(belief, predicted.d_uv_d_pose.reshape(-1, 6), residual_px.ravel(), noise)
-    updated = updated_by_pose_sightings(
-        belief, residual_px, predicted.d_uv_d_pose, np.linalg.solve(own_cov, predicted.d_uv_d_pose)
-    )
+    updated = informed(belief, *information_of(predicted.d_uv_d_pose, residual_px, np.linalg.inv(own_cov)))
     assert_same(updated, belief, *expected)
 
 
@@ -104,9 +107,7 @@ def test_three_rows_with_half_the_variance_of_v_are_the_reports_four_rows(layout
     residual = (z - predicted.uv_px[:, rows]).ravel()
     expected = by_the_book(belief, predicted.d_uv_d_pose[:, rows].reshape(-1, 6), residual, sigma_px**2 * np.eye(4 * N))
     information = np.broadcast_to(np.linalg.inv(rig.cov_uv_px2), (N, 3, 3))
-    updated = updated_by_pose_sightings(
-        belief, uvs_px - predicted.uv_px, predicted.d_uv_d_pose, information @ predicted.d_uv_d_pose
-    )
+    updated = informed(belief, *information_of(predicted.d_uv_d_pose, uvs_px - predicted.uv_px, information))
     assert_same(updated, belief, *expected)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.models.corrections import Correction, CorrectionTest, correction_test
+from toolkit.models.corrections import Correction, CorrectionTest
 from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE_IMU, simulate
 
@@ -31,7 +31,7 @@ def corrected(belief):
 
 
 def test_a_consistent_correction_has_a_chi_square_length(belief, corrected):
-    found = [correction_test(belief, after) for after in corrected]
+    found = [summed([Correction.of(belief, after)]) for after in corrected]
     assert {test.dof for test in found} == {ROWS}
     # The mean of so many chi-square variables is within four of its standard errors.
     assert abs(np.mean([test.nis for test in found]) - ROWS) < 4.0 * np.sqrt(2.0 * ROWS / COUNT)
@@ -64,7 +64,7 @@ def test_a_sum_shows_what_leans_one_way_and_no_single_correction_shows(belief, c
 
 
 def test_what_nothing_corrected_is_not_tested(belief):
-    assert correction_test(belief, belief) == CorrectionTest(0.0, 0)
+    assert Correction.of(belief, belief).test(np.sqrt(np.diag(belief.cov))) == CorrectionTest(0.0, 0)
 
 
 def test_what_was_added_elsewhere_hides_as_much_that_is_taken_away(belief):

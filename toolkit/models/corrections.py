@@ -58,11 +58,6 @@ class Correction:
         return CorrectionTest(float((length**2 / shares[observed]).sum()), int(observed.sum()))
 
 
-def correction_test(before: Belief, after: Belief) -> CorrectionTest:
-    """Test the correction of a belief by measurements against the reduction of its covariance."""
-    return Correction.of(before, after).test(np.sqrt(np.diag(before.cov)))
-
-
 def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
     """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
     d = model.layout.size
