@@ -9,9 +9,11 @@ import pytest
 from filters import batch
 from filters.batch import worth_smoothing
 from filters.smoothing.levenberg_marquardt import Solution, solve
+from toolkit import runner
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import StereoFrame
+from toolkit.registry import find
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -84,3 +86,25 @@ def test_only_known_landmarks_seen_twice_and_near_once_are_smoothed():
     np.testing.assert_array_equal(worth_smoothing(frames, known), [1, 4])
     fewer = Landmarks(np.array([2, 4]), np.zeros((2, 3)))
     np.testing.assert_array_equal(worth_smoothing(frames, fewer), [4])
+
+
+class Recorded:
+    """Keeps every report."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, int, str]] = []
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        self.calls.append((done, total, stage))
+
+
+@pytest.mark.parametrize(("name", "stages"), [("batch", 3), ("isam2", 1)])
+def test_every_iteration_of_the_last_solves_is_reported(name, stages):
+    sequence, progress = simulate(replace(DRIVE, duration_s=2.0), 0), Recorded()
+    runner.run(name, find(name).load(), sequence, sequence.prior, progress)
+    solving = [call for call in progress.calls if call[2]]
+    assert len({stage for _, _, stage in solving}) == stages
+    for stage in {stage for _, _, stage in solving}:
+        done = [k for k, _, of in solving if of == stage]
+        assert done == list(range(len(done)))
+        assert all(k < total for k, total, of in solving if of == stage)

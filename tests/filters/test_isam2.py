@@ -367,13 +367,6 @@ def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
     assert np.isfinite(run.causal.cov).all()
 
 
-def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recording_with_a_fleck, run_estimator):
-    """It ended as failed, with sightings of a landmark that the tree no longer had."""
-    run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 2, 30.0))
-    assert run.status == "ok", run.log
-    assert any("indeterminate and was dropped" in line for line in run.log)
-
-
 def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew():
     """Their depths grow without end. One of which nothing was left but its value could not begin anew: it failed."""
     sequence = moving_vehicles(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)

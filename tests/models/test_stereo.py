@@ -5,6 +5,7 @@ the prediction, as ours are, and only the residual changes its sign.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import gtsam
@@ -13,7 +14,7 @@ import pytest
 
 from toolkit.answers import Run
 from toolkit.datasets import load_sequence
-from toolkit.geometry import Array, se3_exp
+from toolkit.geometry import Array, se3_exp, transform
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
@@ -48,13 +49,6 @@ def in_world(points_cam: Array, pose: Array, rig: StereoRig) -> Array:
 
 
 @every_rig
-def test_projection_jacobian_is_the_derivative(rig, points_cam, numerical_jacobian):
-    numerical = numerical_jacobian(lambda d: stereo.project(points_cam + d, rig), 3)
-    # 1e-7 of entries up to 350 px / m: the points are 2 m away at least, where the step's own error is 1e-9.
-    np.testing.assert_allclose(stereo.projection_jacobian(points_cam, rig), numerical, atol=1e-7 * 350.0)
-
-
-@every_rig
 def test_pose_jacobian_is_the_derivative_on_the_right(rig, pose, points_cam, numerical_jacobian):
     points = in_world(points_cam, pose, rig)
     predicted = stereo.predict(points, pose, rig)
@@ -68,18 +62,6 @@ def test_point_jacobian_is_the_derivative(rig, pose, points_cam, numerical_jacob
     numerical = numerical_jacobian(lambda d: stereo.predict(points + d, pose, rig).uv_px, 3)
     predicted = stereo.predict(points, pose, rig)
     np.testing.assert_allclose(predicted.d_uv_d_point, numerical, atol=1e-7 * np.abs(numerical).max())
-
-
-@every_rig
-def test_many_poses_at_once_give_what_each_gives_alone(rig, pose, points_cam):
-    points = in_world(points_cam, pose, rig)
-    poses = pose @ se3_exp(0.01 * np.random.default_rng(2).standard_normal((len(points), 6)))
-    together = stereo.predict(points, poses, rig)
-    for i in range(len(points)):
-        alone = stereo.predict(points[i : i + 1], poses[i], rig)
-        for one, all_ in zip(alone, together, strict=True):
-            # The same products in another order: a few units in the last place of numbers up to 1e4.
-            np.testing.assert_allclose(one[0], all_[i], rtol=1e-11, atol=1e-10)
 
 
 @every_rig
@@ -172,3 +154,78 @@ def test_model_equals_gtsams_factor_on_every_sighting_of_kitti00(run_estimator: 
     sequence = load_sequence("kitti00")
     run = run_estimator("dead-reckoning", sequence, start_from_measurements(sequence))
     assert_equal_on_every_sighting(sequence, run)
+
+
+# Correlated, with a v that errs like uL: where v is the mean of two rows the left one alone errs more.
+COV_PX2 = np.array([[1.0, 0.4, 0.1], [0.4, 1.2, 0.2], [0.1, 0.2, 1.0]])
+LEFT_RIG = replace(DRIVE.rig, cov_uv_px2=COV_PX2)
+BY_LEFT = np.array([True, False, True, False])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Return a pose, points in the world, and their images half a pixel off, half of them by the left image alone."""
+    rng = np.random.default_rng(3)
+    pose = se3_exp(0.2 * rng.standard_normal(6))
+    points = transform(pose @ LEFT_RIG.T_imu_cam, np.column_stack([rng.uniform(-2, 2, (4, 2)), rng.uniform(4, 9, 4)]))
+    uvs_px = stereo.predict(points, pose, LEFT_RIG).uv_px + 0.5 * rng.standard_normal((4, 3))
+    uvs_px[BY_LEFT, 1] = np.nan
+    return pose, points, uvs_px
+
+
+def test_it_is_the_limit_of_a_right_image_without_any_precision(scene):
+    """Information and score of a pose by a uR of a variance of 1e10 px^2, to the 1e-10 that it still says."""
+    pose, points, uvs_px = scene
+    seen = stereo.predict(points, pose, LEFT_RIG)
+    whitener = stereo.whitener(uvs_px, LEFT_RIG)
+    H = whitener @ seen.d_uv_d_pose
+    residuals = stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)
+    for i in np.flatnonzero(BY_LEFT):
+        cov_px2 = np.array([[1.0, 0.0, 0.1], [0.0, 1e10, 0.0], [0.1, 0.0, 1.0]])
+        precision = np.linalg.inv(cov_px2)
+        off_px = np.nan_to_num(uvs_px[i] - seen.uv_px[i], nan=7.0)
+        of_pose = seen.d_uv_d_pose[i]
+        np.testing.assert_allclose(H[i].T @ H[i], of_pose.T @ precision @ of_pose, rtol=1e-7)
+        np.testing.assert_allclose(H[i].T @ residuals[i], of_pose.T @ precision @ off_px, rtol=1e-6)
+
+
+def test_unwhitened_its_rows_and_noise_say_the_same(scene):
+    pose, points, uvs_px = scene
+    seen = stereo.predict(points, pose, LEFT_RIG)
+    H, residuals = stereo.seen_rows(uvs_px, seen.d_uv_d_pose), stereo.residuals_px(uvs_px, seen.uv_px)
+    precision = np.linalg.inv(stereo.noise_px2(uvs_px, LEFT_RIG))
+    whitened = stereo.whitener(uvs_px, LEFT_RIG) @ seen.d_uv_d_pose
+    np.testing.assert_allclose(np.swapaxes(H, 1, 2) @ precision @ H, np.swapaxes(whitened, 1, 2) @ whitened, rtol=1e-9)
+    of_residuals = np.square(stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)).sum(axis=1)
+    np.testing.assert_allclose(np.einsum("ni,nij,nj->n", residuals, precision, residuals), of_residuals, rtol=1e-9)
+    np.testing.assert_array_equal(stereo.degrees_of_freedom(uvs_px), [2, 3, 2, 3])
+
+
+def test_smoothers_have_gtsam_factors_of_the_left_camera_for_it(scene, numerical_jacobian):
+    pose, points, uvs_px = scene
+    frame = StereoFrame(0, np.arange(4), uvs_px)
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose3(pose))
+    for i, point in enumerate(points):
+        values.insert(L(i), point)
+    seen = stereo.predict(points, pose, LEFT_RIG)
+    residuals = stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)
+    for i, factor in enumerate(StereoFactors(LEFT_RIG).of(frame, 0)):
+        assert factor.dim() == 3 - BY_LEFT[i]
+        assert factor.error(values) == pytest.approx(0.5 * residuals[i] @ residuals[i], rel=1e-9)
+        H_gtsam, _ = factor.linearize(values).jacobian()
+        H = np.concatenate([seen.d_uv_d_pose[i], seen.d_uv_d_point[i]], axis=1)
+        H = stereo.whitener(uvs_px, LEFT_RIG)[i] @ H
+        np.testing.assert_allclose(H_gtsam.T @ H_gtsam, H.T @ H, atol=1e-9 * np.abs(H.T @ H).max())
+
+    def residuals_at(xi):
+        return stereo.whitened_residuals(uvs_px, stereo.predict(points, pose @ se3_exp(xi), LEFT_RIG).uv_px, LEFT_RIG)
+
+    numerical = -numerical_jacobian(residuals_at, 6)
+    H = stereo.whitener(uvs_px, LEFT_RIG) @ seen.d_uv_d_pose
+    np.testing.assert_allclose(H, numerical, atol=1e-7 * np.abs(H).max())
+
+
+def test_where_v_is_the_mean_of_two_rows_the_left_row_errs_as_the_left_column_does():
+    cov_px2 = stereo.left_cov_px2(replace(LEFT_RIG, cov_uv_px2=np.diag([1.0, 1.0, 0.5])))
+    np.testing.assert_array_equal(cov_px2, np.eye(2))
