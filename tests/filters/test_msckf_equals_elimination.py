@@ -16,8 +16,7 @@ from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
-from filters.kalman.tracks import AcceptedTracks, WindowTracks, accepted_tracks
-from filters.kalman.tracks import Window as WindowPoses
+from filters.kalman.tracks import AcceptedTracks, WindowPoses, WindowTracks, accepted_tracks
 from filters.msckf import Msckf
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X

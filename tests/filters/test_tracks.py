@@ -17,7 +17,7 @@ from filters.kalman import kernels
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, propagate
-from filters.kalman.tracks import TrackSightings, Window, WindowTracks, accepted_tracks, camera_for_kernels
+from filters.kalman.tracks import TrackSightings, WindowPoses, WindowTracks, accepted_tracks, camera_for_kernels
 from filters.kalman.tracks_in_view import given_tracks_in_view
 from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import StereoRig
@@ -101,7 +101,7 @@ def flight(window_of_clones):
 
 def window_of(joint):
     columns = joint.clone_columns
-    return Window(joint.clones, AtFirstEstimates().clones(joint), joint.cov[columns, columns])
+    return WindowPoses(joint.clones, AtFirstEstimates().clones(joint), joint.cov[columns, columns])
 
 
 def sightings_in(rig, window, left_only=0.0) -> TrackSightings:
@@ -168,7 +168,11 @@ def exact_tracks(seed: int, width: int = 6):
     uvs_px = np.stack([stereo.predict(points, pose, RIG).uv_px for pose in poses], axis=1)
     seen = rng.uniform(size=(TRACKS, width)) < 0.6
     seen[:, :2] = True
-    return points, TrackSightings(np.arange(TRACKS), uvs_px, seen), Window(poses, poses, np.zeros((6 * width,) * 2))
+    return (
+        points,
+        TrackSightings(np.arange(TRACKS), uvs_px, seen),
+        WindowPoses(poses, poses, np.zeros((6 * width,) * 2)),
+    )
 
 
 def test_exact_sightings_give_the_points_where_one_right_image_or_the_rays_determine_them():
@@ -195,7 +199,7 @@ def test_what_determines_no_point_is_not_relied_on():
     assert found_of(sightings._replace(uvs_px=flat), window, RIG)[1].tolist() == [False] + [True] * (TRACKS - 1)
     behind = window.poses.copy()
     behind[1, :3, :3] = so3_exp(np.array([0.0, np.pi, 0.0]))
-    assert not found_of(sightings, Window(behind, behind, window.cov), RIG)[1].any()
+    assert not found_of(sightings, WindowPoses(behind, behind, window.cov), RIG)[1].any()
 
 
 # The gate's policy.
