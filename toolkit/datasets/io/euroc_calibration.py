@@ -117,9 +117,9 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
     stated = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
-    sides = _Sides(left, right, T_imu_left, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
-    noise, noise_source = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
-    return _calibration(sides, noise, "the folder's sensor.yaml files", noise_source)
+    _check_right(right.path, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
+    noise = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
+    return _calibration(left, right, (T_imu_left, T_left_right), noise, "the folder's sensor.yaml files")
 
 
 def _of_kalibr(chain: Path, root: Path, mav0: Path) -> AslCalibration:
@@ -134,9 +134,9 @@ def _of_kalibr(chain: Path, root: Path, mav0: Path) -> AslCalibration:
     noise = _stated_noise(
         read_fields(mav0 / "imu0/sensor.yaml" if imu is None else imu), "" if imu is None else "imu0."
     )
-    source = str(chain.relative_to(root))
-    sides = _Sides(left, right, T_imu_left, se3_inverse(T_right_left))
-    return _calibration(sides, noise, source, _AS_STATED)
+    T_left_right = se3_inverse(T_right_left)
+    _check_right(chain, T_left_right, None)
+    return _calibration(left, right, (T_imu_left, T_left_right), (noise, _AS_STATED), str(chain.relative_to(root)))
 
 
 def _check_camchain(fields: Fields) -> None:
@@ -172,17 +172,6 @@ def _stated_noise(imu: Fields, prefix: str = "") -> ImuNoise:
     return ImuNoise(**{ours: imu.positive(nested + theirs) for ours, theirs in _DENSITIES.items()})
 
 
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """What a calibration says of both cameras, and of sensor.yaml files where cam1 is if they say the inverse."""
-
-    left: Fields
-    right: Fields
-    T_imu_left: Array
-    T_left_right: Array
-    T_left_right_inverted: Array | None = None
-
-
 def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> None:
     """Raise DataError where cam1 is not to the right of cam0.
 
@@ -205,17 +194,18 @@ def _is_right(T_left_right: Array) -> bool:
     return bool(x > max(abs(y), abs(z)))
 
 
-def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> AslCalibration:
-    left, right, T_left_right = sides.left, sides.right, sides.T_left_right
-    _check_right(right.path, T_left_right, sides.T_left_right_inverted)
-    fx_px, fy_px, cx_px, cy_px = _pinhole_of(left)
+def _calibration(
+    left: Fields, right: Fields, mounted: tuple[Array, Array], noise: tuple[ImuNoise, str], source: str
+) -> AslCalibration:
+    """Return what files say of both cameras; ``mounted`` is T_imu_left and T_left_right, ``noise`` has its source."""
+    T_imu_left, T_left_right = mounted
     width_px, height_px = left.constant("resolution", 2)
-    rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
+    rig = _simulated_rig(_pinhole_of(left), float(np.linalg.norm(T_left_right[:3, 3])), T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
     cameras = (_camera_of(left), _camera_of(right)) if whole else None
     return AslCalibration(
-        *(rig, (int(width_px), int(height_px)), noise, f"calibration from {source}", noise_source),
-        T_imu_left=sides.T_imu_left,
+        *(rig, (int(width_px), int(height_px)), noise[0], f"calibration from {source}", noise[1]),
+        T_imu_left=T_imu_left,
         T_right_left=se3_inverse(T_left_right),
         cameras=cameras,
     )
