@@ -23,7 +23,7 @@ from toolkit.datasets.io.fields import (
     rectified_observations,
     stamps_ns,
 )
-from toolkit.datasets.io.image_pairs import pinhole_of, seen_in
+from toolkit.datasets.io.image_pairs import seen_in
 from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
@@ -148,7 +148,9 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
 def _rig(parts: _Parts) -> StereoRig:
     left = camera_matrix(parts.path, "K_l", parts.fields.constant("K_l", 3, 3))
     T_imu_cam = se3_inverse(parts.fields.rigid("extL_T_imu"))
-    return StereoRig(*pinhole_of(left), _baseline_m(parts.fields), T_imu_cam, pixel_covariance(2))
+    return StereoRig(
+        left[0, 0], left[1, 1], left[0, 2], left[1, 2], _baseline_m(parts.fields), T_imu_cam, pixel_covariance(2)
+    )
 
 
 def _baseline_m(fields: Fields) -> float:
@@ -232,7 +234,7 @@ def _check_image(path: Path, key: str, image: Any) -> None:
 def _pair(parts: _Parts, size_px: tuple[int, int]) -> RectifiedPair:
     """Return the cameras as a rectified pair; where they differ in K alone, the images are made alike."""
     matrices = [camera_matrix(parts.path, key, parts.fields.constant(key, 3, 3)) for key in ("K_l", "K_r")]
-    left, right = (Camera(pinhole_of(K), "none", np.zeros(4), size_px) for K in matrices)
+    left, right = (Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), "none", np.zeros(4), size_px) for K in matrices)
     baseline_m = _baseline_m(parts.fields)
     if np.array_equal(matrices[0], matrices[1]):
         return already_rectified(left.pinhole_px, baseline_m, size_px)

@@ -109,7 +109,7 @@ def _calibration(path: Path) -> Fields:
         raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a JSON {type(content).__name__}, expected an object; export it again")
-    fields = Fields(path, dict(flattened(content)))
+    fields = Fields(path, dict(flattened(content)))  # without what is no number and no list of them
     fields.require(*_REQUIRED)
     return fields
 

@@ -271,7 +271,8 @@ def _distortion(fields: Fields) -> tuple[Distortion, Array]:
     given = next((key for key in _COEFFICIENTS.split("|") if key in fields), None)
     if given is None and name != "none" and name in _LENSES:
         fields.require(_COEFFICIENTS)
-    return lens_of(str(fields.path), name, np.zeros(0) if given is None else fields.vector(given))
+    what = str(fields.path) if given is None else f"{fields.path}: {given}"
+    return lens_of(what, name, np.zeros(0) if given is None else fields.vector(given))
 
 
 def lens_of(what: str, name: str, coefficients: Array) -> tuple[Distortion, Array]:
@@ -285,7 +286,5 @@ def lens_of(what: str, name: str, coefficients: Array) -> tuple[Distortion, Arra
     count = next((n for n in counts if np.trim_zeros(coefficients, "b").size <= n <= coefficients.size), None)
     if count is None or not np.isfinite(coefficients).all():
         wanted = " or ".join(map(str, counts))
-        raise DataError(
-            f"{what}: distortion has {coefficients.size} coefficients, expected {wanted} finite ones of {name}"
-        )
+        raise DataError(f"{what}: has {coefficients.size} values of a lens, expected {wanted} finite ones of {name}")
     return model, coefficients[:count]
