@@ -63,10 +63,7 @@ def checked(baseline: Baseline, now: list[Measured], *, speed: bool = True, acce
     """Judge measurements that were never made against a baseline."""
     every, terms = CaseVerdicts(), CheckTerms(speed, accept_better)
     for (case, before), after in zip(baseline.cases, now, strict=True):
-        one = check_case(case, before, after, baseline.bounds, terms)
-        every.verdicts += one.verdicts
-        every.tests += one.tests
-        every.notes += one.notes
+        every.add(check_case(case, before, after, baseline.bounds, terms))
     return check_all(every, baseline, "made-up.json", 1.0, terms)
 
 

@@ -109,7 +109,7 @@ def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path):
     assert (speed.estimator, speed.metric, speed.finding) == ("dead-reckoning", "speed", "better")
     assert -85.0 < speed.change_percent < -60.0
     assert "processor time of" in speed.words
-    assert speeds.notes == ()
+    assert speeds.notes == []
 
 
 class Side:

@@ -50,7 +50,7 @@ class Newcomer:
     def finish(self):
         return Finished(Trajectory.of(self.answers), Landmarks.none())
 '''
-FINITE, ROTATIONS, STAMPS, CAUSAL, SAME, LATER, UNTOUCHED = (name for name, _, _ in verification._OF_A_RUN)
+FINITE, ROTATIONS, STAMPS, CAUSAL, SAME, LATER, UNTOUCHED = verification._OF_A_RUN
 COVARIANCES, HONEST, RUNS = verification._COVARIANCE, verification._NEES, "it runs to the end"
 # Lines planted: the promise that each breaks, and what is told of that.
 PLANTS = (

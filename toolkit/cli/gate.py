@@ -264,7 +264,8 @@ def _check_of_estimators(options: argparse.Namespace) -> Check:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline import check_releases, load_baseline
-    from toolkit.gate.checking import How, check
+    from toolkit.gate.case_check import CheckTerms
+    from toolkit.gate.checking import check
 
     if options.speed_against and options.skip_speed:
         raise UsageError("--speed-against and --skip-speed exclude each other")
@@ -273,13 +274,9 @@ def _check_of_estimators(options: argparse.Namespace) -> Check:
     baseline = load_baseline(options.baseline)
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
-    how = How(
-        options.workers or usable_cpus(),
-        speed=not options.skip_speed,
-        accept_better=options.accept_better,
-        speed_against=options.speed_against,
-    )
-    return check(baseline, str(options.baseline), how, of_this_process())
+    terms = CheckTerms(not options.skip_speed, options.accept_better)
+    workers = options.workers or usable_cpus()
+    return check(baseline, str(options.baseline), workers, of_this_process(), terms, options.speed_against)
 
 
 def _check_of_trajectories(options: argparse.Namespace) -> Check:

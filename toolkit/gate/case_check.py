@@ -52,6 +52,12 @@ class CaseVerdicts:
     tests: list[Pairs] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def add(self, other: "CaseVerdicts") -> None:
+        """Append those of another case."""
+        self.verdicts += other.verdicts
+        self.tests += other.tests
+        self.notes += other.notes
+
 
 def check_case(
     case: Case, before: Measured, now: Measured, bounds: BoundsRecord, terms: CheckTerms = USUAL_TERMS

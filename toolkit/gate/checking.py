@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
@@ -14,26 +14,6 @@ from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import check_options, find_all
 from toolkit.settings import DEFAULTS, Settings
-
-
-@dataclass(frozen=True)
-class How:
-    """How to run a check: number of processes, whether time is checked, settings, and what passes.
-
-    ``accept_better`` lets what moved pass unless it is worse; ``speed_against`` names another version of the code, a
-    git revision or a wheel, to take turns with for speed.
-    """
-
-    workers: int
-    speed: bool = True
-    settings: Settings = DEFAULTS
-    accept_better: bool = False
-    speed_against: str | None = None
-
-    @property
-    def terms(self) -> CheckTerms:
-        """The terms on which each case is checked; speed checked in turns with other code is not checked twice."""
-        return CheckTerms(self.speed and self.speed_against is None, self.accept_better)
 
 
 def new_baseline(
@@ -53,29 +33,33 @@ def new_baseline(
         for entry in find_all(case.estimators).values():
             entry.check_usable(settings)
         prepare(recordings_of(case, settings)[0])
-    how = How(workers, settings=settings)
-    measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), how, progress_for)) for case in cases)
+    measured = tuple(
+        (case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), settings, workers, progress_for)) for case in cases
+    )
     return Baseline(installed_releases(), measured, made_by=made_by, settings=settings)
 
 
-def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
+def check(
+    baseline: Baseline,
+    name: str,
+    workers: int,
+    progress_for: ProgressFor,
+    terms: CheckTerms = USUAL_TERMS,
+    speed_against: str | None = None,
+) -> Check:
     """Measure again what a baseline lists, and compare. Whatever is missing is a verdict, not an error.
 
-    Raises BaselineError where another version of the code is asked for and cannot be found or timed.
+    ``speed_against`` names another version of the code, a git revision or a wheel, to take turns with for speed, which
+    is then not checked by the terms. Raises BaselineError where it cannot be found or timed.
     """
-    began, how = time.monotonic(), replace(how, settings=baseline.settings)
-    collected = CaseVerdicts()
-    if how.speed_against is not None:
-        speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
-        collected.verdicts += speeds.verdicts
-        collected.notes += speeds.notes
+    began, collected = time.monotonic(), CaseVerdicts()
+    if speed_against is not None:
+        terms = replace(terms, speed=False)
+        collected.add(compare_speed(baseline, speed_against, baseline.false_alarm_rate, progress_for))
     for case, before in baseline.cases:
-        now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
-        one = check_case(case, before, now, baseline.bounds, how.terms)
-        collected.verdicts += one.verdicts
-        collected.tests += one.tests
-        collected.notes += one.notes
-    return check_all(collected, baseline, name, time.monotonic() - began, how.terms)
+        now = _measured(case, metrics_of(case, baseline.bounds), baseline.settings, workers, progress_for)
+        collected.add(check_case(case, before, now, baseline.bounds, terms))
+    return check_all(collected, baseline, name, time.monotonic() - began, terms)
 
 
 def check_all(
@@ -101,7 +85,9 @@ def check_all(
     )
 
 
-def _measured(case: Case, metrics: Sequence[str], how: How, progress_for: ProgressFor) -> Measured:
+def _measured(
+    case: Case, metrics: Sequence[str], settings: Settings, workers: int, progress_for: ProgressFor
+) -> Measured:
     runs = len(case.seeds) * len(case.estimators)
     with progress_for(f"{case.source}: {runs} runs") as progress:
-        return measure(case, metrics, how.settings, how.workers, progress)
+        return measure(case, metrics, settings, workers, progress)

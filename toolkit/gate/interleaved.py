@@ -27,6 +27,7 @@ from scipy.special import ndtri
 from toolkit.errors import printable
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import SPEED, Baseline, BaselineError, Case
+from toolkit.gate.case_check import CaseVerdicts
 from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
@@ -67,21 +68,13 @@ class Turns:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Speeds:
-    """The result of the comparison: a verdict for each estimator and case, and remarks."""
-
-    verdicts: tuple[Verdict, ...]
-    notes: tuple[str, ...]
-
-
-def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
+def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> CaseVerdicts:
     """Judge the time of a baseline's estimators, the installed code's against another version's.
 
     Raises BaselineError where the version cannot be found or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
-    return Speeds((*turns.missing, *check_speeds(turns.timed, version, rate)), turns.notes)
+    return CaseVerdicts([*turns.missing, *check_speeds(turns.timed, version, rate)], notes=list(turns.notes))
 
 
 def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:

@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.answers import COV_SIZES, Run, check_state
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished
-from toolkit.estimator import Build, Estimator, Setup
+from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
@@ -30,6 +30,7 @@ _FALSE_ALARM = 1e-3
 class Watched:
     """One run over a recording: setup, packets, every answer and the result of ``finish``, with copies of each."""
 
+    build: Build
     sequence: Sequence
     setup: Setup
     packets: tuple[Packet, ...]
@@ -60,7 +61,7 @@ def watch(build: Build, sequence: Sequence) -> Watched:
         online.append(answer)
         online_copies.append(copies_of(online[-1]))
     finished = estimator.finish()
-    return Watched(sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)
+    return Watched(build, sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)
 
 
 def declines(build: Build, sequence: Sequence) -> str:
@@ -109,11 +110,11 @@ def copies_of(value: object) -> tuple[Array, ...]:
     return tuple(array.copy() for array in arrays_of(value))
 
 
-def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> str:
+def look_ahead(watched: Watched, counts: tuple[int, ...] = ()) -> str:
     """Say at which frame an answer changes when later packets are withheld."""
     frames = len(watched.online)
     for count in counts or (2, frames // 2):
-        early = answers(build, watched.sequence.truncated(count))
+        early = answers(watched.build, watched.sequence.truncated(count))
         for k, (answer, full) in enumerate(zip(early, watched.online, strict=False)):
             if difference(answer, full):
                 return (
@@ -123,12 +124,12 @@ def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> 
     return ""
 
 
-def other_answers(build: Build, watched: Watched) -> str:
+def other_answers(watched: Watched) -> str:
     """Say at which frame a second run over the same packets gives another answer."""
-    return _other_in_second_run(build(watched.setup), watched.packets, watched)
+    return _other_in_second_run(watched.packets, watched)
 
 
-def other_when_repeated(build: Build, watched: Watched) -> str:
+def other_when_repeated(watched: Watched) -> str:
     """Check both properties above in one run: repeat it with packets of recordings that end early.
 
     The first two packets come from a recording that ends with them, the others of the first half from one that ends
@@ -137,11 +138,12 @@ def other_when_repeated(build: Build, watched: Watched) -> str:
     counts = (2, len(watched.online) // 2, len(watched.online))
     cut = [list(watched.sequence.truncated(count).packets()) for count in counts]
     packets = tuple(packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:])
-    return _other_in_second_run(build(watched.setup), packets, watched)
+    return _other_in_second_run(packets, watched)
 
 
-def _other_in_second_run(estimator: Estimator, packets: tuple[Packet, ...], first: Watched) -> str:
+def _other_in_second_run(packets: tuple[Packet, ...], first: Watched) -> str:
     """Say at which frame an estimator answers differently than before; empty where answers are the same."""
+    estimator = first.build(first.setup)
     for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
             return f"a second run differs at frame {k}: {found}"

@@ -77,12 +77,16 @@ def ends_by_fault(name: str, build: Build) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class CheckedPromise:
-    """One promise: its name, the result of the check, what was found, and what to do where it is broken."""
+    """One promise: its name, the result of the check, and what was found."""
 
     name: str
     result: Result
     found: str = ""
-    remedy: str = ""
+
+    @property
+    def remedy(self) -> str:
+        """Return what to do where it is broken."""
+        return _REMEDIES[self.name] if self.result == "failed" else ""
 
 
 @dataclass(frozen=True)
@@ -98,69 +102,61 @@ class Verification:
         return all(check.result != "failed" for check in self.checks)
 
 
-# Promises checked on one watched run: name, the function that finds a violation, and what to do.
-_Of = Callable[[Build, Watched], str]
-_OF_A_RUN: tuple[tuple[str, _Of, str], ...] = (
-    (
-        "poses, velocities and biases are numbers",
-        lambda _, watched: promises.not_finite(watched),
-        "look for a division by zero, a logarithm or square root of less than zero, an inverse of a singular matrix; "
-        "raise EstimatorError where it cannot go on",
-    ),
-    (
-        "rotations are rotations",
-        lambda _, watched: promises.no_rotation(watched),
-        "compose with se3_exp, so3_exp and products of rotations; project onto SO(3) after many of them",
-    ),
-    (
-        "an answer at each frame, with its stamp",
-        lambda _, watched: promises.wrong_stamps(watched),
-        "answer with packet.frame.t_ns at every step, or with None at every one; finish() has a state for each frame",
-    ),
-    (
-        "causal: later packets change no earlier answer",
-        promises.look_ahead,
-        "use what step() was given so far alone: no packets kept from another run, no base of an array that reaches "
-        "into later frames",
-    ),
-    (
-        "deterministic: a second run gives the same bits",
-        promises.other_answers,
-        "seed every random number in build(); keep nothing in the module or the class between runs",
-    ),
-    (
-        "an answer does not change after it was given",
-        lambda _, watched: promises.changed_later(watched),
-        "return a copy of the state, not the array that the next step writes into",
-    ),
-    (
-        "setup and packets stay untouched",
-        lambda _, watched: promises.touched(watched),
-        "copy an array before writing into it",
-    ),
-)
-_COVARIANCE = "covariances are finite, symmetric, positive definite"
-_COVARIANCE_REMEDY = (
-    "symmetrise after every update, P = (P + P^T) / 2, and look for a subtraction that may leave less than nothing; "
-    "the pose comes first, rotation before position, in the body frame"
-)
-_NO_COVARIANCE = "it states no covariance"
-_NEES = f"consistent: pose NEES over {SEEDS} seeds"
-_NEES_REMEDY = (
-    "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "
-    "Jacobians at first estimates; below it, assume less noise; see docs/metrics.md"
-)
-_RUNS = "it runs to the end"
-_RUNS_REMEDY = (
-    "see the line named; raise EstimatorError, with the reason, where it cannot go on, and in build() for an input "
-    "that it is not made for (setup.motion_kind)"
-)
-_THREADS = "one thread and two give the same bits"
-_THREADS_REMEDY = "sum in a fixed order; leave no result to which thread is first"
+# Promises checked on one watched run, each with the function that finds a violation.
+_OF_A_RUN: Mapping[str, Callable[[Watched], str]] = {
+    "poses, velocities and biases are numbers": promises.not_finite,
+    "rotations are rotations": promises.no_rotation,
+    "an answer at each frame, with its stamp": promises.wrong_stamps,
+    "causal: later packets change no earlier answer": promises.look_ahead,
+    "deterministic: a second run gives the same bits": promises.other_answers,
+    "an answer does not change after it was given": promises.changed_later,
+    "setup and packets stay untouched": promises.touched,
+}
+_RUNS, _COVARIANCE = "it runs to the end", "covariances are finite, symmetric, positive definite"
+_NEES, _THREADS = f"consistent: pose NEES over {SEEDS} seeds", "one thread and two give the same bits"
 _TROUBLE = "it goes on through every planted fault"
-_TROUBLE_REMEDY = (
-    "expect frames without sightings, negative disparities, gross outliers; recover and report it in Finished(log=...)"
-)
+_NO_COVARIANCE = "it states no covariance"
+# What to do where a promise is broken.
+_REMEDIES: Mapping[str, str] = {
+    "poses, velocities and biases are numbers": (
+        "look for a division by zero, a logarithm or square root of less than zero, an inverse of a singular "
+        "matrix; raise EstimatorError where it cannot go on"
+    ),
+    "rotations are rotations": (
+        "compose with se3_exp, so3_exp and products of rotations; project onto SO(3) after many of them"
+    ),
+    "an answer at each frame, with its stamp": (
+        "answer with packet.frame.t_ns at every step, or with None at every one; finish() has a state for each frame"
+    ),
+    "causal: later packets change no earlier answer": (
+        "use what step() was given so far alone: no packets kept from another run, no base of an array that reaches"
+        " into later frames"
+    ),
+    "deterministic: a second run gives the same bits": (
+        "seed every random number in build(); keep nothing in the module or the class between runs"
+    ),
+    "an answer does not change after it was given": (
+        "return a copy of the state, not the array that the next step writes into"
+    ),
+    "setup and packets stay untouched": "copy an array before writing into it",
+    _RUNS: (
+        "see the line named; raise EstimatorError, with the reason, where it cannot go on, and in build() for an "
+        "input that it is not made for (setup.motion_kind)"
+    ),
+    _COVARIANCE: (
+        "symmetrise after every update, P = (P + P^T) / 2, and look for a subtraction that may leave less than "
+        "nothing; the pose comes first, rotation before position, in the body frame"
+    ),
+    _NEES: (
+        "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "
+        "Jacobians at first estimates; below it, assume less noise; see docs/metrics.md"
+    ),
+    _THREADS: "sum in a fixed order; leave no result to which thread is first",
+    _TROUBLE: (
+        "expect frames without sightings, negative disparities, gross outliers; recover and report it in "
+        "Finished(log=...)"
+    ),
+}
 
 
 def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verification:
@@ -183,7 +179,7 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
             except Exception as error:  # anybody's code, which may raise anything
                 raised = raised or f"{sequence.name}: {_error_message(error)}"
         checks = [_runs(raised, declined)]
-        checks += _of_runs(build, watched) if watched else []
+        checks += _of_runs(watched) if watched else []
         if watched:
             progress.advance(len(SCENARIOS), steps, "NEES")
             checks.append(_consistent(subject.name, build, declined))
@@ -198,15 +194,15 @@ def _runs(raised: str, declined: Mapping[str, str]) -> CheckedPromise:
     """Judge how runs ended; an estimator may decline inputs that it is not made for, but not all."""
     whys = "; ".join(dict.fromkeys(declined.values()))
     if raised or len(declined) == len(SCENARIOS):
-        return CheckedPromise(_RUNS, "failed", raised or f"it declines every recording: {whys}", _RUNS_REMEDY)
+        return CheckedPromise(_RUNS, "failed", raised or f"it declines every recording: {whys}")
     return CheckedPromise(_RUNS, "passed", f"not applicable to {', '.join(declined)}: {whys}" if declined else "")
 
 
-def _of_runs(build: Build, watched: list[Watched]) -> Iterator[CheckedPromise]:
-    for name, broken, remedy in _OF_A_RUN:
-        yield _check(name, remedy, partial(_first, watched, partial(broken, build)))
+def _of_runs(watched: list[Watched]) -> Iterator[CheckedPromise]:
+    for name, broken in _OF_A_RUN.items():
+        yield _check(name, partial(_first, watched, broken))
     if any(promises.states_covariance(one) for one in watched):
-        yield _check(_COVARIANCE, _COVARIANCE_REMEDY, lambda: _first(watched, promises.unsound_covariance))
+        yield _check(_COVARIANCE, lambda: _first(watched, promises.unsound_covariance))
     else:
         yield CheckedPromise(_COVARIANCE, "not applicable", _NO_COVARIANCE)
 
@@ -219,14 +215,14 @@ def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
     return ""
 
 
-def _check(name: str, remedy: str, find: Callable[[], str]) -> CheckedPromise:
+def _check(name: str, find: Callable[[], str]) -> CheckedPromise:
     try:
         found = find()
     except SystemLimitError:
         raise
     except Exception as error:  # anybody's code, which may raise anything
         found = _error_message(error)
-    return CheckedPromise(name, "failed", found, remedy) if found else CheckedPromise(name, "passed")
+    return CheckedPromise(name, "failed", found) if found else CheckedPromise(name, "passed")
 
 
 def _error_message(error: Exception) -> str:
@@ -261,22 +257,18 @@ def _consistent(name: str, build: Build, declined: Collection[str]) -> CheckedPr
     found = promises.inconsistency(means)
     if not found and len(means) < SEEDS:
         found = f"{SEEDS - len(means)} of {SEEDS} seeds have none: {why}"
-    return (
-        CheckedPromise(_NEES, "failed", found, _NEES_REMEDY)
-        if found
-        else CheckedPromise(_NEES, "passed", f"{np.mean(means):.2f}")
-    )
+    return CheckedPromise(_NEES, "failed", found) if found else CheckedPromise(_NEES, "passed", f"{np.mean(means):.2f}")
 
 
 def _threads(word: str) -> CheckedPromise:
     try:
-        return _check(_THREADS, _THREADS_REMEDY, lambda: differing_answers(word))
+        return _check(_THREADS, lambda: differing_answers(word))
     except SystemLimitError as error:
         return CheckedPromise(_THREADS, "not applicable", f"not checked: {error}")
 
 
 def _faults(name: str, build: Build) -> CheckedPromise:
-    return _check(_TROUBLE, _TROUBLE_REMEDY, lambda: "; ".join(_causes(ends_by_fault(name, build))))
+    return _check(_TROUBLE, lambda: "; ".join(_causes(ends_by_fault(name, build))))
 
 
 def _causes(found: Mapping[str, str]) -> Iterator[str]:
