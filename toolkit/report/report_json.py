@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
-from toolkit.answers import Output, Run
+from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.files.documents import number, numbers, of_attributes, read, rounded
 from toolkit.geometry import Array
@@ -22,8 +22,8 @@ from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import CardRecord, card_record
 from toolkit.report.comparison_table import header_lines, noise_line, sequence_line
 from toolkit.report.curves import (
+    NOT_ALIGNED,
     ErrorCurves,
-    Errors,
     alignment_text,
     components,
     error_curves,
@@ -315,9 +315,13 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
         alignment=alignment_text(comparison.sequence),
         error=None if curves is None else of_attributes(ErrorKind, curves),
-        runs=tuple(_row(row, comparison, _curve_of(row, curves)) for row in comparison.rows),
+        runs=tuple(_row(row, comparison, _errors(row, curves, comparison.sequence)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
-        maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
+        maps=tuple(
+            DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=shown_output(run))
+            for run in comparison.runs
+            if len(run.landmarks)
+        ),
         words=_messages(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
         frames=frames or UNSET,
@@ -343,16 +347,15 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
     )
 
 
-def _curve_of(row: Row, curves: ErrorCurves | None) -> Errors | None:
+def _errors(row: Row, curves: ErrorCurves | None, sequence: Sequence) -> ErrorSeries | None:
     """Return a row's errors; where causal and final agree they were computed once and stand with the causal row."""
-    output = "causal" if row.run.final_is_causal else row.output
-    if curves is None or output != row.output:
+    same = row.run.final_is_causal
+    if curves is None or (same and row.output == "final"):
         return None
-    return next((errors for other, errors in curves.of_rows if _same_line(row, other)), None)
-
-
-def _same_line(row: Row, other: Row) -> bool:
-    return row.run is other.run and (row.run.final_is_causal or row.output == other.output)
+    for other, errors in curves.of_rows:
+        if other.run is row.run and (same or other.output == row.output):
+            return of_attributes(ErrorSeries, errors, numbers, t_s=seconds(sequence, errors.t_ns))
+    return None
 
 
 def _messages(comparison: Comparison) -> Messages:
@@ -371,19 +374,17 @@ def _messages(comparison: Comparison) -> Messages:
     )
 
 
-def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
+def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnRun:
     answered = row.run.trajectory(row.output) is not None
-    alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else None
-    rotation = np.eye(3) if alignment is None else alignment.rotation
-    translation_m = np.zeros(3) if alignment is None else alignment.translation
+    alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else NOT_ALIGNED
     return DrawnRun(
         estimator=row.estimator,
         output=row.output,
         repeats_causal=row.output == "final" and row.run.final_is_causal,
         trajectory=trajectory_file(row.estimator, row.output) if answered else None,
-        rotation=(_vector(rotation[0]), _vector(rotation[1]), _vector(rotation[2])),
-        translation_m=_vector(translation_m),
-        errors=None if errors is None else _errors(errors, comparison.sequence),
+        rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
+        translation_m=_vector(alignment.translation),
+        errors=errors,
         nees=_series_or_reason(_nees, row, comparison),
         nis=_series_or_reason(_nis, row, comparison),
         components=UNSET if row.repeats_causal else _components(row, comparison),
@@ -393,15 +394,6 @@ def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
 def _vector(values: Array) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _errors(errors: Errors, sequence: Sequence) -> ErrorSeries:
-    return ErrorSeries(
-        t_s=seconds(sequence, errors.t_ns),
-        path_m=numbers(errors.path_m),
-        position_m=numbers(errors.position_m),
-        heading_deg=numbers(errors.heading_deg),
-    )
 
 
 def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
@@ -430,13 +422,8 @@ def _components(row: Row, comparison: Comparison) -> ComponentSeries | UnsetType
 
 def _nees(row: Row, comparison: Comparison) -> NeesSeries:
     nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
-    return NeesSeries(
-        t_s=seconds(comparison.sequence, nees.t_ns),
-        pose=numbers(nees.pose),
-        orientation=numbers(nees.orientation),
-        position=numbers(nees.position),
-        band=nees_band(POSE_DOF),
-    )
+    t_s = seconds(comparison.sequence, nees.t_ns)
+    return of_attributes(NeesSeries, nees, numbers, t_s=t_s, band=nees_band(POSE_DOF))
 
 
 def _nis(row: Row, comparison: Comparison) -> NisSeries:
@@ -465,20 +452,13 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
             )
 
 
-def _map(run: Run) -> DrawnMap:
-    """Return where a run's landmarks are; they are aligned to the truth as its final answer is."""
-    return DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=shown_output(run))
-
-
 def _over_seeds(group: Row) -> DrawnOverSeeds:
     """Return the NEES averaged over the seeds with its band, and the position error over the seeds, or None each."""
     nees, errors_m = group.mean_nees, group.position_m
     return DrawnOverSeeds(
         estimator=group.estimator,
         output=group.output,
-        nees=None
-        if nees is None
-        else MeanNeesSeries(pose=numbers(nees.mean), low=numbers(nees.low), high=numbers(nees.high)),
+        nees=None if nees is None else of_attributes(MeanNeesSeries, nees, numbers, pose=numbers(nees.mean)),
         position_rms_m=None if errors_m is None else numbers(_rms_over_runs(errors_m)),
     )
 

@@ -368,12 +368,7 @@ def _quantiles_all(group: Row, metric: Metric) -> QuantilesAll | UnsetType:
     found = group.quantiles_of_all(metric)
     if found is None:
         return UNSET
-    return QuantilesAll(
-        lower_quartile=found.lower_quartile,
-        median=found.median,
-        upper_quartile=found.upper_quartile,
-        reason=found.reason or UNSET,
-    )
+    return of_attributes(QuantilesAll, found, reason=found.reason or UNSET)
 
 
 def _whole_runs(group: Row) -> WholeRuns:
@@ -383,19 +378,11 @@ def _whole_runs(group: Row) -> WholeRuns:
     """
     nees, errors_m = group.mean_nees, group.position_m
     position_rmse_m = None if errors_m is None else float(np.sqrt(np.nanmean(errors_m**2)))
-    if nees is None:
-        return WholeRuns(
-            position_rmse_m=position_rmse_m,
-            runs=0,
-            nees_pose_band=None,
-            nees_pose_in_band_percent=None,
-            nees_pose_above_percent=None,
-        )
-    most = int(nees.runs.argmax())
+    most = 0 if nees is None else int(nees.runs.argmax())
     return WholeRuns(
         position_rmse_m=position_rmse_m,
-        runs=int(nees.runs[most]),
-        nees_pose_band=(float(nees.low[most]), float(nees.high[most])),
-        nees_pose_in_band_percent=nees.in_band_percent,
-        nees_pose_above_percent=nees.too_sure_percent,
+        runs=0 if nees is None else int(nees.runs[most]),
+        nees_pose_band=None if nees is None else (float(nees.low[most]), float(nees.high[most])),
+        nees_pose_in_band_percent=None if nees is None else nees.in_band_percent,
+        nees_pose_above_percent=None if nees is None else nees.too_sure_percent,
     )
