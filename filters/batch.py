@@ -30,8 +30,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from filters.kalman.joint import AtFirstEstimates
 from filters.kalman.landmark_map import KnownPoseMapper
-from filters.kalman.linearisation import AtFirstEstimates
 from filters.msckf import Msckf
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.indeterminate import with_covariances

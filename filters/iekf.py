@@ -24,13 +24,12 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
+from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
+from filters.kalman.coordinates import AnchoredBelief
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.invariant import AnchoredBelief
-from filters.kalman.joint import JointBelief
-from filters.kalman.joint_ekf import JointEkf
+from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation
 from filters.kalman.joint_landmarks import LandmarkSightings
-from filters.kalman.linearisation import AtLatestEstimates, Linearisation
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array

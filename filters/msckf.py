@@ -12,8 +12,7 @@ import numpy as np
 
 from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtLatestEstimates, Linearisation, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
 from filters.kalman.tracks import (

@@ -1,7 +1,7 @@
 """MSCKF with first-estimate Jacobians and long-lived landmarks in the state (Li & Mourikis 2013)."""
 
 from filters import msckf
-from filters.kalman.linearisation import AtFirstEstimates
+from filters.kalman.joint import AtFirstEstimates
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf", "li2013high")

@@ -14,9 +14,9 @@ update is one Gauss-Newton step, and a landmark's first estimate is one stereo s
 
 from functools import partial
 
-from filters.kalman.invariant import AnchoredBelief
-from filters.kalman.joint_ekf import JointEkf
-from filters.kalman.linearisation import AtLatestEstimates
+from filters.ekf_slam import JointEkf
+from filters.kalman.coordinates import AnchoredBelief
+from filters.kalman.joint import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 

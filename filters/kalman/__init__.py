@@ -1,8 +1,8 @@
 """Parts of the handwritten filters, in NumPy but for the MSCKFs' tracks; GTSAM only preintegrates IMU samples.
 
-Decoupled filters: ``landmark_map`` (one small Gaussian a landmark), ``correction``, ``frame_gate``.
-Joint filters: ``joint`` (the belief and its covariance), ``linearisation``, ``joint_landmarks``, ``joint_ekf``; then
-``inverse_depth`` for ekf-slam, ``invariant`` for riekf and iekf; ``tracks`` and ``tracks_in_view`` for the MSCKFs, with
-what is compiled of both in ``kernels``. ``online_output`` makes an estimator of each; ``thinning`` gives one with a
-window, filter or smoother, no more frames than the window may hold.
+Decoupled filters: ``landmark_map`` (one small Gaussian a landmark, and its correction), ``frame_gate``. Joint filters:
+``joint`` (the belief, its covariance, where it is linearised), ``joint_landmarks``, and ``coordinates``, the other
+errors of ekf-slam, riekf and iekf; ``tracks`` and ``tracks_in_view`` for the MSCKFs, with what is compiled of both in
+``kernels``. ``online_output`` makes an estimator of each; ``thinning`` gives one with a window, filter or smoother, no
+more frames than the window may hold.
 """

@@ -11,8 +11,7 @@ from scipy.linalg.lapack import dgeqrf
 from scipy.sparse import csr_array
 
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import Linearisation
+from filters.kalman.joint import JointBelief, Linearisation
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.tracks import TrackSightings
 from toolkit.arrays import is_among

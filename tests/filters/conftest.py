@@ -13,8 +13,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtLatestEstimates, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from filters import ekf_slam
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief
 from toolkit.metrics import score_run
 from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE_IMU, simulate

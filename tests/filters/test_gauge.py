@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters.kalman.joint_ekf import JointEkf
-from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, Linearisation
+from filters.ekf_slam import JointEkf
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, Linearisation
 from filters.msckf import Msckf
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, skew

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from filters import iekf
+from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
+from filters.kalman.coordinates import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.invariant import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.joint import JointBelief
-from filters.kalman.joint_ekf import JointEkf
-from filters.kalman.linearisation import AtLatestEstimates, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.kalman.inverse_depth import InverseDepthBelief
+from filters.kalman.coordinates import InverseDepthBelief
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.models import stereo

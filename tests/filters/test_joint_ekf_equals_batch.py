@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.joint_ekf import JointEkf
-from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
+from filters.ekf_slam import JointEkf
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
 # Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.

@@ -8,8 +8,7 @@ import pytest
 from filters import iekf
 from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.joint import AtLatestEstimates, JointBelief
 from toolkit.geometry import Array, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo

@@ -14,8 +14,7 @@ import pytest
 
 from filters.kalman import joint_landmarks
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import AcceptedTracks, WindowPoses, WindowTracks, accepted_tracks
 from filters.msckf import Msckf
 from toolkit.geometry import Array, se3_inverse, se3_log

@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from filters import msckf, msckf_fej
 from filters.kalman import kernels
 from filters.kalman.frame_gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtFirstEstimates, propagate
+from filters.kalman.joint import AtFirstEstimates, JointBelief, propagate
 from filters.kalman.tracks import TrackSightings, WindowPoses, WindowTracks, accepted_tracks, camera_for_kernels
 from filters.kalman.tracks_in_view import given_tracks_in_view
 from toolkit.geometry import se3, so3_exp
