@@ -14,6 +14,13 @@ from toolkit.errors import DataError
 Refused = Callable[..., None]
 
 
+def edit(path: Path, old: str, new: str) -> None:
+    """Replace a text in a file, the first time it stands there."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
 @pytest.fixture
 def course() -> dict[str, Any]:
     """Return the arrays of a course recording: 5 frames, 3 tracks, and one sighting without its uR."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from tests.datasets.conftest import edit as replace
 from tests.datasets.test_own_tables import recorded, written
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth
@@ -103,14 +104,8 @@ def test_arrays(
 
 
 def edit(name: str, old: str, new: str) -> Callable[[Path], None]:
-    """Return what replaces a text in a file of a folder, the first time it stands there."""
-
-    def change(folder: Path) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-
-    return change
+    """Return what replaces a text in a file of a folder."""
+    return lambda folder: replace(folder / name, old, new)
 
 
 def cell(row: int, column: int, value: str) -> Callable[[Path], None]:

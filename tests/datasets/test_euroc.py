@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.datasets.conftest import edit
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.datasets.io.fields import read_fields
@@ -242,12 +243,6 @@ def test_a_matrix_of_opencv_has_its_rows(tmp_path: Path) -> None:
     assert "cam0.T" not in read_fields(path)
 
 
-def replace_in(recording: Path, name: str, old: str, new: str) -> None:
-    path = recording / "mav0" / name
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new, 1))
-
-
 def shift_truth(recording: Path) -> None:
     truth_s = np.arange(100.0, 102.0, 0.005)
     write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
@@ -271,14 +266,14 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ("no stamps", lambda d: (d / "mav0/cam0/data.csv").unlink(), "cam0/data.csv: cannot be read"),
     (
         "column",
-        lambda d: replace_in(d, "imu0/data.csv", "w_RS_S_y", "rate_y"),
+        lambda d: edit(d / "mav0/imu0/data.csv", "w_RS_S_y", "rate_y"),
         "imu0/data.csv: missing column w_RS_S_y",
     ),
-    ("open list", lambda d: replace_in(d, "cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
+    ("open list", lambda d: edit(d / "mav0/cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
     ("aliases", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "its aliases .* more than 200000 values"),
     ("too deep", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(f"a: {'[' * 5000}"), "is nested too deeply"),
-    ("twice", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
-    ("not rigid", lambda d: replace_in(d, "cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
+    ("twice", lambda d: edit(d / "mav0/cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
+    ("not rigid", lambda d: edit(d / "mav0/cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
     (
         "another unit",
         lambda d: scale_truth(d, 1e6),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import toolkit
+from tests.datasets.conftest import edit
 from toolkit.datasets import kitti_odometry, load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
@@ -98,12 +99,6 @@ def test_a_calibration_of_images_half_as_large_is_reported(drive: Path) -> None:
     text = (drive / "calib.txt").read_text()
     (drive / "calib.txt").write_text(text.replace(" 160", " 80").replace(" 100 ", " 50 "))
     assert reported()
-
-
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
 
 
 def rename(drive: Path, name: Callable[[Path], str]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.datasets.conftest import edit
 from toolkit.datasets import load_sequence
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
@@ -156,12 +157,6 @@ def test_packets_without_a_stamp_and_stamps_without_a_packet_are_counted(drive: 
     sequence = load_sequence(str(drive))
     assert sequence.motion.t_ns.size == FRAMES
     assert "2 oxts packets lack their file or their stamp and are left out" in sequence.provenance.facts
-
-
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
 
 
 def another_day(stamps: Path) -> None:

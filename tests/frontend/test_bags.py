@@ -547,9 +547,8 @@ def test_a_damaged_bag_is_read_or_refused_in_one_line(asl: Path, tmp_path: Path,
             assert str(file) in str(raised.value)
 
 
-@pytest.mark.parametrize(("kept", "pattern"), [(0.5, "damaged or truncated"), (0.0, "it is empty")])
 def test_images_that_cannot_be_used_are_reported_with_their_topic(
-    asl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: float, pattern: str
+    asl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In every command: they are unpacked into a folder that nobody knows."""
     ros = Ros.of("ros1")
@@ -557,14 +556,14 @@ def test_images_that_cannot_be_used_are_reported_with_their_topic(
 
     def cut(t_ns: int, camera: str, path: Path) -> Item:
         content = path.read_bytes()
-        return ros.compressed(t_ns, camera, content[: int(kept * len(content))])
+        return ros.compressed(t_ns, camera, content[: len(content) // 2])
 
     path = ros.write(tmp_path / "film.bag", [*film, *images_of(asl, cut)])
     for words in (("check-data", str(path)), ("tracks", str(path), "--out", str(tmp_path / "stills"))):
         assert main(words) == 3
         printed = capsys.readouterr().err
         assert f"{path}: /cam0/image_raw/compressed: 10 of 10 image pairs cannot be used" in printed
-        assert pattern in printed
+        assert "damaged or truncated" in printed
         assert str(tmp_path) not in printed.replace(str(path), "")
 
 
