@@ -219,14 +219,17 @@ class Workers:
         An error that the work raises ends everything and is raised here.
         """
         if self.count == 1:
+            board = _Board(len(units))
             for place, unit in enumerate(units):
-                yield place, work(unit, _Share(progress, place, len(units)))
+                yield place, work(unit, _Entry(board.entries, place, lambda: progress.advance(*board.progress())))
+                board.finish(place)
             return
         with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
-            board = _Board(Path(folder) / "progress", len(units))
-            tasks = [(_do, work, unit, board.path, place) for place, unit in enumerate(units)]
+            path = Path(folder) / "progress"
+            board = _Board(len(units), path)
+            tasks = [(_do, work, unit, path, place) for place, unit in enumerate(units)]
             handing_out: _HandingOut[R] = _HandingOut(self._processes, tasks, [needs(unit) for unit in units])
-            progress.advance(0, board.total)
+            progress.advance(*board.progress())
             try:
                 for place, result in handing_out.results(lambda: progress.advance(*board.progress())):
                     board.finish(place)
@@ -234,32 +237,6 @@ class Workers:
                     yield place, result
             finally:
                 handing_out.stop()
-
-
-class _Share:
-    """The progress of one unit as a part of that of all."""
-
-    def __init__(self, whole: Progress, place: int, count: int) -> None:
-        self._whole, self._place, self._count = whole, place, count
-        self._stages: list[str] = []
-
-    def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Pass on how far the unit has come."""
-        if stage and stage not in self._stages:
-            self._stages.append(stage)
-        steps = int(_share_done(len(self._stages), done, total))
-        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count, _step_label(stage, done))
-
-
-def _share_done(stages: Any, done: Any, total: Any) -> Any:
-    """Return how many of its steps a unit, or units (n,), have done."""
-    half = _STEPS // 2
-    return half * done // np.maximum(total, 1) + half * (np.asarray(stages) > 0)
-
-
-def _step_label(stage: str, done: int) -> str:
-    """Return the name of a smoother's current step at the end; empty before that."""
-    return f"{stage}, iteration {done + 1}" if stage else ""
 
 
 class _HandingOut(Generic[R]):
@@ -353,11 +330,11 @@ class _HandingOut(Generic[R]):
 
 
 class _Board:
-    """Progress of each unit, in a file that the processes write."""
+    """Progress of each unit: in a file that the processes write, or in memory where there is one process."""
 
-    def __init__(self, path: Path, count: int) -> None:
-        self.path, self.total = path, _STEPS * count
-        self._entries = np.memmap(path, dtype=_ENTRY, mode="w+", shape=(max(count, 1),))
+    def __init__(self, count: int, path: Path | None = None) -> None:
+        size, self._total = max(count, 1), _STEPS * count
+        self.entries = np.zeros(size, _ENTRY) if path is None else np.memmap(path, _ENTRY, "w+", shape=(size,))
         self._under_way = np.ones(count, dtype=bool)
 
     def finish(self, place: int) -> None:
@@ -366,11 +343,11 @@ class _Board:
 
     def progress(self) -> tuple[int, int, str]:
         """Return the steps done, of how many, and the current step of the first smoother in its final solve."""
-        entries = np.array(self._entries[: self._under_way.size])[self._under_way]
-        shares = _share_done(entries["stages"], entries["done"], entries["total"])
+        entries, half = np.array(self.entries[: self._under_way.size])[self._under_way], _STEPS // 2
+        done = half * entries["done"] // np.maximum(entries["total"], 1) + half * (entries["stages"] > 0)
         ending = entries[entries["stage"] != b""][:1]
-        stage = "".join(_step_label(one["stage"].decode(), int(one["done"])) for one in ending)
-        return self.total - _STEPS * entries.size + int(shares.sum()), self.total, stage
+        stage = "".join(f"{one['stage'].decode()}, iteration {one['done'] + 1}" for one in ending)
+        return self._total - _STEPS * entries.size + int(done.sum()), self._total, stage
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
@@ -384,14 +361,14 @@ def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
 
 
 class _Entry:
-    """Progress that a process writes where its parent reads it."""
+    """Progress of a unit, written to the board and then reported."""
 
-    def __init__(self, entries: Any, place: int) -> None:
-        self._entries, self._place = entries, place
-        self._stages: list[str] = []
+    def __init__(self, entries: Any, place: int, report: Callable[[], None] = lambda: None) -> None:
+        self._entries, self._place, self._report = entries, place, report
+        self._stages: set[str] = set()
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Write how far the unit has come."""
-        if stage and stage not in self._stages:
-            self._stages.append(stage)
+        self._stages |= {stage} - {""}
         self._entries[self._place] = (done, total, len(self._stages), stage.encode("ascii", "replace"))
+        self._report()

@@ -60,39 +60,31 @@ def _check_ours(directory: Path, owner: Owner, named: Path) -> None:
 
 def _probe(target: Path) -> None:
     """Test that a result can be written: create and remove entries as deep and with names as long as it needs."""
-    with _parents_of(target) as parents:
+    with _parents_of(target) as clear_away:
         partial = _beside(target, "probe")
         partial.mkdir()
         partial.rmdir()
         if not target.exists():
             target.mkdir()
             target.rmdir()
-        parents.clear_away()
-
-
-class _Parents:
-    """The directories that were made for something to be written in."""
-
-    def __init__(self, made: list[Path]) -> None:
-        self._made = made
-
-    def clear_away(self) -> None:
-        """Remove those that hold nothing."""
-        with suppress(OSError):
-            for directory in self._made:
-                directory.rmdir()
+        clear_away()
 
 
 @contextmanager
-def _parents_of(target: Path) -> Iterator[_Parents]:
-    """Make the directories above a place; if the block fails, remove them again."""
+def _parents_of(target: Path) -> Iterator[Callable[[], None]]:
+    """Make the directories above a place; yield what removes those of them that hold nothing, as a failure does."""
     missing = [parent for parent in target.absolute().parents if not parent.exists()]
-    parents = _Parents(missing)
+
+    def clear_away() -> None:
+        with suppress(OSError):
+            for directory in missing:
+                directory.rmdir()
+
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        yield parents
+        yield clear_away
     except BaseException:
-        parents.clear_away()
+        clear_away()
         raise
 
 
