@@ -28,7 +28,8 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Setup
 from toolkit.gate.baseline import Case
-from toolkit.gate.checking import How, check, new_baseline
+from toolkit.gate.case_check import CheckTerms
+from toolkit.gate.checking import check, new_baseline
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
 from toolkit.measurements import Packet, StereoFrame
 from toolkit.metrics import score_run
@@ -192,7 +193,7 @@ baseline = new_baseline([case], workers=1, made_by={}, progress_for=silent)
 
 def check_again() -> str:
     """Measure everything in the baseline again, and return what the gate says; time is not judged here."""
-    return gate_text(check(baseline, "the baseline", How(workers=1, speed=False), silent))
+    return gate_text(check(baseline, "the baseline", 1, silent, CheckTerms(speed=False)))
 
 
 print(check_again())

@@ -1,5 +1,6 @@
 """The notebooks: .py and .ipynb are one notebook, it runs on built-in data alone, and what is kept is small."""
 
+import ast
 import importlib.util
 import json
 import os
@@ -57,6 +58,14 @@ def test_the_pair_has_the_same_cells(source: Path, execution: ModuleType) -> Non
     assert [(c.cell_type, c.source) for c in kept.cells] == [(c.cell_type, c.source) for c in written.cells], (
         f"python notebooks/execute.py {source.name} writes it again"
     )
+
+
+@each
+def test_what_it_imports_of_the_toolkit_is_there(source: Path) -> None:
+    """To execute them takes minutes, and is not done with every run of the tests."""
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("toolkit"):
+            exec(f"from {node.module} import {', '.join(alias.name for alias in node.names)}")
 
 
 @each
