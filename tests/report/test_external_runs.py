@@ -112,16 +112,6 @@ def test_a_straight_drive_w_first_is_named_though_no_gyro_decides(tmp_path: Path
     assert "the quaternions look w first" in refusal(tmp_path, mistaken, straight)
 
 
-def test_milliseconds_at_a_high_rate_are_named_beside_the_recording(tmp_path: Path, recording: Sequence) -> None:
-    """Steps of five milliseconds read as five seconds could be a trajectory; beside the frames they cannot."""
-    frames_t_ns = recording.frames_t_ns
-    from_zero = replace(recording, frames_t_ns=frames_t_ns - frames_t_ns[0], truth=None)
-    t_ns = np.arange(0, int(frames_t_ns[-1] - frames_t_ns[0]), 5_000_000)
-    poses = np.broadcast_to(np.eye(4), (t_ns.size, 4, 4))
-    message = refusal(tmp_path, Trajectory(1000 * t_ns, poses), from_zero)
-    assert "they fit only in another unit of time; multiply the stamps by 0.001" in message
-
-
 def test_kitti_rows_are_the_frames_all_of_them_or_those_compared(tmp_path: Path, recording: Sequence) -> None:
     truth = truth_of(recording)
     for rows in (recording.frame_count, 20):
@@ -283,13 +273,9 @@ def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> 
     ("spoil", "message"),
     [
         (lambda lines: [], "holds no poses; .* remove it"),
-        (lambda lines: [lines[0], lines[1], lines[2][:60]], r"line 3 has \d columns, expected 17 \(t qx qy qz qw"),
         (lambda lines: [lines[0], lines[1] + "x"], "line 2 is not numeric"),
-        (lambda lines: [lines[0], lines[2], lines[1]], "line 3 is not later .* sort"),
-        (lambda lines: [lines[0], "1 " * 17], "line 2 has a quaternion that is not of unit length"),
-        (lambda lines: [lines[0], "1.5 0 0 0 1 nan" + " 0" * 11], "line 2 holds a value that is not finite; remove"),
     ],
-    ids=["empty", "cut off", "words", "unsorted", "quaternion", "nan"],
+    ids=["empty", "words"],
 )
 def test_a_malformed_one_gets_one_line_before_anything_runs(
     export: Path, spoil: Callable[[list[str]], list[str]], message: str

@@ -117,13 +117,3 @@ def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     assert reported.endswith(" m")
     assert float(reported.split(" s")[0]) > 0.0
     assert page.find(".scrubber input").get_attribute("aria-valuetext") == reported
-
-
-def test_a_view_can_fill_the_window_and_escape_leaves_it(page: Page, single: Path) -> None:
-    page.open(single, PHONE)
-    page.press(".view-card .quiet", Keys.ENTER)
-    assert page.run("return document.querySelector('.expanded').getBoundingClientRect().height") == PHONE[1]
-    ActionChains(page.driver).send_keys(Keys.ESCAPE).perform()
-    page.settle()
-    assert not page.all(".expanded")
-    assert page.run("return document.activeElement.textContent") == "Expand"
