@@ -27,16 +27,16 @@ GAP_RATIO = 3.5
 NOT_A_TIME = np.iinfo(np.int64).min
 
 
-# A step of the frames is unusual if it differs from the usual one by this share of it, by this time (s), and by so many
-# times the scatter of all steps. A step of the samples near it must differ by the same, to half of their usual step or
-# a quarter of the difference.
+# A step of the frames is unusual if it differs from the usual one by this share of it, by this time (s), and by this
+# many times the scatter of all steps. A step of the samples near it must differ by the same, to half of their usual
+# step or a quarter of the difference.
 LEAST_JUMP_SHARE, LEAST_JUMP_S, SCATTERS = 0.25, 0.01, 10.0
 ALIKE_STEPS, ALIKE = 0.5, 0.25
-# So many intervals on either side show how far the camera moves in a step, at least so many together; acceleration
+# This many intervals on either side show how far the camera moves in a step, at least this many together; acceleration
 # limits the accuracy to this share.
 AROUND, FEWEST_AROUND, SYSTEMATIC = 4, 5, 0.03
-# The camera moved one step, or as many as the stamps say, to within so many standard errors; the two must be at least
-# so many standard errors apart.
+# The camera moved one step, or as many as the stamps say, to within this many standard errors; the two must be at least
+# this many standard errors apart.
 WITHIN, APART = 3.0, 6.0
 # A camera that moves less (m), or rotates less (rad), in a usual step is not used.
 LEAST_M, LEAST_RAD = 0.01, 0.005
@@ -170,8 +170,9 @@ def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
     return Scalar(size[here] / expected, scatter / expected * float(np.sqrt(1.0 + 1.0 / beside.size)))
 
 
-# A forward step of so many usual ones means that earlier stamps were out of order; after a jump, all steps are smaller.
-# So many stamps must follow a jump, so that a single stamp out of order at the end is not taken for one.
+# A forward step of this many usual ones means that earlier stamps were out of order; after a jump, all steps are
+# smaller. At least this many stamps must follow a jump, so that a single stamp out of order at the end is not taken for
+# one.
 LEAP, FEWEST_AFTER = 1.9, 3
 # If more than this share of the stamps is late, the whole order is wrong, and sorting is no repair.
 MOST_LATE = 0.5
@@ -367,7 +368,7 @@ def _frames_symptom(sequence: Sequence) -> Symptom | None:
     )
 
 
-# A vehicle turns and stops within this time (s). Samples with a longer step, and with so many frames in one step, do
+# A vehicle turns and stops within this time (s). Samples with a longer step, and with this many frames in one step, do
 # not represent its motion.
 MOST_STEP_S, MOST_RATIO = 2.0, 20.0
 
@@ -454,7 +455,7 @@ def _short_holes(sequence: Sequence) -> tuple[IntArray, float]:
 
 
 def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
-    """Return the factors (2,) on the noise, linear and angular, of an interpolation over so many steps."""
+    """Return the factors (2,) on the noise, linear and angular, of an interpolation over ``steps`` steps."""
     values, step_s = sequence.motion.values, usual_ns / NS_PER_S
     stretches = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
     if stretches.size >= LEAST_STRETCHES:
@@ -471,7 +472,7 @@ def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
 
 
 def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray:
-    """Return the first samples of the stretches of so many steps without a gap."""
+    """Return the first samples of the stretches of ``steps`` steps without a gap."""
     if t_ns.size <= steps:
         return np.empty(0, dtype=np.int64)
     holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
@@ -499,7 +500,7 @@ def _with(before: Bridges | None, new: Bridges) -> Bridges:
 # their cameras do not follow either; chosen with them in view.
 LEAST_UNEVEN_SHARE = 0.03
 # The motion follows a share of 1 of the deviations if the stamps are right. The stamps are reported if the share is
-# below the second number by so many standard errors, of a jackknife.
+# below the second number by this many standard errors, of a jackknife.
 UNEVEN_SIGMAS, MOST_FOLLOWED = 5.0, 0.5
 # The usual step is half of this quantile of two steps together, which are even where every other frame is late. The
 # shortest quarter misses no frame, in a recording that has lost half of its frames at most.
@@ -632,10 +633,10 @@ def _samples_at_frames(sequence: Sequence) -> tuple[IntArray, BoolArray]:
     return sample, at_frame[:-1] & at_frame[1:] & (np.diff(sample) == 1)
 
 
-# An offset is reported beyond so many standard errors and beyond what is no fault. A sample of an IMU may describe the
-# interval before or after its stamp, 5 ms at 100 Hz. A twist may describe the interval before or after its stamp, whose
-# middle is half an interval away, and may be one interval late: an indoor recording that is taken as sound is late by
-# 0.8.
+# An offset is reported beyond this many standard errors and beyond what is no fault. A sample of an IMU may describe
+# the interval before or after its stamp, 5 ms at 100 Hz. A twist may describe the interval before or after its stamp,
+# whose middle is half an interval away, and may be one interval late: an indoor recording that is taken as sound is
+# late by 0.8.
 OFFSET_SIGMAS, LEAST_OFFSET_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
 # With an IMU, sound recordings at hand have 3.1 standard errors at most; from this many on the finding is undecided and
 # says so.
@@ -643,9 +644,9 @@ DOUBTFUL_SIGMAS = 3.2
 # The same limit, in intervals, for twists stamped between the frames. There a pairing has the same effect as an offset
 # of the clock, and the shift corrects both.
 LEAST_OFF_FRAMES = 0.25
-# A shift is rejected if the velocities fit worse by so many standard errors. Halves and thirds of the indoor recording
-# whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a simulated one have
-# -0.1 at most. Chosen between these.
+# A shift is rejected if the velocities fit worse by this many standard errors. Halves and thirds of the indoor
+# recording whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a simulated
+# one have -0.1 at most. Chosen between these.
 AGAINST_SHIFT = 2.5
 # Offsets (s) up to this are taken from the self-calibration.
 NEAR_S = 0.025
@@ -653,7 +654,7 @@ NEAR_S = 0.025
 # accepted up to twice the standard error, except for twists stamped at the frames, whose interval is open.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
 # The time from a sample to the next frame is constant if this share of the frames has it to within this share of a
-# step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within so many
+# step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within this many
 # standard errors.
 CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 

@@ -221,7 +221,7 @@ def _share_half(uv_px: Array) -> float:
         return float(np.mean(uv_px.astype(np.float16) == uv_px))
 
 
-# From this share of disparities that are not positive on, the order of the coordinates is tested: dropping so many
+# From this share of disparities that are not positive on, the order of the coordinates is tested: dropping that many
 # sightings would block.
 SUSPECT_SHARE = 0.2
 # Under the right order at most this share is not positive: 1 % where it was measured.

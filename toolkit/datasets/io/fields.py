@@ -177,7 +177,7 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
 
 
 def exact_ns(cells: Sequence[str], per_unit_ns: int, place: Callable[[int], str]) -> IntArray:
-    """Return printed stamps, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
+    """Return printed stamps, in units of ``per_unit_ns``, as int64 nanoseconds (N,), rounded only there.
 
     A double holds today's seconds to 0.2 us only. Raises DataError, with the ``place`` of a row, where a stamp is no
     finite number or beyond what 64 bits hold.
