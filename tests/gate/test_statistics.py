@@ -5,7 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from toolkit.gate.significance import holm, paired_p, smallest_detectable
+from toolkit.experiment.statistics import paired_p
+from toolkit.gate.significance import holm, smallest_detectable
 
 
 @pytest.mark.parametrize("n", [2, 5, 24, 400])

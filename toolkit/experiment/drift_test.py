@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import fdtri, stdtrit
 
 from toolkit.arrays import rows_of
+from toolkit.experiment.statistics import standard_error
 from toolkit.geometry import Array, se3_inverse
 from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.metrics.parts.against_truth import Matched
@@ -143,7 +144,7 @@ def less_over_seeds(one: Array, other: Array) -> Advantage | None:
     if one.size < 3 or not (np.minimum(one, other) > 0.0).all():
         return None
     logs = np.log(other / one)
-    return _interval(float(logs.mean()), float(logs.std(ddof=1) / np.sqrt(logs.size)), logs.size, "seeds")
+    return _interval(float(logs.mean()), float(standard_error(logs)), logs.size, "seeds")
 
 
 def _interval(log_ratio: float, error: float, count: int, parts: str) -> Advantage:

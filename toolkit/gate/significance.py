@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
+from toolkit.experiment.statistics import paired_p, standard_error
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
@@ -222,29 +223,6 @@ def percent_text(change: float) -> str:
 def geometric_mean(values: Array) -> float:
     """Return the geometric mean of values (n,), whose ratio is the mean change."""
     return float(np.exp(log_of(values).mean()))
-
-
-def paired_p(differences: Array, margin: float | Array = 0.0) -> Array:
-    """Return the p-value (...) of the one-sided paired t-test that the mean of differences (..., n) exceeds a margin.
-
-    A small value means that the mean is above the margin by more than chance. Differences that are all equal have no
-    spread; the result is then 0 where they exceed the margin, otherwise 1. For a single difference it is 1.
-    """
-    given = np.asarray(differences, dtype=float)
-    n = given.shape[-1]
-    if n < 2:
-        return np.ones(given.shape[:-1])
-    excess, error = given.mean(axis=-1) - margin, standard_error(given)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        p = np.asarray(stdtr(n - 1, -excess / error))
-    return np.where(error > 0.0, p, np.where(excess > 0.0, 0.0, 1.0))
-
-
-def standard_error(differences: Array) -> Array:
-    """Return the standard error (...) of the mean of differences (..., n), 0 where they are all equal."""
-    equal = np.ptp(differences, axis=-1) == 0.0  # whose computed variance need not be exactly zero
-    n = differences.shape[-1]
-    return np.where(equal, 0.0, differences.std(axis=-1, ddof=1) / np.sqrt(n))
 
 
 def holm(p_values: Array) -> Array:
