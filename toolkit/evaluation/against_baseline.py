@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct, to_builtins
@@ -93,20 +93,6 @@ def to_text(baseline: TrajectoryBaselineRecord) -> str:
     return json_text(to_builtins(baseline))
 
 
-class GivenRuns(Protocol):
-    """Runs of a system on sequences, from a folder or scored before."""
-
-    @property
-    def sequences(self) -> tuple[str, ...]:
-        """Return the sequences there are; raises DataError where there are none."""
-
-    def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
-        """Return the scores of a sequence; ``before`` is what the baseline has of it.
-
-        Raises DataError where there is no run, or one cannot be used.
-        """
-
-
 @dataclass(frozen=True)
 class Truths:
     """Where the truth of a sequence is: in a file named for it in a folder, or in one that was named."""
@@ -150,7 +136,10 @@ class FolderOfRuns:
         return tuple(self._files)
 
     def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
-        """Score the files of a sequence; the truth is where it is given, or else where the baseline had it."""
+        """Score the files of a sequence; the truth is where it is given, or else where the baseline had it.
+
+        ``before`` is what the baseline has of it. Raises DataError where there is no file, or one cannot be used.
+        """
         files = self._files.get(sequence, ())
         if not files:
             had = ", ".join(before.files if before else ())
@@ -224,6 +213,10 @@ class EvaluatedRuns:
         for run in self._record.runs:
             found.setdefault(f"{run.estimator}/{run.sequence}" if several else run.sequence, []).append(run)
         return found
+
+
+# Runs of a system on sequences, in a folder or scored before.
+GivenRuns = FolderOfRuns | EvaluatedRuns
 
 
 def _check_truth(path: str, digest: str, before: SequenceRecord | None) -> None:
