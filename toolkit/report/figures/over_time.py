@@ -59,6 +59,7 @@ _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
 # An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
+_MS = 1e3
 _BAND_ALPHA = 0.16
 _LEAST = 1e-3  # m, deg
 
@@ -278,54 +279,34 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
 def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
     figure = new_figure(4.8)
     position, rotation = figure.subplots(2, 1, sharex=True)
+    of_output = {row.output: one for row, one in reversed(found)}  # the bound is that of any estimator's output
+    outputs = list(dict.fromkeys(row.output for row, _ in found))
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
-            _plot_estimator(axes, comparison, row, one, block, scale)
-        _plot_bounds(axes, comparison, found, block, scale)
+            t_s, stroke = comparison.sequence.elapsed_s(one.t_ns), stroke_of(comparison, row.estimator, shown_as(row))
+            lost = np.linalg.norm(one.excess[:, block], axis=1)
+            axes.plot(t_s, scale * lost, linewidth=1.6, label=f"{row.estimator} {row.label}", **stroke)
+            axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
+        bounds = {output: scale * _sigma(of_output[output].bound, block) for output in outputs}
+        for output, sigma in bounds.items():
+            t_s, line = comparison.sequence.elapsed_s(of_output[output].t_ns), line_of(output)
+            axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
+        axes.set_yscale("log")
+        # There is room for what is a thousand times below the bound.
+        axes.set_ylim(bottom=_LEAST_SHARE * min(float(sigma.min()) for sigma in bounds.values()))
     style_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
     style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
-    bounds = [
-        Entry.of_line(f"bound {output}", TRUTH_COLOUR, line_of(output), 2.0)
-        for output in dict.fromkeys(row.output for row, _ in found)
-    ]
-    stated = Entry.of_line("thin: stated", MUTED_COLOUR, width=_STATED_WIDTH)
-    estimators = entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
-    legend_below(figure, [*bounds, *estimators, stated])
+    entries = [Entry.of_line(f"bound {output}", TRUTH_COLOUR, line_of(output), 2.0) for output in outputs]
+    entries += entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
+    entries += [Entry.of_line("thin: stated", MUTED_COLOUR, width=_STATED_WIDTH)]
+    legend_below(figure, entries)
     return NamedFigure("against_bound", _OF_BOUND, figure)
-
-
-def _plot_estimator(
-    axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
-) -> None:
-    t_s, label = comparison.sequence.elapsed_s(one.t_ns), f"{row.estimator} {row.label}"
-    stroke = stroke_of(comparison, row.estimator, shown_as(row))
-    lost = np.linalg.norm(one.excess[:, block], axis=1)
-    axes.plot(t_s, scale * lost, linewidth=1.6, label=label, **stroke)
-    axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
-
-
-def _plot_bounds(
-    axes: Axes, comparison: Comparison, found: list[tuple[Row, AgainstBound]], block: slice, scale: float
-) -> None:
-    """Draw the bound of each kind of output, and leave room for what is a thousand times below it."""
-    least = np.inf
-    for output in dict.fromkeys(row.output for row, _ in found):
-        one = next(one for row, one in found if row.output == output)
-        sigma = scale * _sigma(one.bound, block)
-        least = min(least, float(sigma.min()))
-        t_s, line = comparison.sequence.elapsed_s(one.t_ns), line_of(output)
-        axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
-    axes.set_yscale("log")
-    axes.set_ylim(bottom=_LEAST_SHARE * least)
 
 
 def _sigma(covs: Array, block: slice) -> Array:
     """Return the root (n,) of the trace of a block of covariances (n, d, d)."""
     return np.asarray(np.sqrt(np.trace(covs[:, block, block], axis1=1, axis2=2)))
-
-
-_MS = 1e3
 
 
 def draw_frame_times(comparison: Comparison) -> Iterator[NamedFigure]:
