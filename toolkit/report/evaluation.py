@@ -8,7 +8,6 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
+from toolkit.report.html import filled_page, source
 from toolkit.report.text import (
     MISSING,
     WIDTH,
@@ -55,39 +55,6 @@ EVALUATION = "evaluation.json"
 _FILES = (EVALUATION, "leaderboard.html", "leaderboard.md", "runs.csv")
 # Of the figure, in its own units: room for names, for dots, between rows; and how many lines of colour there are.
 _NAMES, _DOTS, _MARGIN, _ROW, _COLOURS = 190.0, 660.0, 60.0, 15.0, 7
-_STYLE = """
-main { padding: 1rem clamp(.75rem, 3vw, 2rem); display: grid; gap: var(--gap); max-width: 90rem; margin: 0 auto; }
-.card > h2 { margin-bottom: .5rem; }
-.scroll { overflow-x: auto; }
-thead th { padding: .35rem .55rem; font-size: .84rem; white-space: normal; line-height: 1.25; min-width: 3.6rem; }
-th:first-child, td:first-child { text-align: left; font-weight: 600; }
-figure { margin: 0; }
-svg text { fill: var(--text); font-size: 11px; }
-svg .grid { stroke: var(--grid); }
-svg .failed { stroke: var(--bad); stroke-width: 1.6; }
-.key { display: inline-flex; gap: .4rem; align-items: center; margin-right: 1rem; font-size: .85rem; }
-.key i { width: .7rem; height: .7rem; border-radius: 50%; }
-"""
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
-<title>{title} - vislam leaderboard</title>
-<style>
-{style}
-</style>
-</head>
-<body>
-<header class="top"><div><span class="brand">vislam leaderboard</span><h1>{title}</h1></div></header>
-<main>
-{cards}
-</main>
-</body>
-</html>
-"""
 
 
 def shown_metrics(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> tuple[Metric, ...]:
@@ -335,8 +302,8 @@ def leaderboard_page(evaluation: EvaluatedSystems) -> str:
     ):
         entries = "".join(f"<li>{in_html(line)}</li>" for line in lines)
         cards += [_card(name, f"<ul>{entries}</ul>")] if entries else []
-    style = files("toolkit.report.html").joinpath("style.css").read_text(encoding="utf-8") + _STYLE
-    return _PAGE.format(title=in_html(title), style=style, cards="\n".join(cards))
+    parts = {"title": in_html(title), "style": source("style.css"), "cards": "\n".join(cards)}
+    return filled_page("leaderboard.html", parts)
 
 
 def _html_table(table: Table) -> str:

@@ -7,7 +7,7 @@ made of page.html, style.css and the scripts in ``scripts``): nothing is fetched
 import html
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 from toolkit.errors import printable
 from toolkit.files.writing import write_text
 
-__all__ = ["write_html"]
 # In the order in which they build upon each other; together they are the body of one function.
 SCRIPTS = (
     *("dom", "numbers", "state", "hints", "table", "canvas", "gestures", "scene", "top_view", "orbit_view"),
@@ -43,12 +42,17 @@ def page_text(payload: dict[str, Any]) -> str:
     """Return the page of a payload with its ``title``; refuses NaN and infinity, which are not JSON."""
     parts = {
         "title": html.escape(printable(payload["title"])),
-        "style": _source("style.css"),
+        "style": source("style.css"),
         "payload": json_in_html(payload),
-        "script": "\n".join(_source(f"scripts/{name}.js") for name in SCRIPTS),
+        "script": "\n".join(source(f"scripts/{name}.js") for name in SCRIPTS),
     }
-    # One pass: a payload that spells out one of the places must not be taken for one.
-    return re.sub(r"{{ (\w+) }}", lambda place: parts[place[1]], _source("page.html"))
+    return filled_page("page.html", parts)
+
+
+def filled_page(name: str, parts: Mapping[str, str]) -> str:
+    """Return a page of this folder with each place ``{{ part }}`` filled."""
+    # One pass: a part that spells out one of the places must not be taken for one.
+    return re.sub(r"{{ (\w+) }}", lambda place: parts[place[1]], source(name))
 
 
 def json_in_html(value: object) -> str:
@@ -60,5 +64,6 @@ def json_in_html(value: object) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def _source(name: str) -> str:
+def source(name: str) -> str:
+    """Return the text of a file of this folder."""
     return files("toolkit.report.html").joinpath(name).read_text(encoding="utf-8")
