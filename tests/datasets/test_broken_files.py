@@ -150,7 +150,7 @@ OPENVINS: list[tuple[Callable[[Path], object], str]] = [
     (remove("calib.json"), "missing calib.json"),
     (calibration(lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
     (calibration(lambda c: c.update(pixel_noise_sigma=None)), "missing pixel_noise_sigma"),
-    (calibration(lambda c: c.update(gravity_world=[[0], 0, 1])), "missing gravity_world"),
+    (calibration(lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds text"),
     (lambda d: (d / "calib.json").write_text('{"cam0": '), "not valid JSON"),
     (lambda d: (d / "calib.json").write_text('["cam0"]'), "holds a JSON list"),
     (edit("calib.json", '"k1": 0', '"k1": 0.1'), "not a rectified pair"),

@@ -327,8 +327,8 @@ def read_fields(path: Path) -> Fields:
     """Return what a file holds as arrays with dotted keys: numbers (), lists of numbers (n,) or (n, m), and texts ().
 
     OpenCV's matrices, mappings of rows, cols and data, are given as arrays (rows, cols) too, under their own key.
-    What is none of these, as a list of names, is left out. Raises DataError, naming the line where there is one, where
-    the file cannot be read, is no YAML, or says a thing twice.
+    A list of anything else is a text, and what has no value is left out. Raises DataError, naming the line where there
+    is one, where the file cannot be read, is no YAML, or says a thing twice.
     """
     text = read_text_input(path, "copy it again")
     if len(text) > _MOST_CHARACTERS:
@@ -426,10 +426,10 @@ def _as_array(value: Any) -> np.ndarray | None:
 
 
 def _list_with_texts(value: Any) -> np.ndarray | None:
-    """Return a list of which some numbers were read as texts, as 1e-3 is."""
+    """Return a list of which some numbers were read as texts, as 1e-3 is; one of names or of unequal rows as a text."""
     if not isinstance(value, list):
         return None
     try:
         return np.array([[float(x) for x in row] if isinstance(row, list) else float(row) for row in value])
     except (TypeError, ValueError, OverflowError):
-        return None
+        return np.array(str(value))
