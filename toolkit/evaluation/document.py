@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 
 from toolkit.answers import Status
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
+from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedRecord, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.files import documents
 from toolkit.files.documents import Count, Value, of_attributes
@@ -93,19 +93,6 @@ class StandingRecord(Struct, frozen=True, kw_only=True):
     metrics: Annotated[dict[str, Quartiles | None], Meta(description="over the medians of the sequences")]
 
 
-class PairedRecord(Struct, frozen=True, kw_only=True):
-    """Two systems, paired over the sequences."""
-
-    estimator: Annotated[str, Meta(description="the first system's name")]
-    other: str
-    better: Annotated[Count, Meta(description="sequences on which the first is better")]
-    worse: Count
-    tied: Count
-    median_ratio: Annotated[float | None, Meta(description="first to second; null where failures decide it")]
-    p: Annotated[float, Meta(description="Wilcoxon's signed-rank test, exact, two-sided", ge=0, le=1)]
-    p_holm: Annotated[float, Meta(description="corrected for all pairs", ge=0, le=1)]
-
-
 class EvaluationRecord(Struct, frozen=True, kw_only=True):
     """Every run of every system, and what they say together."""
 
@@ -143,7 +130,7 @@ def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
         runs=tuple(map(_run, evaluation.runs)),
         over_runs=tuple(_over_runs(cell, metrics) for cell in evaluation.cells.values()),
         leaderboard=tuple(map(_standing, evaluation.leaderboard)),
-        paired=tuple(map(_paired, evaluation.paired)),
+        paired=evaluation.paired,
         notes=evaluation.notes,
     )  # fmt: skip
 
@@ -178,10 +165,6 @@ def _quartiles(found: QuantilesOfAll | None) -> Quartiles | None:
 def _standing(standing: Standing) -> StandingRecord:
     metrics = {key: _quartiles(found) for key, found in standing.quantiles.items()}
     return of_attributes(StandingRecord, standing, estimator=standing.system, metrics=metrics)
-
-
-def _paired(test: PairedTest) -> PairedRecord:
-    return of_attributes(PairedRecord, test, estimator=test.system)
 
 
 def read_evaluation(path: Path) -> EvaluationRecord:

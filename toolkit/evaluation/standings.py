@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from toolkit.answers import Status
 from toolkit.errors import DataError
@@ -20,6 +22,7 @@ from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
+from toolkit.files.documents import Count
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
@@ -102,22 +105,17 @@ class Standing:
     quantiles: Mapping[str, QuantilesOfAll | None]
 
 
-@dataclass(frozen=True)
-class PairedTest:
-    """Two systems over the sequences: how often the first is better, by what factor, and whether that is chance.
+class PairedRecord(Struct, frozen=True, kw_only=True):
+    """Two systems, paired over the sequences."""
 
-    ``median_ratio`` is of the first's error to the second's, None where sequences without a median decide it. ``p`` is
-    two-sided and of this pair alone, ``p_holm`` corrected for all pairs.
-    """
-
-    system: str
+    estimator: Annotated[str, Meta(description="the first system's name")]
     other: str
-    better: int
-    worse: int
-    tied: int
-    median_ratio: float | None
-    p: float
-    p_holm: float
+    better: Annotated[Count, Meta(description="sequences on which the first is better")]
+    worse: Count
+    tied: Count
+    median_ratio: Annotated[float | None, Meta(description="first to second; null where failures decide it")]
+    p: Annotated[float, Meta(description="Wilcoxon's signed-rank test, exact, two-sided", ge=0, le=1)]
+    p_holm: Annotated[float, Meta(description="corrected for all pairs", ge=0, le=1)]
 
     @property
     def is_significant(self) -> bool:
@@ -172,7 +170,7 @@ class EvaluatedSystems:
         return tuple(sorted(standings, key=lambda standing: standing.mean_rank))
 
     @cached_property
-    def paired(self) -> tuple[PairedTest, ...]:
+    def paired(self) -> tuple[PairedRecord, ...]:
         """Every pair of systems over the sequences, the one higher on the leaderboard first; none of one sequence."""
         order = [standing.system for standing in self.leaderboard]
         pairs = list(combinations(order, 2)) if len(self.sequences) > 1 else []
@@ -319,12 +317,20 @@ def _ranked(values: Array) -> Array:
     return np.asarray((last - 0.5 * (counts - 1))[place])
 
 
-def _paired(system: str, other: str, log_ratios: Array, p: float, p_holm: float) -> PairedTest:
-    middle = float(np.median(log_ratios)) if not np.isinf(np.median(log_ratios)) else None
+def _paired(system: str, other: str, log_ratios: Array, p: float, p_holm: float) -> PairedRecord:
+    with np.errstate(invalid="ignore"):  # of two infinite ratios of either sign the median is no number
+        median = float(np.median(log_ratios))
     better, worse = int((log_ratios < 0.0).sum()), int((log_ratios > 0.0).sum())
-    tied = log_ratios.size - better - worse
-    ratio = None if middle is None or np.isnan(middle) else float(np.exp(middle))
-    return PairedTest(system, other, better, worse, tied, ratio, p, p_holm)
+    return PairedRecord(
+        estimator=system,
+        other=other,
+        better=better,
+        worse=worse,
+        tied=log_ratios.size - better - worse,
+        median_ratio=float(np.exp(median)) if np.isfinite(median) else None,
+        p=p,
+        p_holm=p_holm,
+    )
 
 
 def _over_sequences(cells: Sequence[Cell], metric: Metric) -> QuantilesOfAll | None:

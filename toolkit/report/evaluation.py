@@ -14,7 +14,7 @@ from typing import NamedTuple
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
+from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedRecord, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory
@@ -163,19 +163,21 @@ def paired_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     tests = evaluation.paired
     leader = evaluation.leaderboard[0].system
     for test in tests:
-        if test.system == leader or test.is_significant:
+        if test.estimator == leader or test.is_significant:
             yield _paired_line(test, len(tests), evaluation.ranked_by)
     count = len(evaluation.ranked_sequences)
     if tests and 2.0 ** (1 - count) * len(tests) > FALSE_ALARM_RATE:
         yield f"{count} sequences cannot distinguish {len(evaluation.systems)} systems at 5 %, whatever the errors are"
 
 
-def _paired_line(test: PairedTest, pairs: int, metric: Metric) -> str:
+def _paired_line(test: PairedRecord, pairs: int, metric: Metric) -> str:
     counts = f"better on {test.better}, worse on {test.worse}" + (f", equal on {test.tied}" if test.tied else "")
     ratio = "" if test.median_ratio is None else f", {metric.name} {test.median_ratio:.3g} times as large in the median"
     corrected = f", {test.p_holm:.2g} with Holm's correction for {pairs} pairs" if pairs > 1 else ""
     verdict = "" if test.is_significant else ": may be chance"
-    return f"{test.system} against {test.other}: {counts} of the sequences{ratio}; p = {test.p:.2g}{corrected}{verdict}"
+    return (
+        f"{test.estimator} against {test.other}: {counts} of the sequences{ratio}; p = {test.p:.2g}{corrected}{verdict}"
+    )
 
 
 def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURES) -> Iterator[str]:
