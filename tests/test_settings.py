@@ -10,18 +10,8 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from toolkit import settings
-from toolkit.settings import (
-    DEFAULTS,
-    POLICIES,
-    Settings,
-    SettingsError,
-    as_values,
-    assigned,
-    describe,
-    settings_of,
-    with_changes,
-)
+from toolkit.settings import DEFAULTS, POLICIES, Settings, SettingsError, as_values, changes_of
+from toolkit.settings.reading import assigned, describe, read_toml, settings_of, with_changes
 
 
 def _with(given: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
@@ -124,9 +114,9 @@ def test_an_assignment_that_is_none_is_refused(text: str) -> None:
 def test_a_file_that_is_not_toml_is_refused_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text("window = [")
     with pytest.raises(SettingsError, match=r"run\.toml: is not TOML"):
-        settings.read_toml(tmp_path / "run.toml")
+        read_toml(tmp_path / "run.toml")
     with pytest.raises(SettingsError, match="cannot be read"):
-        settings.read_toml(tmp_path / "absent.toml")
+        read_toml(tmp_path / "absent.toml")
 
 
 def test_the_smoothers_threshold_is_under_the_classic_policy_the_filters_gate_as_a_length() -> None:
@@ -149,9 +139,9 @@ def test_settings_cannot_be_changed() -> None:
 
 
 def test_what_differs_from_the_defaults_is_kept_alone_and_reads_back() -> None:
-    assert settings.changes_of(DEFAULTS) == {}
+    assert changes_of(DEFAULTS) == {}
     changes = {"window": {"lag_s": 3.0}, "seeds": 4, "estimators": {"mine": {"gain": 0.5}}}
-    assert settings.changes_of(settings_of(changes, "here")) == changes
+    assert changes_of(settings_of(changes, "here")) == changes
 
 
 def test_the_page_documents_every_setting_as_it_is() -> None:

@@ -30,7 +30,8 @@ from toolkit.registry import find_all
 from toolkit.report.comparison_table import comparison_table, requested_columns
 from toolkit.report.text import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
+from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
+from toolkit.settings.reading import settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

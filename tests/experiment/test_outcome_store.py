@@ -20,7 +20,8 @@ from toolkit.experiment.workers import Workers
 from toolkit.metrics import Scores, describe
 from toolkit.progress import Progress
 from toolkit.report.scores import seeds_document
-from toolkit.settings import Settings, settings_of
+from toolkit.settings import Settings
+from toolkit.settings.reading import settings_of
 
 TWO = ("dead-reckoning", "ekf")
 Sweep = Callable[..., Comparison]

@@ -13,7 +13,8 @@ from toolkit.experiment import Plan, recording, run
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measurements import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.sequence import Observations, Sequence
-from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
+from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse
+from toolkit.settings.reading import settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
 from toolkit.simulation.faults import moving_vehicles
 

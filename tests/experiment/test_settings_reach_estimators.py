@@ -10,7 +10,7 @@ from toolkit.errors import EstimatorError
 from toolkit.experiment import Plan, prepared_cases, run
 from toolkit.experiment.workers import Workers
 from toolkit.registry import ENTRY_POINT_GROUP, find
-from toolkit.settings import settings_of
+from toolkit.settings.reading import settings_of
 
 _ESTIMATOR = '''
 """Stands still, and says in its log what it was set to."""

@@ -25,7 +25,8 @@ from toolkit.gate.interleaved import (
 from toolkit.gate.measuring import recordings_of
 from toolkit.gate.timing_child import Timer
 from toolkit.progress import silent
-from toolkit.settings import changes_of, settings_of
+from toolkit.settings import changes_of
+from toolkit.settings.reading import settings_of
 
 PROJECT = Path(__file__).parents[2]
 # Times of single runs on a machine that others use, too: a few percent, and now and then much more.

@@ -364,7 +364,7 @@ def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any
 
     Raises UsageError where one is given two values.
     """
-    from toolkit.settings import assigned
+    from toolkit.settings.reading import assigned
 
     short = []
     for dest, value in vars(options).items():
@@ -384,7 +384,7 @@ def requested_changes(options: argparse.Namespace, *further: tuple[str, str, Any
 def requested_settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of --config, --set and the options short for one; SettingsError where there is no such."""
     from toolkit.experiment.configuration import read_configuration
-    from toolkit.settings import settings_of, with_changes
+    from toolkit.settings.reading import settings_of, with_changes
 
     file = getattr(options, "config", None)
     values = {} if file is None else read_configuration(file)[1]

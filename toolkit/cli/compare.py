@@ -163,7 +163,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     """Return what is to be compared and how: the file of --config, and over it the command line."""
     from toolkit.experiment.configuration import Request, configuration, read_configuration
     from toolkit.metrics import requests_of
-    from toolkit.settings import with_changes
+    from toolkit.settings.reading import with_changes
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
     switches = () if options.columns == ("all",) else requests_of(options.columns)

@@ -51,7 +51,7 @@ def _known_names() -> dict[str, tuple[str, ...]]:
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.registry import discover
-    from toolkit.settings import describe
+    from toolkit.settings.reading import describe
 
     return {
         "estimators": tuple(discover()),

@@ -10,7 +10,7 @@ from toolkit.cli.arguments import arg, choice, command, output
 
 if TYPE_CHECKING:
     from toolkit.registry import EstimatorEntry
-    from toolkit.settings import Described
+    from toolkit.settings.reading import Described
 
 KINDS = ("estimators", "metrics", "faults", "settings", "formats", "sequences")
 # How many names of each kind stand for all of it.
@@ -40,7 +40,7 @@ def _entries(kind: str) -> Mapping[str, str]:
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.registry import discover
-    from toolkit.settings import describe
+    from toolkit.settings.reading import describe
 
     match kind:
         case "estimators":

@@ -11,7 +11,8 @@ from msgspec import Meta, Struct
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.documents import Record, readable
 from toolkit.files.reading import read_text_input
-from toolkit.settings import Settings, SettingsError, read_toml, settings_of
+from toolkit.settings import Settings, SettingsError
+from toolkit.settings.reading import read_toml, settings_of
 
 if TYPE_CHECKING:
     from toolkit.estimator import Build

@@ -18,7 +18,8 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field, to_builtins
 from toolkit.answers import Output, Status
 from toolkit.errors import VislamError
 from toolkit.files import documents
-from toolkit.settings import DEFAULTS, Settings, changes_of, settings_of
+from toolkit.settings import DEFAULTS, Settings, changes_of
+from toolkit.settings.reading import settings_of
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]

@@ -38,7 +38,7 @@ class Timer:
     def prepare(self, requested: Json) -> Json:
         """Make a recording ready."""
         from toolkit.experiment.recording import Recording, prepare
-        from toolkit.settings import settings_of
+        from toolkit.settings.reading import settings_of
 
         self._settings = settings_of(requested["settings"], "the baseline's settings")
         truth = None if requested["truth"] is None else Path(requested["truth"])

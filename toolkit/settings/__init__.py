@@ -2,10 +2,9 @@
 
 An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
 runs carry the same one. A threshold that no user has to choose is no setting: it is in the code, once, with its source.
-Read ``records``, then ``reading``, which converts input to a record and describes each setting.
+Read ``records``; ``reading``, which estimators do not need, converts input to a record and describes each setting.
 """
 
-from toolkit.settings.reading import Described, assigned, describe, read_toml, settings_of, with_changes
 from toolkit.settings.records import (
     DEFAULTS,
     POLICIES,
@@ -29,7 +28,6 @@ from toolkit.settings.records import (
 __all__ = [
     "DEFAULTS",
     "POLICIES",
-    "Described",
     "Frontend",
     "Metrics",
     "Noise",
@@ -43,11 +41,6 @@ __all__ = [
     "Varied",
     "Window",
     "as_values",
-    "assigned",
     "changes_of",
-    "describe",
     "outlier_summary",
-    "read_toml",
-    "settings_of",
-    "with_changes",
 ]
