@@ -19,16 +19,15 @@ factors of the old one, with the same estimates.
 from collections.abc import Collection, Iterable
 
 import gtsam
-import numpy as np
 
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
-    ties_of_the_last,
     undetermined,
     variable_named,
     weak_prior,
+    with_the_last_tied,
     without_gaps,
 )
 from toolkit.errors import EstimatorError
@@ -156,16 +155,6 @@ class FixedLagTree:
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())
 
-    def _with_the_last_tied(
-        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, slots: list[int]
-    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
-        """Return factors to add and slots to remove that also move the dummy variable's ties to the newest state."""
-        factors, values = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values)
-        if not self._isam.valueExists(LAST):
-            values.insert(LAST, np.zeros(1))
-        factors.push_back(ties_of_the_last(self._newest))
-        return factors, values, [*slots, *self._tie_slots]
-
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int]) -> None:
         old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < self._oldest_ns]
         old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < self._oldest_ns]
@@ -173,7 +162,8 @@ class FixedLagTree:
         # CCOLAMD accepts no index beyond the number of variables it orders.
         new = set(values.keys())
         known = [key for key in (*self._landmark_stamps_ns, *self._state_stamps_ns) if key not in new]
-        factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
+        factors, values = with_the_last_tied(self._isam, factors, values, self._newest)
+        slots = [*dropped_slots, *self._tie_slots]
         self._add(factors, values, slots, key_list(known))
         # QR eliminates singular systems without an error; solving raises it here, before anything is marginalised.
         self._values = self._isam.calculateEstimate()

@@ -109,13 +109,21 @@ def _least_distance_m(point: Array, values: gtsam.Values) -> float:
     return min((float(np.linalg.norm(point - place)) for place in places), default=0.0)
 
 
-def ties_of_the_last(state: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
-    """Return factors that tie the dummy variable to a state (keys with sizes), without information on the state."""
-    ties, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
-    for key, size in state.items():
+def with_the_last_tied(
+    tree: gtsam.ISAM2, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: Mapping[int, int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Return what is added to a tree, and the dummy variable tied to the newest state (keys with sizes).
+
+    There is one such factor for each of the keys, at the end, without information on the state.
+    """
+    factors, values = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values)
+    if not tree.valueExists(LAST):
+        values.insert(LAST, np.zeros(1))
+    for key, size in newest.items():
+        unit = gtsam.noiseModel.Unit.Create(1)
         tie = gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), unit)
-        ties.add(gtsam.LinearContainerFactor(tie))
-    return ties
+        factors.add(gtsam.LinearContainerFactor(tie))
+    return factors, values
 
 
 def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:

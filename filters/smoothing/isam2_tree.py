@@ -28,10 +28,10 @@ from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
-    ties_of_the_last,
     undetermined,
     variable_named,
     weak_prior,
+    with_the_last_tied,
     without_gaps,
 )
 from toolkit.errors import EstimatorError
@@ -122,24 +122,14 @@ class Isam2Tree:
         self._to_relinearise = self._moved()
         cached, moved = self._linearisations(factors, values)
         factors = with_linearisations(factors, cached)
-        factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
+        newest = {key: self._motion.variable_sizes[kind_of(key)] for key in state_keys}
+        first_tie, old_ties = self._slot_count + factors.size(), self._tie_slots
+        factors, values = with_the_last_tied(self.isam, factors, values, newest)
+        self._tie_slots = list(range(first_tie, first_tie + len(newest)))
         added = self._update(factors, values, cached, moved, old_ties)
         # Only after the update: a landmark dropped by the return to Cholesky may be one of the frame's.
         back = self._back_to_cholesky(has_landmarks)
         return Recovery(added.log + back.log, added.dropped | back.dropped)
-
-    def _with_the_last_tied(
-        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: list[int]
-    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
-        """Return what is added, with the dummy variable's ties, and the slots of the ties they replace."""
-        factors, values, old = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values), self._tie_slots
-        if not self.isam.valueExists(LAST):
-            values.insert(LAST, np.zeros(1))
-        ties = ties_of_the_last({key: self._motion.variable_sizes[kind_of(key)] for key in newest})
-        first_slot = self._slot_count + factors.size()
-        self._tie_slots = list(range(first_slot, first_slot + ties.size()))
-        factors.push_back(ties)
-        return factors, values, old
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors; Python factors themselves, not their linearisations."""
