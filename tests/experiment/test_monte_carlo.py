@@ -159,13 +159,9 @@ def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> 
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
-        (lambda d: d.update(schema="vislam.seeds/2"), "its schema is 'vislam.seeds/2'"),
-        (lambda d: d.pop("runs"), "lacks runs"),
         (lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"), "metrics.ate_se3_m is missing"),
         (lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(), "metrics.ate_none_m.values"),
-        (lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"), "ate_none_m.mean: expected number or null"),
         (lambda d: d["runs"][0]["counts"].update(ok=9), "counts does not count status"),
-        (lambda d: d["runs"][0]["status"].__setitem__(0, "fine"), "runs[0].status[0]: cannot be 'fine'"),
         (lambda d: d["runs"][3]["notes"].clear(), "has no value, and notes does not say why"),
         (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed"),
     ],
