@@ -346,7 +346,6 @@ def scale_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     frame = intervals.interval[fast][np.argmax(np.arange(len(ratio)) * STRETCHES // len(ratio) == after)]
     at_s = (evidence.sequence.frames_t_ns[frame] - evidence.sequence.frames_t_ns[0]) / NS_PER_S
     return Symptom.warning(
-        count=1,
         detail=(
             f"from about {at_s:.0f} s on the odometry's speed relative to the camera's is "
             f"{100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} % "
@@ -421,7 +420,6 @@ def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
             None if hidden < LARGEST_HIDDEN_GRAVITY else Undecided(f"a change by less than {hidden:.0%} would not show")
         )
     return Symptom.warning(
-        count=1,
         detail=(
             f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
             f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before"

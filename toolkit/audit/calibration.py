@@ -667,7 +667,7 @@ def _scale_beside_odometry(found: VelocityFit) -> Symptom | Undecided | None:
             "disparities, baseline or focal length are wrong, or wheels: check K, the baseline and the samples' unit"
         )
         is_scale = 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO  # else reported as a disagreement
-        return Symptom.warning(1, _steps(found.scale, "odometry"), cause) if is_scale else None
+        return Symptom.warning(_steps(found.scale, "odometry"), cause) if is_scale else None
     off = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
     hidden, by_chance = least + abs(scale), found.scale_by_chance + abs(scale)
     if hidden >= LARGEST_HIDDEN_SCALE["twist"]:
@@ -683,7 +683,7 @@ def _scale_beside_imu(found: SelfCalibration | None) -> Symptom | Undecided | No
     factor, error = float(np.exp(found.value[BASELINE])), float(found.error[BASELINE])
     if abs(found.value[BASELINE]) > SYSTEMATIC_SCALE["imu"] + RIGHT_SIGMAS["imu"] * error:
         cause = "disparities, baseline or focal length are wrong: check K and the baseline"
-        return Symptom.warning(1, _steps(Scalar(1.0 / factor - 1.0, error / factor), "IMU"), cause)
+        return Symptom.warning(_steps(Scalar(1.0 / factor - 1.0, error / factor), "IMU"), cause)
     hidden = _least(found, "baseline", "imu") + abs(found.value[BASELINE])
     seen = f"tracks and IMU fit a baseline {factor:.3f} +- {factor * error:.3f} times the given one"
     unseen = f"too little change of velocity: {seen}, and less than {100.0 * hidden:.1f} % would not show"

@@ -65,7 +65,7 @@ class Symptom:
         return cls(count, detail, treatment, remedy=None, harmful=False)
 
     @classmethod
-    def warning(cls, count: int, detail: str, treatment: str, spans_ns: Spans = ()) -> Self:
+    def warning(cls, detail: str, treatment: str, count: int = 1, spans_ns: Spans = ()) -> Self:
         """Return a symptom that may spoil results, or those within its spans, and has no repair."""
         return cls(count, detail, treatment, remedy=None, harmful=False, warns=True, spans_ns=spans_ns)
 

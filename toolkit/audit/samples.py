@@ -378,7 +378,7 @@ def coarse_samples(evidence: Evidence) -> Symptom | None:
     if not found:
         return None
     why = "write all the digits that the sensor has, or state noise that includes the rounding"
-    return Symptom.warning(len(found), "; ".join(found), why)
+    return Symptom.warning("; ".join(found), why, count=len(found))
 
 
 def _step_of(column: Array) -> float:

@@ -528,7 +528,6 @@ def uneven_stamps(evidence: Evidence) -> Symptom | None:
         return None
     typical_ms = 1e3 * float(np.median(np.abs(off_s)))
     return Symptom.warning(
-        count=1,
         detail=(
             f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the "
             f"camera's motion shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should "
@@ -687,12 +686,12 @@ def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided
     if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
         parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms more in the second half than in the first"
         why = "a clock drifts or was set: stamp both by one clock, or cut the recording there"
-        return Symptom.warning(1, f"{detail}, but by {parted}", why)
+        return Symptom.warning(f"{detail}, but by {parted}", why)
     remedy = _shifted(sequence, offset_s)
     if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
         fit_worse = f"the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
         why = "stamp rates of rotation and velocities by one clock, the camera's"
-        return Symptom.warning(1, f"{seen}, but then {fit_worse}", why)
+        return Symptom.warning(f"{seen}, but then {fit_worse}", why)
     return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
 
 
@@ -752,7 +751,6 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     if sigmas > NEAR_SIGMAS:
         from_zero = f"{sigmas:.1f} standard errors from zero"
     return Symptom.warning(
-        count=1,
         detail=(
             f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the "
             f"camera's clock were to be shifted by {shifts} ms; by the tracks the offset is "
@@ -818,7 +816,6 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     if abs(change_s) < least_s:
         return None
     return Symptom.warning(
-        count=1,
         detail=(
             f"the offset of frames and motion samples changes by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from "
             "the first half of the recording to the second"

@@ -690,7 +690,7 @@ def track_scatter(evidence: Evidence) -> Symptom | Undecided | None:
     cause = "mismatches, points that move, or noise stated too small"
     if SAME_RATIO[0] < _nearer_scatter(chi2) / scatter < SAME_RATIO[1]:
         cause = f"near and far ones equally, so the noise is stated {scatter:.3g} times too small"
-    return _scatter_warning(
+    return Symptom.warning(
         f"{_scatters(evidence, scatter, error)}; {np.mean(chi2 > FAR_CHI2):.0%} are beyond chance",
         f"{cause}: estimators give such tracks too much weight",
     )
@@ -717,7 +717,7 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     cause = f"the noise is stated {times} times too large, or the errors are constant along tracks"
     if not independent:
         cause = f"the noise is stated too large, by less than {times} times as the errors are correlated between frames"
-    symptom = _scatter_warning(
+    symptom = Symptom.warning(
         _scatters(evidence, scatter, error), f"{cause}: estimators give such tracks too little weight"
     )
     if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
@@ -736,10 +736,6 @@ def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
     )
 
 
-def _scatter_warning(detail: str, treatment: str) -> Symptom:
-    return Symptom.warning(count=1, detail=detail, treatment=treatment)
-
-
 def _tail(chi2: Array) -> Symptom | None:
     """Report too many gross distances (P,), or too many far ones where the median agrees with the noise."""
     gross, error = _gross_share(chi2), jackknife_error(_gross_share, chi2)
@@ -753,7 +749,7 @@ def _tail(chi2: Array) -> Symptom | None:
 
 
 def _mismatched(share: str, than: str) -> Symptom:
-    return _scatter_warning(
+    return Symptom.warning(
         f"from frame to frame {share} of the sightings have residuals of more than {than}",
         "mismatches, exchanged ids, or points that move: estimators must reject as many",
     )

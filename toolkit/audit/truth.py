@@ -217,7 +217,6 @@ def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
         return _unseen(clock.unseen_s)
     rate = clock.rate
     return Symptom.warning(
-        count=1,
         detail=(
             f"the camera turns as the truth does when time passes {1.0 + rate.value:.4f} +- {rate.error:.4f} times as "
             "fast by the truth's stamps as by the frames'"
@@ -282,7 +281,7 @@ def _broken(truth: Truth) -> Symptom | None:
     """Report poses that are not finite, and steps that no vehicle makes: a reset, a flipped bit."""
     finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
     if not finite.all():
-        return _warning(
+        return Symptom.warning(
             f"{int((~finite).sum())} of {finite.size} true poses are not finite", "leave them out of the file"
         )
     step_s = np.maximum(np.diff(truth.t_ns), 1) / NS_PER_S
@@ -293,7 +292,7 @@ def _broken(truth: Truth) -> Symptom | None:
         return None
     row = int(np.argmax(np.where(leaps, step_m, 0.0)))
     at_s = (truth.t_ns[row] - truth.t_ns[0]) / NS_PER_S
-    return _warning(
+    return Symptom.warning(
         f"the truth jumps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
         "cut it there, or leave the pose out: every position error includes the jump",
     )
@@ -322,11 +321,11 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     seen, true = both.displaced_m[:, moved]
     scale, only_longer = longer(seen, true)
     if "turns" in elsewhere or (elsewhere and not only_longer):
-        return _warning(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
+        return Symptom.warning(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
         return _doubtful(scale) if only_longer else None
     unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
-    return _warning(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
+    return Symptom.warning(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
 
 
 def _doubtful(scale: WindowMedian) -> Undecided | None:
@@ -349,7 +348,7 @@ def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
     if not in_most and (apart & frozen).sum() < LEAST_WINDOWS:
         return None
     speed_mps = float(np.median(drives_m[apart])) / WINDOW_S
-    return _warning(
+    return Symptom.warning(
         f"the truth stands still in {apart.sum()} of {moved.size} windows of {WINDOW_S:g} s in which the camera moves "
         f"at {speed_mps:.2g} m/s",
         "it is no truth of this motion, or was frozen: leave it out; errors and consistency against it are meaningless",
@@ -365,7 +364,7 @@ def _looking_one_way(truth: Truth, both: Windows) -> Symptom | None:
     turns = turns_rad > LEAST_TURNED_RAD
     if np.ptp(truth.T_world_imu[:, :3, :3], axis=0).max() > 0.0 or turns.sum() < LEAST_WINDOWS:
         return None
-    return _warning(
+    return Symptom.warning(
         f"all orientations of the truth are equal, and in {turns.sum()} of {turns.size} windows of {WINDOW_S:g} s the "
         f"camera turns by {float(np.median(turns_rad[turns])):.2g} rad (median)",
         "write the orientations, or leave the truth out: errors of orientation and NEES against it are meaningless",
@@ -384,7 +383,7 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
                 f"the truth's motion agrees with the camera's only for a truth {reading}, with a difference of "
                 f"{apart:.1%}"
             )
-            return _warning(f"{summary} in place of {given:.0%}", remedy)
+            return Symptom.warning(f"{summary} in place of {given:.0%}", remedy)
     return None
 
 
@@ -412,12 +411,8 @@ def _by_another_clock(evidence: Evidence) -> Symptom | None:
     found = clock.offset
     if abs(found.value) < max(LEAST_OFFSET_S, OFFSET_SIGMAS * found.error):
         return None
-    return _warning(
+    return Symptom.warning(
         f"the camera turns as the truth does when the truth's stamps are shifted by {-1e3 * found.value:.0f} +- "
         f"{1e3 * found.error:.0f} ms",
         "stamp both by one clock: every position error includes the distance moved in that time",
     )
-
-
-def _warning(detail: str, treatment: str) -> Symptom:
-    return Symptom.warning(count=1, detail=detail, treatment=treatment)
