@@ -271,11 +271,12 @@ def _distortion(fields: Fields) -> tuple[Distortion, Array]:
     given = next((key for key in _COEFFICIENTS.split("|") if key in fields), None)
     if given is None and name != "none" and name in _LENSES:
         fields.require(_COEFFICIENTS)
-    what = str(fields.path) if given is None else f"{fields.path}: {given}"
-    return lens_of(what, name, np.zeros(0) if given is None else fields.vector(given))
+    if given is None:
+        return lens_of(str(fields.path), name, np.zeros(0))
+    return lens_of(str(fields.path), name, fields.vector(given), given)
 
 
-def lens_of(what: str, name: str, coefficients: Array) -> tuple[Distortion, Array]:
+def lens_of(what: str, name: str, coefficients: Array, key: str = "distortion") -> tuple[Distortion, Array]:
     """Return the model of a lens, by any name it has, and its coefficients; raises DataError where they do not fit."""
     if name not in _LENSES:
         raise DataError(f"{what}: distortion_model {printable(name)[:50]} is unknown; there are {', '.join(_LENSES)}")
@@ -286,5 +287,5 @@ def lens_of(what: str, name: str, coefficients: Array) -> tuple[Distortion, Arra
     count = next((n for n in counts if np.trim_zeros(coefficients, "b").size <= n <= coefficients.size), None)
     if count is None or not np.isfinite(coefficients).all():
         wanted = " or ".join(map(str, counts))
-        raise DataError(f"{what}: has {coefficients.size} values of a lens, expected {wanted} finite ones of {name}")
+        raise DataError(f"{what}: {key} has {coefficients.size} values, expected {wanted} finite ones of {name}")
     return model, coefficients[:count]
