@@ -2,8 +2,8 @@
 
 What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that have
 left the window are never corrected again. The answer at a frame is the state given also the tracks still in view; these
-do not correct the belief itself (:mod:`filters.kalman.tracks_in_view`). A pose leaves once it is older than the window,
-as a state does in the smoothers.
+do not correct the belief itself (:mod:`filters.kalman.tracks`). A pose leaves once it is older than the window, as a
+state does in the smoothers.
 
 `msckf-fej` and `msckf-slam` are this filter with other options: Jacobians at first estimates, and landmarks that stay.
 """
@@ -21,9 +21,9 @@ from filters.kalman.tracks import (
     WindowPoses,
     WindowTracks,
     accepted_tracks,
+    given_tracks_in_view,
     load_kernels,
 )
-from filters.kalman.tracks_in_view import given_tracks_in_view
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup

@@ -16,8 +16,14 @@ from filters import msckf, msckf_fej
 from filters.kalman import kernels
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtFirstEstimates, JointBelief, propagate
-from filters.kalman.tracks import TrackSightings, WindowPoses, WindowTracks, accepted_tracks, camera_for_kernels
-from filters.kalman.tracks_in_view import given_tracks_in_view
+from filters.kalman.tracks import (
+    TrackSightings,
+    WindowPoses,
+    WindowTracks,
+    accepted_tracks,
+    camera_for_kernels,
+    given_tracks_in_view,
+)
 from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
