@@ -129,7 +129,7 @@ def test_a_truth_of_other_times_or_none_is_not_checked() -> None:
     assert isinstance(with_truth(drive, elsewhen), Undecided)
 
 
-@pytest.mark.parametrize("pace", [1.03, 0.95, 1.0])
+@pytest.mark.parametrize("pace", [1.03, 0.95, 1.015, 1.0])
 @pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 12.0), ("drive-imu", 12.0), ("flight", 6.0)])
 def test_the_pace_of_the_truths_clock_is_reported(scenario: str, duration_s: float, pace: float) -> None:
     evidence = Evidence(faults.truth_clock_rate(recording(scenario, 31, duration_s, True), pace))
