@@ -9,15 +9,13 @@ than dead reckoning, that it differs from the measured motion or uses a motion a
 the audit found something in its recording, repaired or not; faults that could not be decided do not count. In a sound
 recording all of that is a false alarm, and so is the mark timid.
 
-The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`, `fourth`,
-`fifth`, `sixth`, `seventh` and `eighth` are draws of others yet, with one recording drawn for every fault. In `sixth`
-and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be tested by, beside
-one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and two by
-two, as they meet faults, and what any of these comparisons says is a false alarm.
+A draw is a number: it deals every fault to one recording and one stretch of it, and to two cheap estimators, which take
+turns, with a dear one every fourth time. Thresholds may be chosen on some draws; others are not to be looked at while
+they are. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and
+two by two, as they meet faults, and what any of these comparisons says is a false alarm.
 
-    python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
-    python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
+    python tests/benchmarks/status_power.py run 1 runs.jsonl     a line a run; goes on where it was stopped
+    python tests/benchmarks/status_power.py table 1 runs.jsonl   power and false alarms; exit 1 beside the bar
 
 With --keep DIRECTORY every run is pickled there, and what is there already is evaluated by the code as it is, not run.
 """
@@ -89,15 +87,8 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
-DRAWN = HALVES[2:]
-# So many stretches of each recording a half has, and in so many of these faults are planted.
+# So many stretches of each recording a draw has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
-# The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns, the
-# cheap ones after so many of them.
-PASSED_OVER = {"sixth": 4, "eighth": 6}
-# Or these three meet every fault.
-SAME_FOR_ALL = {"seventh": ("dead-reckoning", "seed-ekf", "ekf-slam")}
 CHEAP = ("dead-reckoning", "ekf", "ekf-slam", "mapping", "msckf", "msckf-fej", "msckf-slam", "riekf", "seed-ekf")
 DEAR = ("batch", "fixed-lag", "smart", "isam2", "batch", "fixed-lag", "smart", "iekf")
 SOUND = ""
@@ -120,27 +111,25 @@ class Scenario:
         return "_".join(filter(None, (self.recording, str(self.seed), self.fault.replace(" ", "-"))))
 
 
-def scenarios(half: str) -> list[Scenario]:
-    """Return the scenarios of a half: every fault is in both, in other recordings, and the stretches are others.
+def scenarios(draw: int) -> list[Scenario]:
+    """Return the scenarios of a draw: every fault once, in a recording that is drawn.
 
     Sound stretches come first: all cheap estimators run on them, and of the dear ones those that meet a fault there.
     """
-    first_seed, faulty = 1000 * (1 + HALVES.index(half)), list[Scenario]()
-    drawn = np.random.default_rng(first_seed).integers(len(LENGTH_S), size=len(FAULTS))
-    for i, fault in enumerate(FAULTS):
-        for j, recording in enumerate(LENGTH_S):
-            if (j == drawn[i]) if half in DRAWN else (i + j) % 2 == HALVES.index(half):
-                count = len(faulty)
-                cheap = SAME_FOR_ALL.get(half) or _neighbours(2 * count + PASSED_OVER.get(half, 0))
-                dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 and half not in SAME_FOR_ALL else ()
-                seed = first_seed + (count // len(LENGTH_S)) % FAULTY_STRETCHES
-                faulty.append(Scenario(recording, seed, fault, (*cheap, *dear)))
+    first_seed, faulty = 1000 * draw, list[Scenario]()
+    places = np.random.default_rng(first_seed).integers(len(LENGTH_S), size=len(FAULTS))
+    drawn = np.array(list(LENGTH_S))[places].tolist()
+    for i, (fault, recording) in enumerate(zip(FAULTS, drawn, strict=True)):
+        dear = (DEAR[(i // 4) % len(DEAR)],) if i % 4 == 3 else ()
+        seed = first_seed + (i // len(LENGTH_S)) % FAULTY_STRETCHES
+        # With each draw a fault meets the next of the cheap estimators.
+        faulty.append(Scenario(recording, seed, fault, (*_neighbours(2 * i + draw - 4), *dear)))
     sound = []
-    for k in range(STRETCHES):
+    for seed in range(first_seed, first_seed + STRETCHES):
         for recording in LENGTH_S:
-            here = [one for one in faulty if (one.recording, one.seed) == (recording, first_seed + k)]
+            here = [one for one in faulty if (one.recording, one.seed) == (recording, seed)]
             dear = sorted({name for one in here for name in one.estimators} - set(CHEAP))
-            sound.append(Scenario(recording, first_seed + k, SOUND, (*SAME_FOR_ALL.get(half, CHEAP), *dear)))
+            sound.append(Scenario(recording, seed, SOUND, (*CHEAP, *dear)))
     return sound + faulty
 
 
@@ -159,7 +148,7 @@ def comparisons(scenario: Scenario) -> list[tuple[str, ...]]:
 class Ended:
     """How one run ended, and what it and the audit of its recording said without the truth."""
 
-    half: str
+    draw: int
     recording: str
     seed: int
     fault: str
@@ -220,7 +209,7 @@ def planted(scenario: Scenario) -> Recorded | None:
         return None
 
 
-def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
+def ended(draw: int, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
     """Run a scenario's estimators and put the truth back for their errors; nothing where the fault cannot be planted.
 
     A recording or a run that is refused has no error and says why.
@@ -236,7 +225,7 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
         if isinstance(prepared, Prepared):
             kept = keep and keep / f"{scenario.name}_{name}.run"
             run = _unless_refused(partial(_run, name, prepared, kept))
-        one = Ended(half, scenario.recording, scenario.seed, scenario.fault, name)
+        one = Ended(draw, scenario.recording, scenario.seed, scenario.fault, name)
         if isinstance(run, str):
             lines[name] = replace(one, status="refused", log=(run,))
         elif isinstance(run, Run) and isinstance(prepared, Prepared):
@@ -306,14 +295,14 @@ def _error_m(run: Run, sequence: Recorded) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)
 
 
-def run_half(half: str, file: Path, keep: Path | None) -> None:
+def run_draw(draw: int, file: Path, keep: Path | None) -> None:
     """Append a line a run to a file, without the scenarios that it has."""
     lines = read(file)
     done = {(one.recording, one.seed, one.fault, one.estimator) for one in lines}
-    for scenario in scenarios(half):
+    for scenario in scenarios(draw):
         where = (scenario.recording, scenario.seed, scenario.fault)
         missing = [name for name in scenario.estimators if (*where, name) not in done]
-        for one in ended(half, scenario, keep) if missing else ():
+        for one in ended(draw, scenario, keep) if missing else ():
             if one.estimator in missing:
                 with file.open("a") as out:
                     out.write(json.dumps(asdict(one)) + "\n")
@@ -365,17 +354,17 @@ def _percent(part: Sized, whole: Sized) -> str:
 
 
 def main(words: list[str]) -> int:
-    """Run a half, or print its table and exit 1 beside the bar: 95 % of the bad say so, at most 2 % of the sound do."""
+    """Run a draw, or print its table and exit 1 beside the bar: 95 % of the bad say so, at most 2 % of the sound do."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table"))
-    parser.add_argument("half", choices=HALVES)
+    parser.add_argument("draw", type=int, help="its number, 1 or more")
     parser.add_argument("file", type=Path)
     parser.add_argument("--keep", type=Path, metavar="DIRECTORY")
     wanted = parser.parse_args(words)
     if wanted.what == "run":
-        run_half(wanted.half, wanted.file, wanted.keep)
+        run_draw(wanted.draw, wanted.file, wanted.keep)
         return 0
-    return 0 if print_table([one for one in read(wanted.file) if one.half == wanted.half]) else 1
+    return 0 if print_table([one for one in read(wanted.file) if one.draw == wanted.draw]) else 1
 
 
 if __name__ == "__main__":
