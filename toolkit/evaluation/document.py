@@ -9,13 +9,9 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit.answers import Status
-from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedRecord, Standing
-from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.evaluation.standings import EvaluatedSystems, PairedRecord, Quartiles, RunRecord, StandingRecord
 from toolkit.files import documents
-from toolkit.files.documents import Count, Value, of_attributes
-from toolkit.metrics import Metric
+from toolkit.files.documents import Count, of_attributes
 
 _REMEDY = "make it with vislam evaluate --out"
 
@@ -41,35 +37,6 @@ class SequenceScored(Struct, frozen=True, kw_only=True):
     path_m: Annotated[float, Meta(ge=0)]
 
 
-class RunRecord(Struct, frozen=True, kw_only=True):
-    """One run of one system."""
-
-    sequence: str
-    estimator: Annotated[str, Meta(description="the system's name")]
-    run: str
-    file: Annotated[str | None, Meta(description="as it was given; null where there is none and ought to be one")]
-    output: Literal["final"]
-    status: Status
-    metrics: Annotated[dict[str, Value], Meta(description="by metric key")]
-    notes: Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on it")]
-    log: Annotated[tuple[str, ...], Meta(description="why it failed")]
-
-    def __post_init__(self) -> None:
-        for key, value in self.metrics.items():
-            if value is None and not self.notes.get(key):
-                raise ValueError(f"metrics.{key} is null, and notes does not say why")
-        if self.status != "ok" and not self.log:
-            raise ValueError(f"status is {self.status}, and log does not say why")
-
-
-class Quartiles(Struct, frozen=True, kw_only=True):
-    """Quartiles in which what failed is infinitely bad; null where that decides one."""
-
-    lower_quartile: float | None
-    median: float | None
-    upper_quartile: float | None
-
-
 class OverRuns(Struct, frozen=True, kw_only=True):
     """All runs of a system on a sequence."""
 
@@ -78,19 +45,6 @@ class OverRuns(Struct, frozen=True, kw_only=True):
     runs: Count
     ok: Count
     metrics: Annotated[dict[str, Quartiles | None], Meta(description="null where runs are ok and none has a value")]
-
-
-class StandingRecord(Struct, frozen=True, kw_only=True):
-    """A system over all sequences, best first."""
-
-    estimator: Annotated[str, Meta(description="the system's name")]
-    mean_rank: Annotated[float, Meta(description="over the sequences, by the median over the runs; 1 is the best")]
-    wins: Annotated[Count, Meta(description="sequences on which every other system is worse")]
-    sequences: Count
-    solved: Annotated[Count, Meta(description="sequences with a median over the runs")]
-    runs: Count
-    ok: Count
-    metrics: Annotated[dict[str, Quartiles | None], Meta(description="over the medians of the sequences")]
 
 
 class EvaluationRecord(Struct, frozen=True, kw_only=True):
@@ -115,7 +69,6 @@ class EvaluationRecord(Struct, frozen=True, kw_only=True):
 
 def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
     """Return an evaluation as a record."""
-    metrics = evaluation.scored_metrics
     return EvaluationRecord(
         schema="vislam.evaluation/1",
         terms=of_attributes(TermsRecord, evaluation.terms),
@@ -127,44 +80,18 @@ def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
             )
             for name, truth in evaluation.truths.items()
         ),
-        runs=tuple(map(_run, evaluation.runs)),
-        over_runs=tuple(_over_runs(cell, metrics) for cell in evaluation.cells.values()),
-        leaderboard=tuple(map(_standing, evaluation.leaderboard)),
+        runs=evaluation.runs,
+        over_runs=tuple(
+            OverRuns(
+                sequence=cell.sequence, estimator=cell.system, runs=len(cell.runs), ok=cell.ok,
+                metrics={metric.key: cell.quantiles(metric) for metric in evaluation.scored_metrics},
+            )
+            for cell in evaluation.cells.values()
+        ),
+        leaderboard=evaluation.leaderboard,
         paired=evaluation.paired,
         notes=evaluation.notes,
     )  # fmt: skip
-
-
-def _run(run: EvaluatedRun) -> RunRecord:
-    counts = {metric.key for metric in METRICS if metric.count}
-    why = run.log[0] if run.log else ""
-    values = {metric.key: run.values.get(metric.key) for metric in METRICS}
-    notes = dict.fromkeys(values, why) if not run.values else dict(run.notes)
-    return RunRecord(
-        sequence=run.item.sequence,
-        estimator=run.item.system,
-        run=run.item.run,
-        file=None if run.item.path is None else run.item.path.as_posix(),
-        output="final",
-        status=run.status,
-        metrics={key: int(v) if v is not None and key in counts else v for key, v in values.items()},
-        notes={key: notes[key] for key in sorted(notes)},
-        log=run.log,
-    )
-
-
-def _over_runs(cell: Cell, metrics: tuple[Metric, ...]) -> OverRuns:
-    quartiles = {metric.key: _quartiles(cell.quantiles(metric)) for metric in metrics}
-    return OverRuns(sequence=cell.sequence, estimator=cell.system, runs=len(cell.runs), ok=cell.ok, metrics=quartiles)
-
-
-def _quartiles(found: QuantilesOfAll | None) -> Quartiles | None:
-    return None if found is None else of_attributes(Quartiles, found)
-
-
-def _standing(standing: Standing) -> StandingRecord:
-    metrics = {key: _quartiles(found) for key, found in standing.quantiles.items()}
-    return of_attributes(StandingRecord, standing, estimator=standing.system, metrics=metrics)
 
 
 def read_evaluation(path: Path) -> EvaluationRecord:

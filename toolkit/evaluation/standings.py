@@ -11,22 +11,22 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from toolkit.answers import Status
-from toolkit.errors import DataError
+from toolkit.errors import DataError, one_line
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
-from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
+from toolkit.experiment.statistics import quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
-from toolkit.files.documents import Count
+from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics import Metric
+from toolkit.metrics import Metric, Scores
 from toolkit.progress import SILENT, Progress
 
 METRIC_BY_KEY: Mapping[str, Metric] = {metric.key: metric for metric in METRICS}
@@ -37,15 +37,33 @@ _WORTH_PROCESSES = 200
 _MOST_EXACT = 1000
 
 
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """One run: how it ended, its metrics, and why they are missing; ``log`` has the reason of a failure."""
+class RunRecord(Struct, frozen=True, kw_only=True):
+    """One run of one system."""
 
-    item: Item
+    sequence: str
+    estimator: Annotated[str, Meta(description="the system's name")]
+    run: str
+    file: Annotated[str | None, Meta(description="as it was given; null where there is none and ought to be one")]
+    output: Literal["final"]
     status: Status
-    values: Mapping[str, float | None]
-    notes: Mapping[str, str]
-    log: tuple[str, ...] = ()
+    metrics: Annotated[dict[str, Value], Meta(description="by metric key")]
+    notes: Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on it")]
+    log: Annotated[tuple[str, ...], Meta(description="why it failed")]
+
+    def __post_init__(self) -> None:
+        for key, value in self.metrics.items():
+            if value is None and not self.notes.get(key):
+                raise ValueError(f"metrics.{key} is null, and notes does not say why")
+        if self.status != "ok" and not self.log:
+            raise ValueError(f"status is {self.status}, and log does not say why")
+
+
+class Quartiles(Struct, frozen=True, kw_only=True):
+    """Quartiles in which what failed is infinitely bad; null where that decides one."""
+
+    lower_quartile: float | None
+    median: float | None
+    upper_quartile: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +72,7 @@ class Cell:
 
     system: str
     sequence: str
-    runs: tuple[EvaluatedRun, ...]
+    runs: tuple[RunRecord, ...]
 
     @property
     def ok(self) -> int:
@@ -66,13 +84,13 @@ class Cell:
         """Return how many did not."""
         return len(self.runs) - self.ok
 
-    def quantiles(self, metric: Metric) -> QuantilesOfAll | None:
+    def quantiles(self, metric: Metric) -> Quartiles | None:
         """Return the quartiles over all runs; None where runs are ok and none of them has a value."""
-        good = [run.values.get(metric.key) for run in self.runs if run.status == "ok"]
+        good = [run.metrics.get(metric.key) for run in self.runs if run.status == "ok"]
         values = [value for value in good if value is not None]
         if good and not values:
             return None
-        return quantiles_of_all(values, self.failed, metric.best or "most")
+        return _quartiles(values, self.failed, metric)
 
     def median(self, metric: Metric) -> float | None:
         """Return the median over all runs, None where failed runs decide it or there is no value."""
@@ -87,22 +105,17 @@ class Cell:
         return next((note for note in notes if note), "not computed")
 
 
-@dataclass(frozen=True)
-class Standing:
-    """A system over all sequences.
+class StandingRecord(Struct, frozen=True, kw_only=True):
+    """A system over all sequences, best first."""
 
-    ``mean_rank`` and ``wins`` are by the median over the runs of each sequence; ``quantiles`` are over the sequences'
-    medians, in which one without a median is infinitely bad.
-    """
-
-    system: str
-    mean_rank: float
-    wins: int
-    sequences: int
-    solved: int
-    runs: int
-    ok: int
-    quantiles: Mapping[str, QuantilesOfAll | None]
+    estimator: Annotated[str, Meta(description="the system's name")]
+    mean_rank: Annotated[float, Meta(description="over the sequences, by the median over the runs; 1 is the best")]
+    wins: Annotated[Count, Meta(description="sequences on which every other system is worse")]
+    sequences: Count
+    solved: Annotated[Count, Meta(description="sequences with a median over the runs")]
+    runs: Count
+    ok: Count
+    metrics: Annotated[dict[str, Quartiles | None], Meta(description="over the medians of the sequences")]
 
 
 class PairedRecord(Struct, frozen=True, kw_only=True):
@@ -129,14 +142,14 @@ class EvaluatedSystems:
 
     truths: Mapping[str, TruthFile]
     terms: Terms
-    runs: tuple[EvaluatedRun, ...]
+    runs: tuple[RunRecord, ...]
     ranked_by: Metric
     notes: tuple[str, ...] = field(default=())
 
     @cached_property
     def systems(self) -> tuple[str, ...]:
         """The systems, in the order given."""
-        return tuple(dict.fromkeys(run.item.system for run in self.runs))
+        return tuple(dict.fromkeys(run.estimator for run in self.runs))
 
     @property
     def sequences(self) -> tuple[str, ...]:
@@ -146,9 +159,9 @@ class EvaluatedSystems:
     @cached_property
     def cells(self) -> Mapping[tuple[str, str], Cell]:
         """The runs by system and sequence; every pair of the two has some."""
-        found: dict[tuple[str, str], list[EvaluatedRun]] = {}
+        found: dict[tuple[str, str], list[RunRecord]] = {}
         for run in self.runs:
-            found.setdefault((run.item.system, run.item.sequence), []).append(run)
+            found.setdefault((run.estimator, run.sequence), []).append(run)
         return {key: Cell(*key, tuple(runs)) for key, runs in found.items()}
 
     @property
@@ -159,11 +172,11 @@ class EvaluatedSystems:
     @cached_property
     def scored_metrics(self) -> tuple[Metric, ...]:
         """The metrics that any run has."""
-        given = {key for run in self.runs for key, value in run.values.items() if value is not None}
+        given = {key for run in self.runs for key, value in run.metrics.items() if value is not None}
         return tuple(metric for metric in METRICS if metric.key in given)
 
     @cached_property
-    def leaderboard(self) -> tuple[Standing, ...]:
+    def leaderboard(self) -> tuple[StandingRecord, ...]:
         """The systems from the lowest mean rank up, and of the same mean rank in the order given."""
         ranks = self._ranks()
         standings = [self._standing(system, row) for system, row in zip(self.systems, ranks, strict=True)]
@@ -172,7 +185,7 @@ class EvaluatedSystems:
     @cached_property
     def paired(self) -> tuple[PairedRecord, ...]:
         """Every pair of systems over the sequences, the one higher on the leaderboard first; none of one sequence."""
-        order = [standing.system for standing in self.leaderboard]
+        order = [standing.estimator for standing in self.leaderboard]
         pairs = list(combinations(order, 2)) if len(self.sequences) > 1 else []
         differences = [self._log_ratios(one, other) for one, other in pairs]
         p_values = [signed_rank_p(given) for given in differences]
@@ -202,18 +215,18 @@ class EvaluatedSystems:
         costs = np.array([self._costs(system) for system in self.systems])
         return np.array([_ranked(column) for column in costs.T]).T
 
-    def _standing(self, system: str, ranks: Array) -> Standing:
+    def _standing(self, system: str, ranks: Array) -> StandingRecord:
         cells = [self.cells[system, sequence] for sequence in self.sequences]
         solved = np.isfinite(self._costs(system))
-        return Standing(
-            system,
-            float(ranks.mean()),
-            int(((ranks == 1.0) & solved).sum()),
-            len(cells),
-            int(solved.sum()),
-            sum(len(cell.runs) for cell in cells),
-            sum(cell.ok for cell in cells),
-            {metric.key: _over_sequences(cells, metric) for metric in self.scored_metrics},
+        return StandingRecord(
+            estimator=system,
+            mean_rank=float(ranks.mean()),
+            wins=int(((ranks == 1.0) & solved).sum()),
+            sequences=len(cells),
+            solved=int(solved.sum()),
+            runs=sum(len(cell.runs) for cell in cells),
+            ok=sum(cell.ok for cell in cells),
+            metrics={metric.key: _over_sequences(cells, metric) for metric in self.scored_metrics},
         )
 
     def _log_ratios(self, system: str, other: str) -> Array:
@@ -243,15 +256,14 @@ def evaluate(
     truths = {name: read_truth(name, path) for name, path in gathered.truths.items()}
     by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
     units = [_Unit(name, path, by_sequence[name], terms) for name, path in gathered.truths.items()]
-    scored: dict[Item, EvaluatedRun] = {}
+    scored: dict[Item, RunRecord] = {}
     processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
-    for place, found in results_of(units, processes, _evaluated, progress):
-        if isinstance(found, LostUnit):
-            scored |= {item: EvaluatedRun(item, "failed", {}, {}, (found.why,)) for item in units[place].items}
-        else:
-            scored |= {run.item: run for run in found}
+    for place, result in results_of(units, processes, _evaluated, progress):
+        items = units[place].items
+        found = [_run(item, None, result.why) for item in items] if isinstance(result, LostUnit) else result
+        scored |= zip(items, found, strict=True)
     runs = tuple(scored[item] for item in gathered.items)
-    if not any(run.values for run in runs):
+    if not any(value is not None for run in runs for value in run.metrics.values()):
         raise DataError(next(run.log[0] for run in runs if run.log))
     return EvaluatedSystems(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
 
@@ -266,7 +278,7 @@ class _Unit:
     terms: Terms
 
 
-def _evaluated(unit: _Unit, progress: Progress) -> tuple[EvaluatedRun, ...]:
+def _evaluated(unit: _Unit, progress: Progress) -> tuple[RunRecord, ...]:
     truth = read_truth(unit.sequence, unit.truth)
     runs = []
     for i, item in enumerate(unit.items):
@@ -275,19 +287,37 @@ def _evaluated(unit: _Unit, progress: Progress) -> tuple[EvaluatedRun, ...]:
     return tuple(runs)
 
 
-def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:
+def evaluated(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
     """Score one run; a fault of its file goes into its log and is not raised."""
     if item.path is None:
-        return EvaluatedRun(item, "failed", {}, {}, ("there is no trajectory",))
+        return _run(item, None, "there is no trajectory")
     try:
         scores = score_file(item.path, truth, terms)
     except DataError as error:
-        return EvaluatedRun(item, "failed", {}, {}, (" ".join(str(error).split()),))
+        return _run(item, None, one_line(str(error)))
     covered = scores.values[COVERAGE.key]
     if covered is not None and covered < terms.least_coverage_percent:
         why = f"it covers {covered:.1f} % of the truth's time, and {terms.least_coverage_percent:g} % is required"
-        return EvaluatedRun(item, "failed", scores.values, scores.notes, (f"{item.path}: {why}",))
-    return EvaluatedRun(item, "ok", scores.values, scores.notes)
+        return _run(item, scores, f"{item.path}: {why}")
+    return _run(item, scores)
+
+
+def _run(item: Item, scores: Scores | None, why: str = "") -> RunRecord:
+    """Return a run with its scores, if it has any; one with a reason failed."""
+    if scores is None:
+        scores = Scores.none((metric.key for metric in METRICS), why)
+    values = {metric.key: scores.values.get(metric.key) for metric in METRICS}
+    return RunRecord(
+        sequence=item.sequence,
+        estimator=item.system,
+        run=item.run,
+        file=None if item.path is None else item.path.as_posix(),
+        output="final",
+        status="failed" if why else "ok",
+        metrics={key: int(v) if v is not None and METRIC_BY_KEY[key].count else v for key, v in values.items()},
+        notes={key: scores.notes[key] for key in sorted(scores.notes)},
+        log=(why,) if why else (),
+    )
 
 
 def signed_rank_p(differences: Array) -> float:
@@ -333,13 +363,13 @@ def _paired(system: str, other: str, log_ratios: Array, p: float, p_holm: float)
     )
 
 
-def _over_sequences(cells: Sequence[Cell], metric: Metric) -> QuantilesOfAll | None:
+def _over_sequences(cells: Sequence[Cell], metric: Metric) -> Quartiles | None:
     """Return the quartiles of the medians of sequences; those where every ok run lacks the metric take no part."""
     due = [cell for cell in cells if cell.quantiles(metric) is not None]
-    return _quantiles([cell.median(metric) for cell in due], metric)
+    medians = [median for cell in due if (median := cell.median(metric)) is not None]
+    return _quartiles(medians, len(due) - len(medians), metric) if medians else None
 
 
-def _quantiles(medians: Iterable[float | None], metric: Metric) -> QuantilesOfAll | None:
-    given = list(medians)
-    good = [value for value in given if value is not None]
-    return quantiles_of_all(good, len(given) - len(good), metric.best or "most") if good else None
+def _quartiles(good: Iterable[float], bad: int, metric: Metric) -> Quartiles | None:
+    found = quantiles_of_all(good, bad, metric.best or "most")
+    return None if found is None else of_attributes(Quartiles, found)

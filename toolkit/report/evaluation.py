@@ -14,8 +14,7 @@ from typing import NamedTuple
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedRecord, Standing
-from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedRecord, Quartiles, RunRecord, StandingRecord
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.gate.baseline import FALSE_ALARM_RATE
@@ -81,10 +80,13 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     rows = []
     for i, standing in enumerate(evaluation.leaderboard):
         counts = [f"{standing.mean_rank:.2f}", str(standing.wins)] if several else []
-        spread = _quartiles_of(evaluation, standing, evaluation.ranked_by, several=several)
+        ranked_by = evaluation.ranked_by
+        spread = _quartiles_of(evaluation, standing, ranked_by, several=several)
+        cells = [evaluation.cells[standing.estimator, sequence] for sequence in evaluation.sequences]
+        count = sum(one.quantiles(ranked_by) is not None for one in cells) if several else standing.runs
+        quartiles = _quartiles(spread, ranked_by, units[ranked_by]) if count > 1 else MISSING
         values = [cell(medians[metric][i], metric, units[metric]) for metric in metrics]
-        ends, ranked_by = f"{standing.ok} of {standing.runs}", evaluation.ranked_by
-        rows.append((standing.system, ends, *counts, _quartiles(spread, ranked_by, units[ranked_by]), *values))
+        rows.append((standing.estimator, f"{standing.ok} of {standing.runs}", *counts, quartiles, *values))
     before = len(heads) - len(metrics)
     best = {(i, before + j) for j, metric in enumerate(metrics) for i in _best(medians[metric], metric)}
     return Table(tuple(heads), tuple(rows), labels=1, best=frozenset(best))
@@ -96,11 +98,11 @@ def _medians(evaluation: EvaluatedSystems, metric: Metric, *, several: bool) -> 
 
 
 def _quartiles_of(
-    evaluation: EvaluatedSystems, standing: Standing, metric: Metric, *, several: bool
-) -> QuantilesOfAll | None:
+    evaluation: EvaluatedSystems, standing: StandingRecord, metric: Metric, *, several: bool
+) -> Quartiles | None:
     if several:
-        return standing.quantiles.get(metric.key)
-    return evaluation.cells[standing.system, evaluation.sequences[0]].quantiles(metric)
+        return standing.metrics.get(metric.key)
+    return evaluation.cells[standing.estimator, evaluation.sequences[0]].quantiles(metric)
 
 
 def _best(medians: list[float | None], metric: Metric) -> set[int]:
@@ -113,7 +115,7 @@ def _best(medians: list[float | None], metric: Metric) -> set[int]:
 
 def sequences_table(evaluation: EvaluatedSystems) -> Table:
     """Return a row a sequence and a column a system: the median over the runs of the metric that ranks."""
-    metric, systems = evaluation.ranked_by, [standing.system for standing in evaluation.leaderboard]
+    metric, systems = evaluation.ranked_by, [standing.estimator for standing in evaluation.leaderboard]
     unit = unit_of(metric, (one.median(metric) for one in evaluation.cells.values()))
     heads = (("sequence", "", ""), *((system, "", unit.name) for system in systems))
     rows, best = [], set()
@@ -133,8 +135,8 @@ def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
     return f"{cell(median, metric, unit)} ({failed})" if failed else cell(median, metric, unit)
 
 
-def _quartiles(found: QuantilesOfAll | None, metric: Metric, unit: ShownUnit) -> str:
-    if found is None or found.n < 2:
+def _quartiles(found: Quartiles | None, metric: Metric, unit: ShownUnit) -> str:
+    if found is None:
         return MISSING
     return " .. ".join(cell(q, metric, unit) for q in (found.lower_quartile, found.upper_quartile))
 
@@ -161,7 +163,7 @@ def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
 def paired_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield how the systems differ over the sequences, the leader against each other, and what is more than chance."""
     tests = evaluation.paired
-    leader = evaluation.leaderboard[0].system
+    leader = evaluation.leaderboard[0].estimator
     for test in tests:
         if test.estimator == leader or test.is_significant:
             yield _paired_line(test, len(tests), evaluation.ranked_by)
@@ -185,7 +187,7 @@ def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURE
     failed = [run for run in evaluation.runs if run.status != "ok"]
     shown = failed if most is None else failed[:most]
     for run in shown:
-        yield f"{run.item.system}, {run.item.sequence}, {run.item.run}: {run.log[0]}"
+        yield f"{run.estimator}, {run.sequence}, {run.run}: {run.log[0]}"
     if len(shown) < len(failed):
         yield f"{len(failed) - len(shown)} more runs failed; evaluation.json and --format csv have all"
 
@@ -193,13 +195,14 @@ def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURE
 def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
-    scored = {metric.key for metric in evaluation.scored_metrics}
+    scored = [metric.key for metric in evaluation.scored_metrics]
     remarks: dict[str, _RemarkScope] = {}
     for run in evaluation.runs:
-        for key in run.notes.keys() & scored:
-            text = run.notes[key] if run.values.get(key) is not None else f"no value: {run.notes[key]}"
+        # Why a run failed is listed already.
+        for key in (key for key in scored if run.notes.get(key) and run.notes[key] not in run.log):
+            text = run.notes[key] if run.metrics.get(key) is not None else f"no value: {run.notes[key]}"
             about = remarks.setdefault(text, _RemarkScope({}, {}))
-            about.keys[key] = about.whose[f"{run.item.system} on {run.item.sequence}"] = None
+            about.keys[key] = about.whose[f"{run.estimator} on {run.sequence}"] = None
     for text, about in list(remarks.items())[:_MOST_REMARKS]:
         first, *others = about.whose
         more = f" and {len(others)} more" if others else ""
@@ -253,10 +256,10 @@ def evaluation_csv(evaluation: EvaluatedSystems) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["sequence", "system", "run", "status", *(metric.key for metric in METRICS), "why"])
     for run in evaluation.runs:
-        values = [run.values.get(metric.key) for metric in METRICS]
+        values = [run.metrics.get(metric.key) for metric in METRICS]
         texts = ["" if value is None else repr(value) for value in values]
         why = run.log[0] if run.log else ""
-        writer.writerow([run.item.sequence, run.item.system, run.item.run, run.status, *texts, why])
+        writer.writerow([run.sequence, run.estimator, run.run, run.status, *texts, why])
     return out.getvalue()
 
 
@@ -360,11 +363,11 @@ def _figure(evaluation: EvaluatedSystems) -> str:
     return f'<figure>{keys}{drawing}<figcaption class="fine">{in_html(label)}</figcaption></figure>'
 
 
-def _value(run: EvaluatedRun, evaluation: EvaluatedSystems) -> float | None:
-    value = run.values.get(evaluation.ranked_by.key)
+def _value(run: RunRecord, evaluation: EvaluatedSystems) -> float | None:
+    value = run.metrics.get(evaluation.ranked_by.key)
     return value if value is not None and value > 0.0 else None
 
 
-def _named(run: EvaluatedRun, value: float | None) -> str:
+def _named(run: RunRecord, value: float | None) -> str:
     entry = run.log[0] if run.status != "ok" else f"{value:.4g}" if value is not None else "no value"
-    return f"{run.item.system}, {run.item.sequence}, {run.item.run}: {entry}"
+    return f"{run.estimator}, {run.sequence}, {run.run}: {entry}"
