@@ -11,7 +11,7 @@ from toolkit.audit.alignment import is_excluded, is_there, metres, way_gone
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import Intervals
 from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
-from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Scalar, cauchy, mean_in_sigmas, slope
+from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Ranking, Scalar, cauchy, ranked, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
@@ -43,9 +43,10 @@ def axes_named(turn: Array) -> str:
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 
 
-# Least mean difference of the logarithms of two readings' residuals, in its own standard errors. The file allows all
-# readings, so the difference only has to be beyond chance (intervals are correlated over about a second).
-AGAINST_SECOND_READING = 4.0
+# Least mean difference of the costs of two candidates, in its own standard errors. To choose among those that a file
+# allows, or among repairs, it only has to be beyond chance (intervals are correlated over about a second); to reject
+# the file as given, far beyond.
+AGAINST_SECOND, AGAINST_GIVEN = 4.0, 8.0
 # Two readings look the same way if their cameras differ by less than this angle. The noise of the samples, which the
 # lever arm turns into motion of the camera, then changes the residuals more than the choice of the reading.
 SAME_READING_RAD = 0.05
@@ -69,14 +70,14 @@ def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     readings, camera = _four_readings(sequence.rig.T_imu_cam), evidence.camera_motion
-    misses = {name: one_step_px_by_interval(sequence, camera, T) for name, T in readings.items()}
-    logs = {name: np.log(np.maximum(miss, 1e-9)) for name, miss in misses.items()}
-    first, *others = sorted(logs, key=lambda name: float(np.mean(logs[name])))
-    certainty = {name: mean_in_sigmas(logs[name] - logs[first]) for name in others}
-    as_good = [name for name in others if not certainty[name] > AGAINST_SECOND_READING]
+    misses_px = np.stack([one_step_px_by_interval(sequence, camera, T) for T in readings.values()])
+    found, names = ranked(np.log(np.maximum(misses_px, 1e-9))), list(readings)
+    first, *others = (names[k] for k in found.order)
+    behind = dict(zip(names, found.behind, strict=True))
+    as_good = [name for name in others if not behind[name] > AGAINST_SECOND]
     if len(as_good) == len(others):
         return Undecided(f"the tracks fit every reading of the extrinsic equally, best {first} and {as_good[0]}")
-    doubt = "".join(f"; {name} explains the motion equally well ({certainty[name]:.1f} sigma)" for name in as_good)
+    doubt = "".join(f"; {name} explains the motion equally well ({behind[name]:.1f} sigma)" for name in as_good)
     for name in others:
         same_way = _turned_rad(readings[first], readings[name]) < SAME_READING_RAD
         if not (same_way or name in as_good):
@@ -143,10 +144,6 @@ def _read_as(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
     return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
 
 
-# Least mean difference of the costs of two readings, in its own standard errors. To reject the file as given it must be
-# far beyond chance (intervals are correlated over about a second), to choose among repairs only beyond chance.
-AGAINST_GIVEN = 8.0
-AGAINST_SECOND = 4.0
 # Two readings look the same way if their cameras differ by less than this angle.
 SAME_WAY_RAD = 0.2
 # Positions nearer than this to each other are taken as one.
@@ -181,22 +178,22 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
     """
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
-    costs = _costs(intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
-    first, second = _best_two(readings, costs)
-    better, alone = mean_in_sigmas(costs[0] - costs[first]), _of_rotations(intervals, given)
+    found = _ranked(intervals, readings)
+    first, twins = found.best, _twins(readings, found.best)
+    second = next(k for k in found.order if k not in twins)  # the best under which the camera looks another way
+    better, alone = found.behind[0], _of_rotations(intervals, given)
+    certain = found.behind[second] > AGAINST_SECOND
     at_odds = _of_rotations(intervals, readings[first].T_imu_cam) != _OWN
     if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
         return _exchanged(alone)
-    if first == 0 and (certainty := mean_in_sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
-        return Undecided(
-            f"{readings[second].name} explains the motion as well as what is given ({certainty:.1f} sigma)"
-        )
+    if first == 0 and not certain:
+        as_well = f"{readings[second].name} explains the motion as well as what is given"
+        return Undecided(f"{as_well} ({found.behind[second]:.1f} sigma)")
     if first == 0:
         return None
     if better < AGAINST_GIVEN:
         return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
-    certain = mean_in_sigmas(costs[second] - costs[first]) > AGAINST_SECOND
-    taken, doubt = _settled(evidence, intervals, [readings[k] for k in _twins(readings, first)])
+    taken, doubt = _settled(evidence, intervals, [readings[k] for k in twins])
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
         count=1,
@@ -224,11 +221,11 @@ def _exchanged(alone: str) -> Symptom:
     )
 
 
-def _readings(given: Array) -> tuple[ExtrinsicConvention, ...]:
+def _readings(given: Array) -> list[ExtrinsicConvention]:
     """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
     place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
     as_given = ExtrinsicConvention(given, _OWN, "", "", place_m)
-    return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
+    return [as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given)]
 
 
 def _of_body(given: Array, turn: Array) -> ExtrinsicConvention:
@@ -251,14 +248,7 @@ def _inverse(given: Array) -> ExtrinsicConvention:
     )
 
 
-def _best_two(readings: tuple[ExtrinsicConvention, ...], costs: Array) -> tuple[int, int]:
-    """Return the best reading, and the best among those under which the camera looks another way."""
-    order = [int(k) for k in np.argsort(costs.mean(axis=1))]
-    twins = _twins(readings, order[0])
-    return order[0], next(k for k in order if k not in twins)
-
-
-def _twins(readings: tuple[ExtrinsicConvention, ...], one: int) -> list[int]:
+def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:
     """Return the readings under which the camera looks the same way as under one, which is among them.
 
     A rotation of the camera's axes and one of the body's can be such a pair. The given extrinsic and its inverse have
@@ -274,11 +264,9 @@ def _settled(
     evidence: Evidence, intervals: Intervals, twins: list[ExtrinsicConvention]
 ) -> tuple[ExtrinsicConvention, str]:
     """Return the best of readings that look the same way, at the position that turns show, and any doubt in words."""
-    costs = _costs(intervals, np.stack([one.T_imu_cam for one in twins])).mean(axis=1)
-    place_m, doubt = _placed(evidence, intervals, twins[int(np.argmin(costs))])
+    place_m, doubt = _placed(evidence, intervals, twins[_ranked(intervals, twins).best])
     placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in twins]
-    costs = _costs(intervals, np.stack([one.T_imu_cam for one in placed])).mean(axis=1)
-    return placed[int(np.argmin(costs))], doubt
+    return placed[_ranked(intervals, placed).best], doubt
 
 
 def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConvention) -> tuple[Array, str]:
@@ -301,20 +289,20 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConventi
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
     """Name the axes of an extrinsic that the gyro's channels measure: x, y, z unless others are better beyond doubt."""
     signed, w_imu = signed_axes(), intervals._replace(T_imu_cam=T_imu_cam).w_seen_radps
-    costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
-    best = int(np.argmin(costs.mean(axis=1)))
-    return axes_named(signed[best]) if mean_in_sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
+    found = ranked(cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W))
+    return axes_named(signed[found.best]) if found.behind[0] > AGAINST_SECOND else _OWN
 
 
-def _costs(intervals: Intervals, candidates: Array) -> Array:
-    """Return the negative Cauchy log-likelihood (C, M) of each interval under each extrinsic (C, 4, 4)."""
+def _ranked(intervals: Intervals, readings: list[ExtrinsicConvention]) -> Ranking:
+    """Rank extrinsics by the negative Cauchy log-likelihood of each interval under them."""
+    candidates = np.stack([reading.T_imu_cam for reading in readings])
     R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
     w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)
     costs = cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)
     if intervals.v_mps is not None:
         v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
         costs = costs + cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
-    return costs
+    return ranked(costs)
 
 
 def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
@@ -405,11 +393,9 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
         return None
     orders = signed_axes()
     left = np.stack([_left(changes, order) for order in orders])
-    costs = cauchy(left, LEAST_SPREAD)
-    ranked = [int(k) for k in np.argsort(costs.mean(axis=1))]
-    best = ranked[0]
+    best, _, behind = ranked(cauchy(left, LEAST_SPREAD))
     given_mps2, best_mps2 = (float(np.median(np.linalg.norm(left[k], axis=1))) for k in (0, best))
-    if best == 0 or mean_in_sigmas(costs[0] - costs[best]) < AGAINST_GIVEN_ORDER or best_mps2 > MOST_LEFT * given_mps2:
+    if best == 0 or behind[0] < AGAINST_GIVEN_ORDER or best_mps2 > MOST_LEFT * given_mps2:
         return None
     return Symptom(
         count=1,

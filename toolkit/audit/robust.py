@@ -57,6 +57,24 @@ def mean_in_sigmas(difference: Array) -> float:
     return float(np.mean(difference)) / max(error, 1e-12)
 
 
+class Ranking(NamedTuple):
+    """Candidates that explain the same intervals.
+
+    ``order`` (C,) lists them by mean cost, ``best`` first. ``behind`` (C,) is how much more each one costs than the
+    best, in standard errors of the mean difference.
+    """
+
+    best: int
+    order: list[int]
+    behind: list[float]
+
+
+def ranked(costs: Array) -> Ranking:
+    """Rank candidates by their costs (C, M) over M intervals. The one named first wins a tie."""
+    order = np.argsort(costs.mean(axis=1), kind="stable").tolist()
+    return Ranking(order[0], order, [mean_in_sigmas(cost - costs[order[0]]) for cost in costs])
+
+
 def median(values: Array) -> Array:
     """Return the median (...) of values (N, ...), NaN where one is NaN or N is 0.
 
