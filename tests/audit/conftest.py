@@ -1,7 +1,7 @@
 """Short clean recordings of every kind, and the faults that can be planted in them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit, fault
+from toolkit.audit.edits import keep_samples
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.measurements import NS_PER_S
-from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Observations, Sequence, content_digest
-from toolkit.simulation import SCENARIOS, simulate
+from toolkit.simulation import SCENARIOS, faults, simulate
 
 # Most faults show in a hundred frames; of a flight as short a gap of two seconds would leave too little.
 LENGTH_S = {"drive": 10.0, "drive-imu": 10.0, "flight": 6.0}
@@ -47,26 +46,11 @@ def with_observations(sequence: Sequence, rows: object = slice(None), **columns:
     return replace(sequence, observations=Observations.sorted(*(merged[c][rows] for c in merged)))
 
 
-def with_samples(sequence: Sequence, rows: object) -> Sequence:
-    """Return the sequence with the motion samples of an index, in that order."""
-    m = sequence.motion
-    kept = {field.name: getattr(m, field.name)[rows] for field in fields(m) if field.name != "pairing"}
-    return replace(sequence, motion=replace(m, **kept))
-
-
-def turned(sequence: Sequence, turn: Array) -> Sequence:
-    """Return the sequence with its extrinsic written in other body axes."""
-    rig = sequence.rig
-    return replace(sequence, rig=replace(rig, T_imu_cam=se3(turn, np.zeros(3)) @ rig.T_imu_cam))
-
-
 def not_finite(sequence: Sequence) -> Plant:
     uv_px, values = sequence.observations.uv_px.copy(), sequence.motion.values.copy()
     uv_px[100:2100:50, 0] = np.nan
     values[40:100:20, 4] = np.inf
-    m = sequence.motion
-    names = [field.name for field in fields(m) if field.name not in ("t_ns", "pairing")]
-    motion = replace(m, **dict(zip(names, (values[:, :3], values[:, 3:]), strict=True)))
+    motion = sequence.motion.of(sequence.motion.t_ns, values)
     return Plant("not-finite", with_observations(replace(sequence, motion=motion), uv_px=uv_px), 40 + 3)
 
 
@@ -77,22 +61,19 @@ def time_order(sequence: Sequence) -> Plant:
     planted = with_observations(sequence, frame=swapped[sequence.observations.frame])
     planted = replace(planted, frames_t_ns=sequence.frames_t_ns[swapped])
     samples = np.sort(np.append(np.arange(len(sequence.motion.t_ns)), [5, 20]))
-    return Plant("time-order", with_samples(planted, samples), 1 + 2)
+    return Plant("time-order", keep_samples(planted, samples), 1 + 2)
 
 
 def time_gap(sequence: Sequence) -> Plant:
-    """Leave a hole of two seconds in the motion samples, a third of the way after the start."""
-    t_s = (sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S
-    begins_s = sequence.duration_s / 3.0
-    return Plant("time-gap", with_samples(sequence, (t_s <= begins_s) | (t_s >= begins_s + 2.0)), 1)
+    """Leave a hole of two seconds in the motion samples, in the first half."""
+    return Plant("time-gap", faults.motion_gap(sequence, 2.0, seed=3), 1)
 
 
 def outside_motion(sequence: Sequence) -> Plant:
     """Let the motion samples reach from frame 5 to the last frame but three."""
     t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
     first, last = np.searchsorted(t_ns, frames[5], side="right") - 1, np.searchsorted(t_ns, frames[-4])
-    rows = np.arange(t_ns.size)
-    return Plant("outside-motion", with_samples(sequence, (rows >= first) & (rows <= last)), 5 + 3)
+    return Plant("outside-motion", keep_samples(sequence, np.arange(first, last + 1)), 5 + 3)
 
 
 def no_disparity(sequence: Sequence) -> Plant:
@@ -142,7 +123,9 @@ def doubled_disparity(sequence: Sequence) -> Plant:
 
 
 def mixed_axes(sequence: Sequence) -> Plant:
-    return Plant("mixed-axes", turned(sequence, np.diag([1.0, -1.0, -1.0])), 1)
+    """Write the extrinsic in other axes of the body."""
+    T_imu_cam = se3(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ sequence.rig.T_imu_cam
+    return Plant("mixed-axes", replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam)), 1)
 
 
 def extrinsic_translation(sequence: Sequence) -> Plant:
@@ -155,39 +138,39 @@ def extrinsic_translation(sequence: Sequence) -> Plant:
 def twist_lag(sequence: Sequence) -> Plant:
     """Stamp every twist one sample late, so that it describes the interval before its stamp."""
     m = sequence.motion
-    assert isinstance(m, TwistSamples)
     late = np.maximum(np.arange(m.t_ns.size) - 1, 0)
-    return Plant("twist-lag", replace(sequence, motion=replace(m, v_mps=m.v_mps[late], w_radps=m.w_radps[late])), 1)
+    return Plant("twist-lag", replace(sequence, motion=m.of(m.t_ns, m.values[late])), 1)
 
 
-PLANTS: dict[str, Callable[[Sequence], Plant]] = {
-    "not-finite": not_finite,
-    "time-order": time_order,
-    "time-gap": time_gap,
-    "outside-motion": outside_motion,
-    "no-disparity": no_disparity,
-    "stale-frames": stale_frames,
-    "returning-tracks": returning_tracks,
-    "doubled-disparity": doubled_disparity,
-    "mixed-axes": mixed_axes,
-    "extrinsic-translation": extrinsic_translation,
-    "twist-lag": twist_lag,
-}
+_ALL = (
+    not_finite,
+    time_order,
+    time_gap,
+    outside_motion,
+    no_disparity,
+    stale_frames,
+    returning_tracks,
+    doubled_disparity,
+    mixed_axes,
+    extrinsic_translation,
+    twist_lag,
+)
+PLANTS: dict[str, Callable[[Sequence], Plant]] = {plant.__name__.replace("_", "-"): plant for plant in _ALL}
 CASES = [
-    (scenario, fault)
+    (scenario, name)
     for scenario in ("drive", "drive-imu", "flight")
-    for fault in PLANTS
+    for name in PLANTS
     # An IMU has no velocities to tell a lever arm, and its samples are interpolated, not paired.
-    if scenario == "drive" or fault not in ("extrinsic-translation", "twist-lag")
+    if scenario == "drive" or name not in ("extrinsic-translation", "twist-lag")
 ]
 
 
 @pytest.fixture(scope="session", params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
 def plant(request: pytest.FixtureRequest) -> Plant:
     """Return each fault planted in each kind of recording that can have it."""
-    scenario, fault = request.param
+    scenario, name = request.param
     # A lag of the twists shows only where there are turns enough.
-    return PLANTS[fault](clean(scenario, duration_s=30.0 if fault == "twist-lag" else None))
+    return PLANTS[name](clean(scenario, duration_s=30.0 if name == "twist-lag" else None))
 
 
 def _once(function: Callable[..., Any], content: Callable[[Sequence], str]) -> Callable[..., Any]:
@@ -236,4 +219,4 @@ def clean_recording() -> Callable[..., Sequence]:
 @pytest.fixture
 def planted() -> Callable[[str, Sequence], Sequence]:
     """Return what plants a fault, by name, in a recording."""
-    return lambda fault, sequence: PLANTS[fault](sequence).planted
+    return lambda name, sequence: PLANTS[name](sequence).planted

@@ -114,22 +114,8 @@ def _halfway(values: Array) -> Array:
 ONLY_LINEAR, NAN_Y = np.repeat([1.0, 0.0], 3), np.array([0.0, np.nan, 0.0, 0.0, 0.0, 0.0])
 
 CASES = [
-    Case(
-        with_values(lambda v: v[:, [0, 1, 2, 3, 5, 4]]),
-        1.0,
-        "mixed-axes",
-        "blocks",
-        "extrinsic's x, z, y, so no",
-        TWIST,
-    ),
-    Case(
-        with_values(lambda v: v[:, [0, 1, 2, 5, 4, 3]]),
-        2.0,
-        "mixed-axes",
-        "blocks",
-        "extrinsic's z, y, x, so no",
-        TWIST,
-    ),
+    Case(with_values(lambda v: v[:, [0, 1, 2, 3, 5, 4]]), 1.0, "mixed-axes", "blocks", "extrinsic's x, z, y", TWIST),
+    Case(with_values(lambda v: v[:, [0, 1, 2, 5, 4, 3]]), 2.0, "mixed-axes", "blocks", "extrinsic's z, y, x", TWIST),
     Case(with_values(lambda v: v[:, [1, 0, 2, 3, 4, 5]]), 3.0, "mixed-axes", "blocks", "the velocities do not", TWIST),
     Case(with_values(_halfway), 4.0, "units", "blocks", "deg/s in a part of the recording", TWIST),
     Case(
@@ -282,22 +268,6 @@ def test_a_kept_offset_is_reported_blocks_and_is_left() -> None:
     (finding,) = [f for f in outcome.findings if f.fault == "time-offset"]
     assert finding.blocking
     assert outcome.sequence is late
-
-
-def test_a_calibration_that_was_repaired_is_the_true_one() -> None:
-    sequence = clean("drive")
-    of_the_table = ((faults.baseline_unit, 1000.0), (faults.extrinsic_unit, 1000.0), (faults.inverted_extrinsic, 1.0))
-    for fault, dose in of_the_table:
-        rig = audited(fault, dose, "drive").sequence.rig
-        assert rig.baseline_m == pytest.approx(sequence.rig.baseline_m)
-        np.testing.assert_allclose(rig.T_imu_cam, sequence.rig.T_imu_cam, atol=1e-9)
-
-
-def test_samples_in_another_unit_come_back_as_they_were() -> None:
-    sequence = clean("drive")
-    for fault, dose in ((faults.linear_unit, 3.6), (faults.angular_unit, 180.0 / np.pi)):
-        repaired = audited(fault, dose, "drive").sequence
-        np.testing.assert_allclose(repaired.motion.values, sequence.motion.values, rtol=1e-9, atol=1e-12)
 
 
 def test_an_implausible_sample_is_dropped_alone() -> None:
