@@ -3,10 +3,9 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from toolkit.answers import Run
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.formats import PosesFile
@@ -73,35 +72,10 @@ class Plan:
 
     def recording(self, source: str | Recorded, seed: int) -> Recording:
         """Return a source of the plan under a seed."""
-        settings = self.settings
-        return Recording(
-            source,
-            seed,
-            self.truth,
-            self.keep,
-            settings.start,
-            max_frames=self.max_frames,
-            noise=settings.noise,
-            frontend=settings.frontend,
-            tracks=settings.tracks,
-            vary=settings.vary,
-            card=settings.card and seed == self.seeds[0],
-            part=self.part,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedCase:
-    """A source of a plan, ready to be read: under its first seed, with what other systems estimated from it."""
-
-    source: str | Recorded
-    prepared: Prepared
-    references: tuple[Run, ...]
-
-    @property
-    def name(self) -> str:
-        """Return the sequence's name."""
-        return self.prepared.sequence.name
+        return Recording.under(
+            self.settings, source, seed, truth=self.truth, keep=self.keep, max_frames=self.max_frames, part=self.part,
+            card=self.settings.card and seed == self.seeds[0],
+        )  # fmt: skip
 
 
 def run(plan: Plan, progress_for: ProgressFor = silent, directories: Sequence[Path] = ()) -> tuple[Comparison, ...]:
@@ -129,7 +103,7 @@ def workers_of(plan: Plan) -> Pool:
     return workers
 
 
-def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[PreparedCase, ...]:
+def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[Prepared, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, SettingsError for a trajectory's name that
@@ -148,7 +122,7 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
     names = ", ".join(_name(source) for source in plan.sources)
     with progress_for(f"{names}: loading and checking") as progress:
         prepared = _prepared(recordings, workers if plan.scheduler is None else Workers(1), progress)
-        return tuple(_case(plan, source, one, files) for source, one in zip(plan.sources, prepared, strict=True))
+        return tuple(_with_references(plan, one, files) for one in prepared)
 
 
 def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress) -> list[Prepared]:
@@ -170,15 +144,16 @@ def _unless_lost(result: Prepared | LostUnit, recording: Recording) -> Prepared:
     return result
 
 
-def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping[str, PosesFile]) -> PreparedCase:
+def _with_references(plan: Plan, case: Prepared, files: Mapping[str, PosesFile]) -> Prepared:
     """Return a prepared source with what other systems estimated from it."""
+    source, sequence = case.source, case.sequence
     brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
     check_names(brought, files)
-    references = reference_runs(brought, prepared.sequence)
-    return PreparedCase(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
+    runs = reference_runs(brought, sequence) + external_runs(files, case.whole, sequence)
+    return replace(case, references=runs)
 
 
-def stores_of(plan: Plan, cases: Sequence[PreparedCase], directories: Sequence[Path]) -> list[OutcomeStore]:
+def stores_of(plan: Plan, cases: Sequence[Prepared], directories: Sequence[Path]) -> list[OutcomeStore]:
     """Return where the outcomes of each case are kept, of a comparison over seeds; of one seed the runs are needed.
 
     Raises DataError where what is kept in a directory is damaged, OutputError where another process writes there.
@@ -195,14 +170,14 @@ def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.own_digest for name, entry in entries.items() if entry.own_digest}
 
 
-def _hash_under_seed_0(plan: Plan, case: PreparedCase) -> str:
-    prepared = case.prepared if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
+def _hash_under_seed_0(plan: Plan, case: Prepared) -> str:
+    prepared = case if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
     return prepared.sequence.content_hash()
 
 
 def comparisons(
     plan: Plan,
-    cases: Sequence[PreparedCase],
+    cases: Sequence[Prepared],
     workers: Pool,
     progress_for: ProgressFor = silent,
     stores: Sequence[Store] = (),
@@ -232,7 +207,7 @@ def comparisons(
 
 
 def _found_and_missing(
-    plan: Plan, cases: Sequence[PreparedCase], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
+    plan: Plan, cases: Sequence[Prepared], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
 ) -> tuple[list[list[Outcome]], list[Unit], list[int]]:
     """Return the outcomes that are there, by case, the units that have to be run, and the case of each of these."""
     outcomes: list[list[Outcome]] = [[] for _ in cases]
@@ -249,12 +224,12 @@ def _found_and_missing(
     return outcomes, units, owner
 
 
-def _label(cases: Sequence[PreparedCase], missing: int, there: int) -> str:
+def _label(cases: Sequence[Prepared], missing: int, there: int) -> str:
     names = ", ".join(dict.fromkeys(case.name for case in cases))
     return f"{names}: {missing} runs" + (f" ({there} are there)" if there else "")
 
 
-def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
+def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
     """Yield the work of a case: seed by seed, the estimators that take longest first."""
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
     # A worker of a cluster stands in another folder.
@@ -263,7 +238,7 @@ def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]
     for seed in plan.seeds:
         # Processes here use the prepared recording; workers of a cluster prepare it themselves and need not be sent it.
         is_ready = single or (seed == plan.seeds[0] and plan.scheduler is None)
-        recording = case.prepared if is_ready else plan.recording(source, seed)
+        recording = replace(case, references=()) if is_ready else plan.recording(source, seed)
         for name in names:
             build, keep_trajectories = plan.own.get(name), plan.keep_trajectories and not single
             yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories, entry=entries.get(name))
@@ -283,25 +258,25 @@ def _outcome(result: Outcome | LostUnit, unit: Unit, store: Store) -> Outcome:
 
 
 def _comparison(
-    plan: Plan, case: PreparedCase, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
+    plan: Plan, case: Prepared, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
 ) -> Comparison:
-    sequence = case.prepared.sequence
+    sequence = case.sequence
     ordered = in_order(outcomes, (*entries, *plan.own), plan.seeds)
     others = tuple(outcome_of(reference, sequence, plan.seeds[0]) for reference in case.references)
     on_ladder = LADDER in plan.estimators
     return Comparison(
         source=_name(case.source),
         sequence=sequence,
-        findings=case.prepared.findings,
-        prior=case.prepared.prior,
+        findings=case.findings,
+        prior=case.prior,
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        measured=case.prepared.measured,
+        measured=case.measured,
         settings=plan.settings,
         workers=workers,
-        undecided=case.prepared.undecided,
-        card=case.prepared.card,
+        undecided=case.undecided,
+        card=case.card,
         own_files={name: entry.word for name, entry in entries.items() if entry.own_digest},
     )
 

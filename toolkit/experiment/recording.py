@@ -5,10 +5,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from toolkit.answers import Run
 from toolkit.audit import Audit, Finding, audit, checked_again
 from toolkit.audit.edits import keep_frames
 from toolkit.datasets import check_built_in, load_sequence
@@ -20,7 +21,7 @@ from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.noise import Card, MeasuredNoise, card_of, measured_noise, with_gap_twists
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, why_not_sightings
-from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
+from toolkit.settings import DEFAULTS, Frontend, Noise, Settings, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.threads import on_one_thread
 
@@ -85,15 +86,23 @@ class Recording:
     card: bool = False
     part: Part = WHOLE
 
+    @classmethod
+    def under(cls, settings: Settings, source: str | Sequence, seed: int, **others: Any) -> "Recording":
+        """Return a source as the settings prepare it; ``others`` are the fields that are no settings."""
+        own = {name: getattr(settings, name) for name in ("start", "noise", "frontend", "tracks", "vary")}
+        return cls(source, seed, **own, **others)
+
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording as the estimators read it, the findings of the audit in it before, and the state they start from.
 
-    ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why;
-    ``measured`` is what was measured of its noise, None where the settings state it.
+    ``source`` is what it was loaded from, and ``whole`` the recording before it was cut; ``undecided`` has the faults
+    that could not be judged, and why; ``measured`` is what was measured of its noise, None where the settings state it;
+    ``references`` are the runs of other systems on it.
     """
 
+    source: str | Sequence
     sequence: Sequence
     findings: tuple[Finding, ...]
     prior: Prior
@@ -101,6 +110,12 @@ class Prepared:
     undecided: Mapping[str, str] = field(default_factory=dict)
     measured: MeasuredNoise | None = None
     card: Card | None = None
+    references: tuple[Run, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return the sequence's name."""
+        return self.sequence.name
 
 
 def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
@@ -124,7 +139,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         if recording.tracks.leave_out_moving:
             sequence = _within_budget(_without_moving_tracks(used, prior), recording.tracks.budget)
         findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
-        return Prepared(sequence, findings, prior, whole, audited.undecided, measured, card)
+        return Prepared(recording.source, sequence, findings, prior, whole, audited.undecided, measured, card)
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:

@@ -59,19 +59,7 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
     Paths are made absolute here: a process that reads them may have another working directory and environment.
     """
     source, truth = located(case.source), None if case.truth is None else Path(located(case.truth))
-    return [
-        Recording(
-            source,
-            seed,
-            truth,
-            start=settings.start,
-            duration_s=case.duration_s,
-            noise=settings.noise,
-            frontend=settings.frontend,
-            tracks=settings.tracks,
-        )
-        for seed in case.seeds
-    ]
+    return [Recording.under(settings, source, seed, truth=truth, duration_s=case.duration_s) for seed in case.seeds]
 
 
 def located(source: str) -> str:

@@ -23,7 +23,7 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
-from toolkit.experiment.pipeline import PreparedCase
+from toolkit.experiment.recording import Prepared
 from toolkit.files.documents import to_line, to_text
 from toolkit.files.reading import read_input
 from toolkit.files.writing import check_parent, check_replaceable, replaced_directory
@@ -99,7 +99,7 @@ def _is_page(path: Path) -> bool:
         return False
 
 
-def directories_for(cases: Sequence[PreparedCase], out: Path) -> tuple[Path, ...]:
+def directories_for(cases: Sequence[Prepared], out: Path) -> tuple[Path, ...]:
     """Return the run directory of each case: ``out`` for a single one, else folders in it by the sequences' names.
 
     Raises OutputError where one cannot be written or holds something else.
