@@ -17,6 +17,7 @@ from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.evaluation import against_baseline
 from toolkit.experiment.comparison import Comparison, Row, consistency_of
+from toolkit.experiment.configuration import configuration, read_configuration
 from toolkit.files.documents import parse, read, to_line, to_text
 from toolkit.gate import baseline
 from toolkit.metrics import Evaluation, Scores, describe
@@ -24,9 +25,11 @@ from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.consistency import body_errors
 from toolkit.report.curves import components, error_curves
 from toolkit.report.messages import note_lines
-from toolkit.report.records import RECORDS, read_card, read_check, schema_files
+from toolkit.report.records import RECORDS, read_card, read_check, read_manifest, schema_files
 from toolkit.report.report_json import report_document
 from toolkit.report.scores import MetricsDocument, metrics_document
+from toolkit.settings import Settings
+from toolkit.settings.records import Noise
 
 Document = dict[str, Any]
 
@@ -106,6 +109,23 @@ def test_a_card_of_version_1_is_read_as_one_whose_tracks_were_not_weighed() -> N
     assert (card.schema, card.track_weight) == ("vislam.card/1", msgspec.UNSET)
     given = json.loads(path.read_text())
     assert {key: given[key] for key in json.loads(to_text(card))} == json.loads(to_text(card))
+
+
+def test_a_manifest_whose_settings_chose_the_arithmetic_is_read_and_repeated_without() -> None:
+    path = OLD.with_name("older_documents") / "manifest-1.json"  # revision eb80bd9a, the last with compiled twins
+    given = json.loads(path.read_text())
+    assert given.pop("arithmetic") == {"msckf": "compiled"} and given["settings"].pop("arithmetic") == "auto"
+    assert json.loads(to_text(read_manifest(path))) == given
+    request, settings = read_configuration(path)
+    repeated = configuration(request, settings, str(path))
+    assert to_builtins(repeated.settings) == given["settings"]
+    assert repeated.request.estimators == ("ekf", "msckf")
+
+
+def test_a_baseline_that_chose_the_arithmetic_is_read_without() -> None:
+    record = read(OLD / "baseline.json", RECORDS["baseline-1"])
+    chosen = msgspec.structs.replace(record, settings={"arithmetic": "numpy", "noise": {"bridge_gaps": False}})
+    assert baseline.from_document(chosen).settings == Settings(noise=Noise(bridge_gaps=False))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -12,7 +12,7 @@ from toolkit.errors import DataError, did_you_mean
 from toolkit.files.documents import Record, readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings import Settings, SettingsError
-from toolkit.settings.reading import read_toml, settings_of
+from toolkit.settings.reading import read_toml, settings_of, without_removed
 
 if TYPE_CHECKING:
     from toolkit.estimator import Build
@@ -119,12 +119,13 @@ def _manifest(path: Path) -> dict[str, Any]:
             f"{path}: holds no settings; "
             f"{_by_its_command(document) or 'name the manifest.json of a comparison, or a TOML file'}"
         )
+    settings = without_removed(document["settings"])
     try:
-        settings_of(document["settings"], str(path))
+        settings_of(settings, str(path))
     except SettingsError as error:
         command = _by_its_command(document)
         raise SettingsError(f"{error}; {command}" if command else str(error)) from error
-    return {**document["settings"], COMPARE: document.get(COMPARE, {})}
+    return {**settings, COMPARE: document.get(COMPARE, {})}
 
 
 def _by_its_command(document: object) -> str:

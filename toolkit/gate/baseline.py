@@ -19,7 +19,7 @@ from toolkit.answers import Output, Status
 from toolkit.errors import VislamError
 from toolkit.files import documents
 from toolkit.settings import DEFAULTS, Settings, changes_of
-from toolkit.settings.reading import settings_of
+from toolkit.settings.reading import settings_of, without_removed
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]
@@ -303,7 +303,7 @@ def from_document(record: BaselineRecord) -> Baseline:
         record.bounds,
         record.false_alarm_rate,
         {name: str(value) for name, value in record.made_by.items()},
-        settings_of({} if record.settings is UNSET else record.settings, "the baseline's settings"),
+        settings_of({} if record.settings is UNSET else without_removed(record.settings), "the baseline's settings"),
     )
 
 

@@ -19,10 +19,11 @@ from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.workers import usable_cpus
-from toolkit.files.documents import read
+from toolkit.files.documents import Json, read
 from toolkit.noise import MeasuredNoise
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
+from toolkit.settings.reading import without_removed
 from toolkit.threads import THREAD_VARIABLES
 
 Versions = Annotated[dict[str, str | None], Meta(description="by package; null where it is not installed")]
@@ -81,7 +82,12 @@ class Manifest(Struct, frozen=True, kw_only=True):
 
 def read_manifest(path: Path) -> Manifest:
     """Read a ``manifest.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, Manifest, remedy="repeat the comparison")
+    return read(path, Manifest, remedy="repeat the comparison", older={"vislam.manifest/1": _of_today})
+
+
+def _of_today(manifest: Json) -> Json:
+    settings = manifest.get("settings")
+    return {**manifest, "settings": without_removed(settings)} if isinstance(settings, dict) else manifest
 
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:

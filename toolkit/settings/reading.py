@@ -32,6 +32,8 @@ _GONE = {
     "arithmetic": "each part of an estimator exists once, the MSCKFs' tracks compiled and all else in NumPy",
     "noise.disparity_scale": "no estimator has such a state any more; the audit's vision-scale reports a scale",
 }
+# Those of them that changed no answer: a document that a run wrote is read without them.
+_CHANGED_NO_ANSWER = ("arithmetic",)
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -52,6 +54,11 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
         what = what.replace("only auto", "give a number or auto")
         given_text = _given(what.partition(":")[0], values) if what.endswith("got string") else ""
         raise SettingsError(f"{place}: {what}{given_text}") from error
+
+
+def without_removed(written: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the nested settings of a document, perhaps of an earlier version, without keys that changed no answer."""
+    return {key: value for key, value in written.items() if key not in _CHANGED_NO_ANSWER}
 
 
 def _given(key: str, values: Mapping[str, Any]) -> str:
