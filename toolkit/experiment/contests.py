@@ -1,33 +1,70 @@
 """Who wins: rows of a comparison ranked by an error, and whether the first is better by more than chance.
 
 One recording is one draw of the noise, so a single run names a winner only where a paired test over stretches of the
-path supports it (:mod:`toolkit.experiment.drift_test`); over seeds the test is over the seeds.
+path supports it; over seeds the test is over the seeds.
+
+The error of a trajectory drifts slowly, so that a whole path is nearly one draw of it: the ATE of two runs of one
+estimator that differ by their noise alone differ by a factor of up to 3. The *drift* over each of many stretches of the
+path is tested instead, which needs no alignment and is drawn many times. Two Gaussian mean squares have the ratio F,
+each with the degrees of freedom of its own: those of the mean square of a correlated vector process (Bartlett, "On the
+theoretical specification and sampling properties of autocorrelated time series", 1946), fewer where the squares scatter
+more than Gaussian ones. Errors of two estimators of the same measurements are correlated, and their ratio then scatters
+less, by sqrt(1 - r^2) (Pitman, "A note on normal correlation", Biometrika 31, 1939).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from scipy.special import fdtri, stdtrit
 
-from toolkit.experiment.drift_test import Advantage, less_drift, less_median, less_over_seeds
+from toolkit.arrays import rows_of
+from toolkit.experiment.statistics import standard_error
+from toolkit.geometry import Array, se3_inverse
+from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.metrics import Evaluation
+from toolkit.metrics.parts.against_truth import Matched
 from toolkit.metrics.parts.scores import Unavailable
 
 if TYPE_CHECKING:
     from toolkit.experiment.comparison import Row
-    from toolkit.geometry import Array
     from toolkit.sequence import Sequence as Recorded
 
 Question = Literal["accuracy at each frame", "accuracy in the end", "withheld tracks"]
-Compared = Callable[["Row", "Row"], Advantage | None]
 HELD_OUT, COST = "heldout_reproj_median_px", "frame_cpu_ms_mean"
 COVERAGE = "coverage_percent"
 _YAW, _SE3 = "ate_yaw_m", "ate_se3_m"
 # Rows that answered less than the best by more than this are left out: their errors are of a part of the recording.
 _COVERAGE_MARGIN_PERCENT = 5.0
+# Stretches a path is divided into, at most; with fewer than the second number nothing is tested.
+MOST_STRETCHES, FEWEST_STRETCHES = 40, 10
+# 99 % intervals. Where an error is nearly one draw for the whole run, as of ekf with an IMU, they are too narrow: there
+# one in six pairs of runs that differ by noise alone is called clear (docs/metrics.md).
+CONFIDENCE = 0.99
+# Degrees of freedom that the estimate of their number uses up: a drift that keeps one direction has not three, but one.
+_USED_UP, _LEAST_DOF = 2.0, 0.5
+
+
+@dataclass(frozen=True)
+class Advantage:
+    """How many times as large an error of another is, with its 99 % interval, over ``n`` ``parts`` of the data."""
+
+    ratio: float
+    low: float
+    high: float
+    n: int
+    parts: str
+
+    @property
+    def is_clear(self) -> bool:
+        """Say whether the interval excludes that both are equal."""
+        return self.low > 1.0 or self.high < 1.0
+
+
+Compared = Callable[["Row", "Row"], Advantage | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,3 +190,115 @@ def _of_one_run(sequence: Recorded) -> tuple[Compared, Compared]:
         return less_median(*errors, "stretches of time")
 
     return by_drift, by_tracks
+
+
+class _Drift(NamedTuple):
+    """The drift (K, 3) m over each stretch, and the degrees of freedom of its mean square."""
+
+    over_m: Array
+    dof: float
+
+
+def less_drift(one: Matched, other: Matched) -> Advantage | None:
+    """Return how many times as much the other drifts as the one, at the stamps that both have.
+
+    None with fewer than ten stretches, or where one of them does not drift at all.
+    """
+    row, both = rows_of(one.t_ns, other.t_ns)
+    mine, its = np.flatnonzero(both), row[both]
+    count = min(MOST_STRETCHES, mine.size - 1)
+    if count < FEWEST_STRETCHES:
+        return None
+    ends = _ends(one.path_m[mine], count)
+    drifts = [
+        _drift(pairs.truth[rows[ends]], pairs.estimate[rows[ends]]) for pairs, rows in ((one, mine), (other, its))
+    ]
+    if any(drift is None for drift in drifts):
+        return None
+    return _ratio(*(drift for drift in drifts if drift is not None))
+
+
+def _ends(path_m: Array, count: int) -> Array:
+    """Return the rows (count + 1,) that divide a path (n,) into stretches of equal length, each at least a step."""
+    at_m = np.linspace(path_m[0], path_m[-1], count + 1)
+    rows = np.searchsorted(path_m, at_m)
+    step = np.arange(count + 1)
+    # Where the vehicle stands still, stretches of no length would share their ends.
+    rows = np.maximum.accumulate(np.maximum(rows, step) - step) + step
+    return np.minimum(rows, path_m.size - 1 - step[::-1])
+
+
+def _drift(truth: Array, estimate: Array) -> _Drift | None:
+    """Return the drift between neighbouring poses (K + 1, 4, 4), or None where it is zero or overflows."""
+    true_step, step = (se3_inverse(poses[:-1]) @ poses[1:] for poses in (truth, estimate))
+    in_body_m = step[:, :3, 3] - true_step[:, :3, 3]
+    in_world_m = np.einsum("kij,kj->ki", truth[:-1, :3, :3], in_body_m)
+    total = float(np.sum(in_body_m**2) ** 2)
+    if not 0.0 < total < np.inf:
+        return None
+    # A wrong scale keeps its direction in the body, a wrong velocity or tilt in the world.
+    dof = min(degrees_of_freedom(in_body_m), degrees_of_freedom(in_world_m)) - _USED_UP
+    return _Drift(in_body_m, max(dof, _LEAST_DOF))
+
+
+def degrees_of_freedom(vectors: Array) -> float:
+    """Return the degrees of freedom of the mean square of correlated vectors (K, d) of mean zero.
+
+    K times d where they are white, of equal variance in all directions and Gaussian.
+    """
+    count = len(vectors)
+    squares = (vectors**2).sum(axis=1)
+    mean = squares.mean()
+    scatter = max(float(squares.var()), 2.0 * float(np.sum((vectors.T @ vectors / count) ** 2)))
+    lagged = 0.0
+    for lag in range(1, count // 2 + 1):
+        cov = vectors[:-lag].T @ vectors[lag:] / count
+        # Without the part that white vectors have by chance.
+        lagged += float(np.sum(cov**2)) - (count - lag) / count**2 * mean**2
+    return float(2.0 * count * mean**2 / (scatter + 4.0 * max(lagged, 0.0)))
+
+
+def _ratio(one: _Drift, other: _Drift) -> Advantage:
+    squares, others = np.sum(one.over_m**2), np.sum(other.over_m**2)
+    shared = min(1.0, float(np.sum(one.over_m * other.over_m) ** 2 / (squares * others)))
+    log_ratio, tail = 0.5 * np.log(others / squares), 0.5 * (1.0 - CONFIDENCE)
+    narrowed = 0.5 * np.sqrt(1.0 - shared)
+    above, below = (narrowed * np.log(fdtri(other.dof, one.dof, p)) for p in (1.0 - tail, tail))
+    return _advantage(log_ratio, log_ratio - above, log_ratio - below, len(one.over_m), "stretches of the path")
+
+
+def less_median(one: Array, other: Array, parts: str) -> Advantage | None:
+    """Return how many times as large the other's median is, of errors (M,) of the same things in order of time.
+
+    By a block jackknife over ten stretches of time, with Student's t. None with fewer than ten errors a stretch.
+    """
+    if one.size < STRETCHES**2:
+        return None
+
+    def log_ratio(mine: Array, others: Array) -> float:
+        return float(np.log(np.median(others) / np.median(mine)))
+
+    whole, error = log_ratio(one, other), jackknife_error(log_ratio, one, other)
+    return _interval(whole, error, STRETCHES, parts) if np.isfinite([whole, error]).all() else None
+
+
+def less_over_seeds(one: Array, other: Array) -> Advantage | None:
+    """Return how many times as large the other's errors (n,) are, seed by seed (geometric mean), by Student's t.
+
+    None with fewer than three seeds, or where an error is not positive.
+    """
+    if one.size < 3 or not (np.minimum(one, other) > 0.0).all():
+        return None
+    logs = np.log(other / one)
+    return _interval(float(logs.mean()), float(standard_error(logs)), logs.size, "seeds")
+
+
+def _interval(log_ratio: float, error: float, count: int, parts: str) -> Advantage:
+    reach = float(stdtrit(count - 1, 0.5 * (1.0 + CONFIDENCE))) * error
+    return _advantage(log_ratio, log_ratio - reach, log_ratio + reach, count, parts)
+
+
+def _advantage(log_ratio: float, low: float, high: float, count: int, parts: str) -> Advantage:
+    # A ratio of a million stands for any larger one, which a diverged run may have.
+    ratio, least, most = np.exp(np.clip([log_ratio, low, high], -14.0, 14.0)).tolist()
+    return Advantage(ratio, least, most, count, parts)

@@ -10,8 +10,7 @@ from msgspec import Meta, Struct
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES, Comparison, Row
-from toolkit.experiment.contests import COST, HELD_OUT, Contest, Question, cheaper_near
-from toolkit.experiment.drift_test import CONFIDENCE
+from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near
 from toolkit.files.documents import rounded
 from toolkit.metrics import metrics_called
 from toolkit.report.text import listed, number

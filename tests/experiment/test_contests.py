@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from toolkit.experiment.drift_test import Advantage, degrees_of_freedom, less_drift, less_median, less_over_seeds
+from toolkit.experiment.contests import Advantage, degrees_of_freedom, less_drift, less_median, less_over_seeds
 from toolkit.geometry import Array, about_z, se3
 from toolkit.metrics.parts.against_truth import Matched
 
