@@ -166,7 +166,7 @@ def test_who_dies_of_a_fault_is_reported_with_that_fault(newcomer, monkeypatch) 
     some = ("2 s without sightings", "a camera 20 ms late")
     monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
-    from toolkit.verify.subject import subject_of
+    from toolkit.verify.promises import subject_of
 
     found = verification.ends_by_fault("my-filter", subject_of(str(path)).load())
     assert set(found) == {"2 s without sightings (drive)", "2 s without sightings (flight)"}

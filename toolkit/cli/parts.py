@@ -116,7 +116,7 @@ def verify(options: argparse.Namespace) -> int:
     from toolkit.files.documents import to_text
     from toolkit.report.text import width_of_output
     from toolkit.report.verify_text import verification_document, verification_text
-    from toolkit.verify.subject import subject_of
+    from toolkit.verify.promises import subject_of
     from toolkit.verify.verification import verify
 
     subject = subject_of(options.estimator)

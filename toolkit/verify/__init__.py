@@ -1,5 +1,5 @@
 """The promises of every estimator as checks, for ``vislam verify`` and for the contract tests.
 
-Reading order: promises (a recorded run, and each property that it must have) -> threads -> subject (finds the
-estimator) -> verification (all checks of one estimator).
+Reading order: promises (which estimator, its recorded run, and each property that it must have) -> threads ->
+verification (all checks of one estimator).
 """

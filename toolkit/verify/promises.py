@@ -1,29 +1,67 @@
-"""Properties that a watched run must have. Each function returns a sentence about what is wrong, or an empty text.
+"""The estimator to verify, and properties that a watched run of it must have.
+
+Of a property each function returns a sentence about what is wrong, or an empty text.
 
 Of a watched run all inputs and outputs of the estimator are kept, each with a copy made at that moment.
 """
 
-from collections.abc import Iterator
+import importlib
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import zip_longest
+from typing import cast
 
 import numpy as np
 
 from toolkit.answers import COV_SIZES, Run, check_state
+from toolkit.discovery import shown_name
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished
 from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
+from toolkit.registry import cannot_import, discover, find
 from toolkit.sequence import Sequence
 
+_MODULE = re.compile(r"\w+(\.\w+)+")
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12
 # Of a product that is symmetric but for rounding, in units of the standard deviations.
 _SYMMETRY_TOLERANCE = 1e-9
 # False alarm rate of the test of mean NEES.
 _FALSE_ALARM = 1e-3
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An estimator to verify: its name, and what loads its ``build``."""
+
+    name: str
+    load: Callable[[], Build]
+
+
+def subject_of(word: str) -> Subject:
+    """Return the estimator that an argument names: ``my_filter.py``, ``my_package.my_filter`` or ``ekf``.
+
+    Loading it raises EstimatorError where the file cannot be imported or has no function ``build(setup)``. Raises
+    EstimatorError where the argument names nothing.
+    """
+    if _MODULE.fullmatch(word) and not word.endswith(".py") and word not in discover():
+        return Subject(shown_name(word), lambda: _build_of(word))
+    entry = find(word)
+    return Subject(entry.name, entry.load)
+
+
+def _build_of(word: str) -> Build:
+    try:
+        module = importlib.import_module(word)
+    except (Exception, SystemExit) as error:  # a script may end where it is imported
+        raise cannot_import(word, error) from error
+    if not callable(getattr(module, "build", None)):
+        raise EstimatorError(f"{word}: it defines no function build(setup)")
+    return cast(Build, module.build)
 
 
 @dataclass(frozen=True, eq=False)

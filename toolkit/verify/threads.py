@@ -17,8 +17,7 @@ from toolkit.errors import EstimatorError, SystemLimitError
 from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.threads import THREAD_VARIABLES
-from toolkit.verify.promises import arrays_of
-from toolkit.verify.subject import subject_of
+from toolkit.verify.promises import arrays_of, subject_of
 
 UNAVAILABLE = "unavailable"
 # The first line of a process that has started.

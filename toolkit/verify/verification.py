@@ -22,8 +22,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, faults, simulate
 from toolkit.verify import promises
-from toolkit.verify.promises import Watched, gave_up, watch
-from toolkit.verify.subject import Subject
+from toolkit.verify.promises import Subject, Watched, gave_up, watch
 from toolkit.verify.threads import differing_answers
 
 SEED = 4
