@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
-from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series, installed_releases
+from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, SeriesRecord, installed_releases
 from toolkit.gate.case_check import CaseVerdicts, CheckTerms, check_case
 from toolkit.gate.checking import check_all
 from toolkit.gate.verdict import Check
@@ -19,13 +20,13 @@ SPREAD = 0.03
 Edit = Callable[[str, str, np.ndarray], np.ndarray]
 
 
-def series(rng: np.random.Generator, count: int, keys: tuple[str, ...]) -> Series:
+def series(rng: np.random.Generator, count: int, keys: tuple[str, ...]) -> SeriesRecord:
     values = {key: tuple(np.exp(rng.normal(-2.0, 0.4, count)).tolist()) for key in keys}
     if "nees_pose_mean" in keys:
         values["nees_pose_mean"] = tuple(np.exp(rng.normal(1.5, 0.3, count)).tolist())
     values[COVERAGE] = (100.0,) * count
     speed = tuple(rng.normal(5.0, 0.2, count).tolist())
-    return Series(("ok",) * count, speed, {"causal": values})
+    return SeriesRecord(status=("ok",) * count, speed=speed, causal=values)
 
 
 @pytest.fixture
@@ -44,9 +45,9 @@ def baseline() -> Baseline:
 def edited(measured: Measured, edit: Edit) -> Measured:
     """Return what is measured with every metric's values changed by ``edit(estimator, metric, values)``."""
     runs = {
-        name: replace(
+        name: structs.replace(
             one,
-            outputs={
+            **{
                 output: {
                     key: tuple(edit(name, key, np.array(values)).tolist()) if key != COVERAGE else values
                     for key, values in metrics.items()

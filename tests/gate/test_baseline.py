@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from toolkit.gate.baseline import (
     BaselineError,
@@ -38,7 +39,7 @@ def test_a_baseline_is_readable(baseline, path):
 
 def test_not_a_number_is_never_written(baseline):
     case, measured = baseline.cases[0]
-    bad = replace(measured.runs["one"], speed=(float("nan"),) * 24)
+    bad = structs.replace(measured.runs["one"], speed=(float("nan"),) * 24)
     with pytest.raises(ValueError, match="not JSON compliant"):
         to_text(replace(baseline, cases=((case, replace(measured, runs={"one": bad})),)))
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from toolkit.gate.baseline import COVERAGE
 
@@ -13,12 +14,11 @@ def findings(check):
 
 
 def with_series(measured, estimator, **changes):
-    return replace(measured, runs=measured.runs | {estimator: replace(measured.runs[estimator], **changes)})
+    return replace(measured, runs=measured.runs | {estimator: structs.replace(measured.runs[estimator], **changes)})
 
 
 def with_values(measured, estimator, key, values):
-    outputs = {"causal": measured.runs[estimator].outputs["causal"] | {key: values}}
-    return with_series(measured, estimator, outputs=outputs)
+    return with_series(measured, estimator, causal=measured.runs[estimator].causal | {key: values})
 
 
 def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
@@ -188,7 +188,8 @@ def test_a_recording_that_rounds_otherwise_is_the_same(baseline, gate):
 @pytest.mark.parametrize("status", ["diverged", "failed"])
 def test_a_run_that_ended_well_and_no_longer_does_fails(baseline, gate, status):
     simulated, recorded = gate.as_measured(baseline)
-    changed = with_series(simulated, "two", status=("ok", status, *("ok",) * 22), why="left the road")
+    changed = with_series(simulated, "two", status=("ok", status, *("ok",) * 22))
+    changed = replace(changed, why={"two": "left the road"})
     check = gate.checked(baseline, [changed, recorded])
     assert findings(check) == [("flight", "two", "status", "regressed")]
     assert check.failures[0].words == f"{status} under seed 1: left the road"

@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.gate import interleaved
-from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series, installed_releases, to_text
+from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, SeriesRecord, installed_releases, to_text
 from toolkit.gate.interleaved import (
     FEWEST_PAIRS,
     MARGIN,
@@ -98,7 +98,7 @@ def _run(*given):
 def baseline_of_a_drive() -> Baseline:
     """Return a baseline that was not measured: what is timed needs to know the cases alone."""
     case = Case("drive", True, (0,), ("dead-reckoning",), 1.0)
-    series = Series(("ok",), (1.0,), {"causal": {}})
+    series = SeriesRecord(status=("ok",), speed=(1.0,), causal={})
     return Baseline(installed_releases(), ((case, Measured(("hash",), ("print",), {"dead-reckoning": series})),))
 
 
@@ -144,7 +144,7 @@ def test_what_the_other_code_can_be_timed_on_and_this_one_cannot_is_missing(monk
     monkeypatch.setattr(interleaved, "unpacked", lambda _: nullcontext(()))
     monkeypatch.setattr(interleaved, "timers", lambda *_: nullcontext((Side("old", *old), Side("new", *new))))
     case = Case("drive", True, (0,), ("ekf",), 1.0)
-    measured = Measured(("hash",), ("print",), {"ekf": Series(("ok",), (1.0,), {"causal": {}})})
+    measured = Measured(("hash",), ("print",), {"ekf": SeriesRecord(status=("ok",), speed=(1.0,), causal={})})
     speeds = compare_speed(Baseline(installed_releases(), ((case, measured),)), "v1", 0.05, silent)
     assert [verdict.finding for verdict in speeds.verdicts] == ([] if found == "noted" else [found])
     assert bool(speeds.notes) is (found == "noted")

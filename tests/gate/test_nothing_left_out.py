@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import UNSET, structs
 
 from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.experiment.units import Outcome
-from toolkit.gate.baseline import Baseline, Measured, Series
+from toolkit.gate.baseline import Baseline, Measured, SeriesRecord
 from toolkit.gate.case_check import CheckTerms, check_case
 from toolkit.gate.measuring import TimedOutcome, gathered
 from toolkit.geometry import se3_exp
@@ -167,23 +168,23 @@ def losses(measured: Measured) -> Iterator[tuple[str, Measured]]:
         yield f"seed {seed} of other data", replace(measured, fingerprints=other, hashes=other)
 
 
-def losses_of_a_series(one: Series, last: int) -> Iterator[tuple[str, Series]]:
-    yield "without its last seed", replace(one, status=one.status[:last], speed=one.speed[:last])
+def losses_of_a_series(one: SeriesRecord, last: int) -> Iterator[tuple[str, SeriesRecord]]:
+    yield "without its last seed", structs.replace(one, status=one.status[:last], speed=one.speed[:last])
     for i in range(last + 1):
-        yield f"failed under {i}", replace(one, status=(*one.status[:i], "failed", *one.status[i + 1 :]))
+        yield f"failed under {i}", structs.replace(one, status=(*one.status[:i], "failed", *one.status[i + 1 :]))
         if last:
-            yield f"without time under {i}", replace(one, speed=(*one.speed[:i], None, *one.speed[i + 1 :]))
+            yield f"without time under {i}", structs.replace(one, speed=(*one.speed[:i], None, *one.speed[i + 1 :]))
     for output, metrics in one.outputs.items():
-        yield f"{output} removed", replace(one, outputs={o: m for o, m in one.outputs.items() if o != output})
-        yield f"{output} renamed", replace(one, outputs={"final": metrics})
-        yield f"{output} empty", replace(one, outputs={output: {}})
+        yield f"{output} removed", structs.replace(one, **{output: UNSET})
+        yield f"{output} renamed", structs.replace(one, causal=UNSET, final=metrics)
+        yield f"{output} empty", structs.replace(one, **{output: {}})
         for key, values in metrics.items():
             left = {other: of_it for other, of_it in metrics.items() if other != key}
             changed = {"removed": left, "renamed": left | {"other": values}, "short": metrics | {key: values[:last]}}
             for i in range(last + 1):
                 changed[f"without {i}"] = metrics | {key: (*values[:i], None, *values[i + 1 :])}
             for what, of_output in changed.items():
-                yield f"{key} {what}", replace(one, outputs={output: of_output})
+                yield f"{key} {what}", structs.replace(one, **{output: of_output})
 
 
 def test_nothing_that_was_measured_can_be_missing(baseline: Baseline, gate) -> None:
@@ -222,11 +223,11 @@ def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline:
 def gathered_first(measured: Measured) -> Measured:
     """Return what is measured under the first seed alone."""
     runs = {
-        name: replace(
+        name: structs.replace(
             one,
             status=one.status[:1],
             speed=one.speed[:1],
-            outputs={o: {k: values[:1] for k, values in metrics.items()} for o, metrics in one.outputs.items()},
+            **{o: {k: values[:1] for k, values in metrics.items()} for o, metrics in one.outputs.items()},
         )
         for name, one in measured.runs.items()
     }

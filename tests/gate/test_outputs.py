@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from msgspec import structs
 
 from toolkit.cli import main
 from toolkit.gate.verdict import check_document
@@ -20,7 +21,7 @@ def failed(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     worse = gate.edited(simulated, gate.planted(8.0, 1))
     runs = {name: one for name, one in recorded.runs.items() if name != "three"}
-    slower = replace(worse.runs["one"], speed=tuple(0.5 * s for s in worse.runs["one"].speed))
+    slower = structs.replace(worse.runs["one"], speed=tuple(0.5 * s for s in worse.runs["one"].speed))
     now = [
         replace(worse, runs=worse.runs | {"one": slower}),
         replace(recorded, runs=runs, absent={"three": "it needs <a | b> &\nmore"}),

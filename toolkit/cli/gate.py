@@ -197,7 +197,8 @@ def _bad_ends(baseline: Baseline) -> Iterator[str]:
         for name, series in measured.runs.items():
             bad = sum(status != "ok" for status in series.status)
             if bad:
-                yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {series.why}"
+                why = measured.why.get(name, "")
+                yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {why}"
 
 
 @command(

@@ -113,31 +113,44 @@ class Case:
     truth: str | None = None
 
 
-@dataclass(frozen=True)
-class Series:
-    """One estimator on one case, by seed: how it ended, its time over the reference's, metrics by kind of output.
+MetricValues = Annotated[
+    dict[str, Values], Meta(description="by metric key, a value for each seed; null where it was not computed")
+]
 
-    ``why`` is the reason of the first run that did not end well.
-    """
+
+class SeriesRecord(Struct, frozen=True, kw_only=True):
+    """One estimator on one sequence, by seed; an output it does not give is left out."""
 
     status: tuple[Status, ...]
-    speed: Values
-    outputs: Mapping[Output, Mapping[str, Values]]
-    why: str = ""
+    speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
+    causal: MetricValues | UnsetType = UNSET
+    final: MetricValues | UnsetType = UNSET
+
+    @property
+    def outputs(self) -> dict[Output, dict[str, Values]]:
+        """Return the metrics by kind of output."""
+        found: dict[Output, dict[str, Values]] = {}
+        if self.causal is not UNSET:
+            found["causal"] = self.causal
+        if self.final is not UNSET:
+            found["final"] = self.final
+        return found
 
 
 @dataclass(frozen=True)
 class Measured:
     """The results of a case: hash and fingerprint of what the estimators read by seed, and the series by estimator.
 
-    ``absent`` says why an estimator has no series, ``unreadable`` why the sequence itself could not be read.
+    ``why`` has the reason of an estimator's first run that did not end well. ``absent`` says why an estimator has no
+    series, ``unreadable`` why the sequence itself could not be read.
     """
 
     hashes: tuple[str, ...]
     fingerprints: tuple[str, ...]
-    runs: Mapping[str, Series]
+    runs: Mapping[str, SeriesRecord]
     absent: Mapping[str, str] = dataclasses.field(default_factory=dict)
     unreadable: str = ""
+    why: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -181,18 +194,6 @@ def releases_in_a_name() -> str:
 _REMEDY = "make the baseline with vislam baseline"
 
 Seed = Annotated[int, Meta(ge=0)]
-MetricValues = Annotated[
-    dict[str, Values], Meta(description="by metric key, a value for each seed; null where it was not computed")
-]
-
-
-class SeriesRecord(Struct, frozen=True, kw_only=True):
-    """One estimator on one sequence, by seed; an output it does not give is left out."""
-
-    status: tuple[Status, ...]
-    speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
-    causal: MetricValues | UnsetType = UNSET
-    final: MetricValues | UnsetType = UNSET
 
 
 class CaseRecord(Struct, frozen=True, kw_only=True):
@@ -213,8 +214,8 @@ class CaseRecord(Struct, frozen=True, kw_only=True):
         columns: dict[str, tuple[object, ...]] = {"hashes": self.hashes, "fingerprints": self.fingerprints}
         for name, run in self.runs.items():
             columns |= {f"runs.{name}.status": run.status, f"runs.{name}.speed": run.speed}
-            for output, metrics in (("causal", run.causal), ("final", run.final)):
-                for key, values in ({} if metrics is UNSET else metrics).items():
+            for output, metrics in run.outputs.items():
+                for key, values in metrics.items():
                     columns[f"runs.{name}.{output}.{key}"] = values
         for place, column in columns.items():
             if len(column) != len(self.seeds):
@@ -316,7 +317,7 @@ def _case_record(case: Case, measured: Measured) -> CaseRecord:
         seeds=case.seeds,
         hashes=measured.hashes,
         fingerprints=measured.fingerprints,
-        runs={name: _series_record(series) for name, series in measured.runs.items()},
+        runs=dict(measured.runs),
     )
 
 
@@ -329,27 +330,7 @@ def _case(record: CaseRecord) -> tuple[Case, Measured]:
         duration_s=record.duration_s,
         truth=record.truth,
     )
-    runs = {name: _series(series) for name, series in record.runs.items()}
-    return case, Measured(record.hashes, record.fingerprints, runs)
-
-
-def _series_record(series: Series) -> SeriesRecord:
-    given = {output: dict(metrics) for output, metrics in series.outputs.items()}
-    return SeriesRecord(
-        status=series.status,
-        speed=series.speed,
-        causal=given.get("causal", UNSET),
-        final=given.get("final", UNSET),
-    )
-
-
-def _series(record: SeriesRecord) -> Series:
-    outputs: dict[Output, dict[str, Values]] = {}
-    if record.causal is not UNSET:
-        outputs["causal"] = record.causal
-    if record.final is not UNSET:
-        outputs["final"] = record.final
-    return Series(record.status, record.speed, outputs)
+    return case, Measured(record.hashes, record.fingerprints, record.runs)
 
 
 def json_text(value: object) -> str:

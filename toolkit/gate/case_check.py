@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from toolkit.answers import Status
-from toolkit.gate.baseline import COVERAGE, SPEED, BoundsRecord, Case, Criterion, Measured, Series, Values
+from toolkit.gate.baseline import COVERAGE, SPEED, BoundsRecord, Case, Criterion, Measured, SeriesRecord, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
@@ -82,6 +82,8 @@ def check_case(
         elif fewer := _fewer_seeds(was, now.runs[estimator]):
             collected.verdicts.append(_missing(case, estimator, "", "seeds", fewer))
         else:
+            why = now.why.get(estimator, "")
+            collected.verdicts += _ends(case, estimator, was, now.runs[estimator], why, collected, terms)
             _check_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
             if terms.speed:
                 collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
@@ -92,7 +94,7 @@ def check_case(
     return collected
 
 
-def _fewer_seeds(before: Series, now: Series) -> str:
+def _fewer_seeds(before: SeriesRecord, now: SeriesRecord) -> str:
     """Say that an estimator has another number of runs than in the baseline; empty where it has as many."""
     if len(now.status) == len(now.speed) == len(before.status):
         return ""
@@ -117,14 +119,13 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
 def _check_series(
     case: Case,
     estimator: str,
-    before: Series,
-    now: Series,
+    before: SeriesRecord,
+    now: SeriesRecord,
     collected: CaseVerdicts,
     bounds: BoundsRecord,
     terms: CheckTerms,
 ) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
-    collected.verdicts += _ends(case, estimator, before, now, collected, terms)
     usable = [i for i, (was, is_) in enumerate(zip(before.status, now.status, strict=True)) if was == is_ == "ok"]
     if not usable:
         collected.notes.append(
@@ -173,14 +174,20 @@ def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdi
 
 
 def _ends(
-    case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, terms: CheckTerms
+    case: Case,
+    estimator: str,
+    before: SeriesRecord,
+    now: SeriesRecord,
+    why: str,
+    collected: CaseVerdicts,
+    terms: CheckTerms,
 ) -> Iterator[Verdict]:
     """Fail where runs end differently than before; where that is accepted, note those that end well now."""
     pairs = list(zip(case.seeds, before.status, now.status, strict=True))
     worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
     if worse:
         runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if case.simulated else ""
-        message = f"{worse[0][1]} {runs}".strip() + (f": {now.why}" if now.why else "")
+        message = f"{worse[0][1]} {runs}".strip() + (f": {why}" if why else "")
         yield Verdict(case.source, estimator, "", "status", "regressed", message)
     better = [seed for seed, was, is_ in pairs if _SEVERITY[is_] < _SEVERITY[was]]
     if better:
@@ -251,7 +258,9 @@ def _distance(before: float, after: float) -> float:
     return math.expm1(abs(math.log(after / before)))
 
 
-def check_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: BoundsRecord) -> Iterator[Verdict]:
+def check_coverage(
+    case: Case, estimator: str, before: SeriesRecord, now: SeriesRecord, bounds: BoundsRecord
+) -> Iterator[Verdict]:
     """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
     for output, metrics in before.outputs.items():
         pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
@@ -270,7 +279,9 @@ def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
     return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
 
 
-def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds: BoundsRecord) -> Iterator[Verdict]:
+def check_speed(
+    case: Case, estimator: str, before: SeriesRecord, now: SeriesRecord, bounds: BoundsRecord
+) -> Iterator[Verdict]:
     """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
     was, is_ = _timed(before), _timed(now)
     if was.size < FEWEST_TIMED:
@@ -294,7 +305,7 @@ def check_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
     yield Verdict(case.source, estimator, "", SPEED, finding, message, old, new, 100.0 * (new / old - 1.0), allowed)
 
 
-def _timed(series: Series) -> Array:
+def _timed(series: SeriesRecord) -> Array:
     return np.array([x for x in series.speed if x is not None])
 
 

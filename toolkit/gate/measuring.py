@@ -31,7 +31,7 @@ from toolkit.experiment.units import (
     run_estimator,
 )
 from toolkit.experiment.workers import LostUnit, results_of
-from toolkit.gate.baseline import COVERAGE, BoundsRecord, Case, Measured, Series, Values
+from toolkit.gate.baseline import COVERAGE, BoundsRecord, Case, Measured, SeriesRecord, Values
 from toolkit.geometry import Array
 from toolkit.progress import Progress
 from toolkit.registry import find
@@ -135,11 +135,12 @@ def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], a
     read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
     hashes = tuple(read[seed].outcome.sequence_hash if seed in read else "" for seed in case.seeds)
     prints = tuple(read[seed].fingerprint if seed in read else "" for seed in case.seeds)
-    runs = {
-        name: _series([by_run.get((name, seed)) or _not_run(name, seed) for seed in case.seeds], metrics)
-        for name in case.estimators
+    by_name = {
+        name: [by_run.get((name, seed)) or _not_run(name, seed) for seed in case.seeds] for name in case.estimators
     }
-    return Measured(hashes, prints, runs, absent)
+    runs = {name: _series(ended, metrics) for name, ended in by_name.items()}
+    why = {name: next(filter(None, (one.outcome.why for one in ended)), "") for name, ended in by_name.items()}
+    return Measured(hashes, prints, runs, absent, why=why)
 
 
 def _not_run(estimator: str, seed: int) -> TimedOutcome:
@@ -167,7 +168,7 @@ def _over(run: Run, reference: float) -> float | None:
     return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
 
 
-def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
+def _series(found: Several[TimedOutcome], metrics: Several[str]) -> SeriesRecord:
     """Return the series of one estimator; a final output that only repeats the causal one is left out."""
     outcomes = [one.outcome for one in found]
     outputs = [{o: s.scores.values for o, s in one.outputs.items() if o not in _repeated(one)} for one in outcomes]
@@ -178,8 +179,7 @@ def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
     # A metric without any value, as a NEES without a covariance, is not kept: no check can find it missing.
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
     status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
-    why = next((one.why for one in outcomes if one.why), "")
-    return Series(status, speed, kept, why)
+    return SeriesRecord(status=status, speed=speed, **kept)
 
 
 def _repeated(outcome: Outcome) -> tuple[Output, ...]:
