@@ -13,7 +13,7 @@ from toolkit.estimate import Trajectory
 from toolkit.evaluation.against_baseline import load_trajectory_baseline, to_text
 from toolkit.evaluation.scoring import TIME_COVERAGE
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.significance import Repeats, Where
+from toolkit.gate.significance import Repeats, Where, check_metrics
 
 CHECK = ("check", "--trajectories", "results", "--baseline", "base.json")
 BASELINE = ("baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json")
@@ -184,3 +184,16 @@ def test_runs_without_a_change_raise_an_alarm_no_more_often_than_stated():
     )
     # Welch's test is a little off at five runs; three standard deviations above 5 %.
     assert 0.03 * checks <= alarms <= 0.05 * checks + 3.0 * np.sqrt(0.05 * checks)
+
+
+def test_five_runs_against_five_show_growth_as_a_one_sided_test_at_half_the_rate_does():
+    rng = np.random.default_rng(4)
+    found = []
+    for _ in range(400):
+        before, after = np.exp(0.08 * rng.standard_normal((2, 5)))
+        one = Repeats(Where("", "", "", ""), Criterion("larger", 0.0), before, 1.15 * after)
+        (verdict,) = check_metrics([one], 0.05)
+        assert (verdict.finding == "regressed") == (one.worse_p() <= 0.025)
+        found.append(verdict.finding == "regressed")
+    # 66 % by 1500 such checks; three standard deviations below.
+    assert np.mean(found) > 0.66 - 3.0 * np.sqrt(0.66 * 0.34 / len(found))

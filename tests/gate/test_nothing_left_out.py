@@ -21,7 +21,7 @@ from toolkit.gate.measuring import TimedOutcome, gathered
 from toolkit.geometry import se3_exp
 
 PROJECT = Path(__file__).parents[2]
-RUNS = {"lap": 1, "hall": 2, "maze": 3}
+RUNS = {"lap": 1, "maze": 3}
 
 
 def remove(path: Path) -> None:
@@ -64,7 +64,7 @@ def damaged(folders: tuple[str, ...]) -> Iterator[str]:
 
 @pytest.fixture
 def trajectories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of three sequences, one, two and three of each, with their truths."""
+    """Runs of two sequences, one of the first and three of the other, with their truths."""
     monkeypatch.chdir(tmp_path)
     truth = load_sequence("drive").truth
     assert truth is not None

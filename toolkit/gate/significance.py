@@ -29,8 +29,6 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
-# The mean NEES over runs scatters by chance; a NIS is a mean over thousands of innovations and hardly does.
-_WITH_BAND = ("nees_pose_mean",)
 # Another processor's rounding moves a metric by less than this, relative (docs/gate.md).
 ROUNDING = 1e-6
 # A value below this is rounding, and its logarithm is not used.
