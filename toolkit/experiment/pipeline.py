@@ -125,23 +125,18 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
         return tuple(_with_references(plan, one, files) for one in prepared)
 
 
-def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress) -> list[Prepared]:
+def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress) -> Iterator[Prepared]:
     """Prepare recordings: several side by side, a single one here, where it is there at once."""
     if len(recordings) == 1:
-        return [prepare(recordings[0], progress)]
-    with closing(workers.results(recordings, _prepare, progress)) as coming:
+        yield prepare(recordings[0], progress)
+        return
+    with closing(workers.results(recordings, prepare, progress)) as coming:
         found = dict(coming)
-    return [_unless_lost(found[place], recording) for place, recording in enumerate(recordings)]
-
-
-def _prepare(recording: Recording, progress: Progress) -> Prepared:
-    return prepare(recording, progress)
-
-
-def _unless_lost(result: Prepared | LostUnit, recording: Recording) -> Prepared:
-    if isinstance(result, LostUnit):
-        raise DataError(f"{_name(recording.source)}: while it was loaded {result.why}; is there memory enough?")
-    return result
+    for place, recording in enumerate(recordings):
+        result = found[place]
+        if isinstance(result, LostUnit):
+            raise DataError(f"{_name(recording.source)}: while it was loaded {result.why}; is there memory enough?")
+        yield result
 
 
 def _with_references(plan: Plan, case: Prepared, files: Mapping[str, PosesFile]) -> Prepared:
