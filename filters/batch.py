@@ -45,8 +45,8 @@ from toolkit.measurements import Packet, StereoFrame, StereoRig, is_left_only
 from toolkit.models import stereo
 from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
+from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Increment
 from toolkit.settings.records import Outliers
 
 CITES = ("dellaert2017factor", "gtsam")
@@ -153,7 +153,7 @@ class Batch:
                 frames = _without_those_behind(frames, values, self._rig)
         return Smoothed(solution, graph, frames)
 
-    def _motion_factors(self) -> tuple[gtsam.NonlinearFactorGraph, dict[int, Increment]]:
+    def _motion_factors(self) -> tuple[gtsam.NonlinearFactorGraph, dict[int, GraphIncrement]]:
         """Return the prior and the motion factors, about the causal pass's last bias, and the increments of these."""
         graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias

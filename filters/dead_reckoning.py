@@ -4,7 +4,7 @@ from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
-from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import predicted
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 0, "the measured motion alone"
@@ -20,7 +20,7 @@ class DeadReckoning(Filter):
     """Integrates the measured motion; its error grows with time, because no measurement corrects it."""
 
     def __init__(self, setup: Setup) -> None:
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._belief = self._motion.initial_belief(setup.prior)
 
     def step(self, packet: Packet) -> Estimate:

@@ -22,7 +22,6 @@ from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.measurements import Packet, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, Belief
 
 CITES = ("kang_vislam",)
@@ -40,7 +39,7 @@ class DecoupledEkf(Filter):
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers = setup.rig, setup.settings.outliers
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
 

@@ -37,7 +37,6 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet, StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
-from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 
 CITES = ("smith1990estimating", "huang2010observability")
@@ -78,7 +77,7 @@ class JointEkf:
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._outliers = setup.settings.outliers
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
 

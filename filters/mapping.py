@@ -8,7 +8,7 @@ from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet
-from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import predicted
 
 CITES = ("kang_vislam",)
 
@@ -22,7 +22,7 @@ class Mapping(Filter):
     """Takes the predicted pose as exact and corrects every landmark by its sightings from it (Kang, eqs. 3-10)."""
 
     def __init__(self, setup: Setup) -> None:
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._belief = self._motion.initial_belief(setup.prior)
         self._map = KnownPoseMapper(setup.rig, setup.settings.outliers.gate_probability)
 

@@ -30,7 +30,6 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.gating import FEWEST_SIGHTINGS
-from toolkit.models.motion import motion_model
 
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
@@ -58,7 +57,7 @@ class Msckf:
     def __init__(self, setup: Setup, at: Linearisation, landmarks: int = 0, window_s: float | None = None) -> None:
         self.log = load_kernels()
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks

@@ -17,8 +17,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Packet
 from toolkit.models import stereo
-from toolkit.models.motion import motion_model, predicted
-from toolkit.models.state import Belief
+from toolkit.models.state import Belief, predicted
 
 # Used instead of zero, which has no inverse: a bias of 1e-8 rad/s turns the pose by 1e-6 rad in 100 s.
 _FIXED_VARIANCE = 1e-16
@@ -40,7 +39,7 @@ class SeedEkf(Filter):
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._belief = _without_biases(self._motion.initial_belief(setup.prior))
         self._map = TrackedMap(setup.rig)
 

@@ -7,6 +7,7 @@ from typing import Protocol
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
 from toolkit.measurements import MotionKind, MotionNoise, Packet, Prior, StereoRig
+from toolkit.models.state import Predictor
 from toolkit.progress import SILENT, Progress
 from toolkit.settings.records import DEFAULTS, Scalar, Settings
 
@@ -14,6 +15,8 @@ from toolkit.settings.records import DEFAULTS, Scalar, Settings
 @dataclass(frozen=True, eq=False)
 class Setup:
     """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
+
+    ``motion`` predicts by the measured motion and its ``noise``: one model for all estimators.
 
     ``options`` are the settings of this estimator alone, by name; a long ``finish`` reports to ``progress``.
     """
@@ -23,6 +26,7 @@ class Setup:
     prior: Prior
     gravity_world: Array
     motion_kind: MotionKind
+    motion: Predictor
     settings: Settings = DEFAULTS
     options: Mapping[str, Scalar] = field(default_factory=dict)
     progress: Progress = SILENT

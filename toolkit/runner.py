@@ -11,7 +11,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,9 +25,11 @@ from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import Packet, Prior
+from toolkit.models.motion import motion_model
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
+from toolkit.settings.records import Scalar
 from toolkit.threads import on_one_thread
 
 # Linux: writing to this file resets the peak memory that is read here (proc(5)).
@@ -90,16 +92,7 @@ def run(
 
 def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress, settings: Settings) -> Run:
     packets = list(sequence.packets())
-    setup = Setup(
-        sequence.rig,
-        sequence.noise,
-        prior,
-        sequence.gravity_world,
-        sequence.motion_kind,
-        settings,
-        settings.options_of(name),
-        progress,
-    )
+    setup = setup_of(sequence, prior, settings, settings.options_of(name), progress)
     clock, online = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)
@@ -120,6 +113,27 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
             raise interrupt from None
         return _failed(name, online, clock.timings(), error)
     return _ended(name, online, finished, clock.timings(), sequence)
+
+
+def setup_of(
+    sequence: Sequence,
+    prior: Prior,
+    settings: Settings = DEFAULTS,
+    options: Mapping[str, Scalar] | None = None,
+    progress: Progress = SILENT,
+) -> Setup:
+    """Return what an estimator knows of a sequence before the first packet, with the model of its motion."""
+    return Setup(
+        sequence.rig,
+        sequence.noise,
+        prior,
+        sequence.gravity_world,
+        sequence.motion_kind,
+        motion_model(sequence.noise, sequence.gravity_world),
+        settings,
+        options or {},
+        progress,
+    )
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:

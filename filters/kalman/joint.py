@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.measurements import Motion
-from toolkit.models.state import POSE, Belief, Increment, MotionModel, Prediction
+from toolkit.models.state import POSE, Belief, Increment, Prediction, Predictor
 
 # At least this share of each variance is assumed independent of all other errors. A smaller share is lost in rounding,
 # and without it the covariance of two clones of one pose, equal to sixteen digits, has no Cholesky root.
@@ -251,7 +251,7 @@ class AtFirstEstimates:
         return np.asarray(moved_m > self._most_moved * distance_m)
 
 
-def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None) -> None:
+def propagate(joint: JointBelief, model: Predictor, at: Linearisation, motion: Motion | None) -> None:
     """Propagate a joint belief over the motion between two frames; the first frame has none (None)."""
     if motion is None:
         return

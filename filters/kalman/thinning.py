@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import ImuMotion, Motion, Packet, TwistMotion, UnmeasuredMotion, noise_scale_of
-from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import predicted
 
 
 class Thinned:
@@ -21,7 +21,7 @@ class Thinned:
     def __init__(self, setup: Setup, estimator: Estimator) -> None:
         self._estimator = estimator
         self._window, self._motion_kind = setup.settings.window, setup.motion_kind
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._motion = setup.motion
         self._prior = self._motion.initial_belief(setup.prior)
         self._kept_ns: list[int] = []
         self._left_out: list[tuple[int, int, Motion]] = []

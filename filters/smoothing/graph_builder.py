@@ -20,8 +20,9 @@ from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief, MotionModel
+from toolkit.models.state import Belief
 
 
 @dataclass

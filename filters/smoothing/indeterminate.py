@@ -23,7 +23,7 @@ import numpy as np
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
-from toolkit.models.state import MotionModel
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 
 # Sigma of the prior on a variable that nothing else determines: m for a landmark; rad, m, m/s for a state.

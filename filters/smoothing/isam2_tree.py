@@ -39,7 +39,7 @@ from toolkit.geometry import Array, BoolArray, se3_inverse, transform
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
 from toolkit.models.factors import key_list, kind_of, python_factors
-from toolkit.models.state import MotionModel
+from toolkit.models.graph_state import MotionModel
 
 # The states of this many frames are eliminated last, in the order of time, and after them landmarks with more sightings
 # than this: a state costs as much as two landmarks, so a longer track is cheaper in the root than the states it spans.

@@ -14,14 +14,16 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian
 from toolkit.models.factors import B, X, linear_factor, python_factors
-from toolkit.models.state import Increment
+from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.twist import TwistIncrement
 
 
 class MixedGraph:
     """A graph in the form a solver takes; the Python factors of twists, given by their last states, are on arrays."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, increments: Mapping[int, Increment] | None = None) -> None:
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, increments: Mapping[int, GraphIncrement] | None = None
+    ) -> None:
         self.whole, self._native = graph, gtsam.NonlinearFactorGraph(graph)
         twists = {k: one for k, one in (increments or {}).items() if isinstance(one, TwistIncrement)}
         self._twists = TwistFactors.of(twists) if twists else None

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
+from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
@@ -40,7 +41,7 @@ class Recording:
     def setup(self) -> Setup:
         s = self.sequence
         assert s.prior is not None
-        return Setup(s.rig, s.noise, s.prior, s.gravity_world, s.motion_kind)
+        return runner.setup_of(s, s.prior)
 
     def truth_at(self, k: int) -> Estimate:
         truth = self.sequence.truth

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from filters.ekf import DecoupledEkf
-from toolkit.estimator import Setup
+from toolkit import runner
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 
 def filter_of(sequence: Sequence) -> DecoupledEkf:
     prior = sequence.prior
-    return DecoupledEkf(Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind))
+    return DecoupledEkf(runner.setup_of(sequence, prior))
 
 
 def accepted_share(sequence: Sequence) -> float:

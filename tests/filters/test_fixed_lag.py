@@ -10,6 +10,7 @@ from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphExtension
+from toolkit import runner
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
@@ -22,7 +23,7 @@ from toolkit.simulation.faults import moving_vehicles
 
 def setup_of(sequence: Sequence) -> Setup:
     assert sequence.prior is not None
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    return runner.setup_of(sequence, sequence.prior)
 
 
 def position_of(window: FixedLagTree, k: int) -> Array:

@@ -20,6 +20,7 @@ from filters.kalman.coordinates import AnchoredBelief, InvariantBelief, inverse_
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from filters.kalman.online_output import LandmarkMemory
+from toolkit import runner
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.measurements import StereoFrame, StereoRig
@@ -39,7 +40,7 @@ def recording(scenario, duration_s: float, tracks: int, seed: int = 3) -> Sequen
 
 def setup_of(sequence: Sequence) -> Setup:
     assert sequence.prior is not None
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    return runner.setup_of(sequence, sequence.prior)
 
 
 def anchored(rig: StereoRig):

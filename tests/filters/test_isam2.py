@@ -18,9 +18,9 @@ from filters.smoothing.isam2_tree import (
     Isam2Tree,
 )
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
-from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measurements import TwistNoise
 from toolkit.models import stereo
@@ -333,7 +333,7 @@ def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share
 
 def isam2_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Isam2:
     s = sequence
-    return Isam2(Setup(s.rig, s.noise, s.prior, s.gravity_world, s.motion_kind, settings))
+    return Isam2(runner.setup_of(s, s.prior, settings))
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)

@@ -12,8 +12,8 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_exp
 from toolkit.measurements import TwistMotion, TwistNoise
 from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Increment
 from toolkit.models.stereo import triangulate_world
 from toolkit.models.twist import TwistIncrement, TwistModel, twist_factor
 from toolkit.simulation import DRIVE, simulate
@@ -22,7 +22,7 @@ NOISE = TwistNoise(np.array([0.01, 0.02, 0.03]), np.array([0.1, 0.2, 0.3]), np.f
 STATES = 7
 
 
-def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, Increment]]:
+def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, GraphIncrement]]:
     """Return two seconds of a drive from disturbed truth, and the increments."""
     sequence = simulate(replace(DRIVE, duration_s=2.0), 2)
     model, rng = motion_model(sequence.noise, sequence.gravity_world), np.random.default_rng(5)

@@ -15,12 +15,12 @@ from filters.smoothing.outlier_check import (
     RefusedTracks,
     relative_to_its_map,
 )
-from toolkit.estimator import Setup
+from toolkit import runner
 from toolkit.geometry import se3, se3_exp, se3_inverse, transform
 from toolkit.measurements import Packet, StereoFrame
 from toolkit.models import stereo
-from toolkit.models.motion import motion_model, predicted
-from toolkit.models.state import Belief
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief, predicted
 from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
@@ -332,7 +332,7 @@ def begun_far(clean):
 
 
 def point_and_log(build, sequence):
-    estimator = build(Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
+    estimator = build(runner.setup_of(sequence, sequence.prior))
     for packet in sequence.packets():
         estimator.step(packet)
     finished = estimator.finish()

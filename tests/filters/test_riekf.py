@@ -19,6 +19,7 @@ from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
 from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from filters.kalman.online_output import LandmarkMemory
+from toolkit import runner
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
 from toolkit.measurements import Prior
@@ -38,7 +39,7 @@ def recording(scenario, duration_s: float = 1.0, tracks: int = 15, seed: int = 3
 
 def setup_of(sequence: Sequence) -> Setup:
     assert sequence.prior is not None
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    return runner.setup_of(sequence, sequence.prior)
 
 
 def numerical_jacobian(function: Callable[[Array], Array], size: int, step: float = 1e-3) -> Array:

@@ -47,14 +47,7 @@ class Listener:
 
 
 def thinned(sequence, window):
-    setup = Setup(
-        sequence.rig,
-        sequence.noise,
-        sequence.prior,
-        sequence.gravity_world,
-        sequence.motion_kind,
-        Settings(window=window),
-    )
+    setup = runner.setup_of(sequence, sequence.prior, Settings(window=window))
     listener = Listener(setup)
     wrapped = Thinned(setup, listener)
     online = [wrapped.step(packet) for packet in sequence.packets()]

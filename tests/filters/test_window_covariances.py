@@ -11,6 +11,7 @@ from filters.fixed_lag import FixedLag
 from filters.smart import Smart
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
+from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.measurements import NS_PER_S
@@ -31,7 +32,7 @@ every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.
 
 
 def setup_of(sequence: Sequence) -> Setup:
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    return runner.setup_of(sequence, sequence.prior)
 
 
 def with_gap(sequence: Sequence) -> Sequence:

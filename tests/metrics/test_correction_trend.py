@@ -12,8 +12,8 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.metrics import Evaluation, correction_trend
 from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.parts.scores import Unavailable
-from toolkit.models.motion import motion_model, predicted
-from toolkit.models.state import POSE
+from toolkit.models.motion import motion_model
+from toolkit.models.state import POSE, predicted
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
 
 DURATION_S = {"drive": 40.0, "drive-imu": 20.0}

@@ -10,8 +10,8 @@ import pytest
 from toolkit.geometry import se3_exp
 from toolkit.measurements import Packet
 from toolkit.models.factors import B, V, X, joint_cov
-from toolkit.models.motion import motion_model, predicted
-from toolkit.models.state import Belief
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief, predicted
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

@@ -15,7 +15,7 @@ from toolkit.geometry import Array
 from toolkit.measurements import TwistNoise
 from toolkit.models import state_covariances
 from toolkit.models.factors import L, X, joint_cov, linear_factor
-from toolkit.models.state import MotionModel
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.models.twist import TwistModel
 from toolkit.simulation import DRIVE, FLIGHT, simulate

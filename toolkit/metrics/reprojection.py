@@ -24,7 +24,8 @@ from toolkit.metrics.parts.leave_one_out import CAP_PX, FEWEST_VIEWS, errors_lef
 from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
 from toolkit.models import stereo
 from toolkit.models.corrections import belief_at
-from toolkit.models.motion import motion_model, predicted
+from toolkit.models.motion import motion_model
+from toolkit.models.state import predicted
 from toolkit.sequence import Sequence
 
 ORDER = 50

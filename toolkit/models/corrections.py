@@ -16,8 +16,9 @@ import numpy as np
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
 from toolkit.measurements import Motion
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief, MotionModel, Prediction
+from toolkit.models.state import Belief, Prediction
 from toolkit.sequence import Sequence
 
 # Directions in which a correction reduces the variance by less than this share are not tested: there rounding

@@ -13,7 +13,8 @@ import numpy as np
 from toolkit.geometry import Array, skew, so3_exp
 from toolkit.measurements import ImuMotion, ImuNoise, Motion
 from toolkit.models.factors import B, V, X, constant_bias
-from toolkit.models.state import IMU_LAYOUT, POSITION, ROTATION, Belief, MotionModel, Prediction
+from toolkit.models.graph_state import MotionModel
+from toolkit.models.state import IMU_LAYOUT, POSITION, ROTATION, Belief, Prediction
 
 _VELOCITY = slice(6, 9)
 

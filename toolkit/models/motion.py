@@ -1,14 +1,18 @@
 """The motion model of a recording, by the kind of its measurements.
 
 They are in :mod:`toolkit.models.twist` (also where nothing was measured) and :mod:`toolkit.models.imu`. What they offer
-filters and smoothers is in :mod:`toolkit.models.state`.
+filters is in :mod:`toolkit.models.state`, and what they offer graphs in :mod:`toolkit.models.graph_state`.
 """
 
 from toolkit.geometry import Array
-from toolkit.measurements import Motion, MotionNoise, TwistChangeNoise, TwistNoise
+from toolkit.measurements import MotionNoise, TwistChangeNoise, TwistNoise
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.imu import ImuModel
-from toolkit.models.state import Belief, MotionModel
+from toolkit.models.state import predicted
 from toolkit.models.twist import SmoothTwist, TwistModel
+
+# Estimators of users import `predicted` from here.
+__all__ = ["motion_model", "predicted"]
 
 
 def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
@@ -18,10 +22,3 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     if isinstance(noise, TwistChangeNoise):
         return SmoothTwist(noise)
     return ImuModel(noise, gravity_world)
-
-
-def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:
-    """Return the belief predicted over a measured motion; unchanged if there is none, at the first frame."""
-    if motion is None:
-        return belief
-    return belief.predicted(model.integrate(motion, belief.bias).predict(belief))

@@ -37,7 +37,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.models.factors import linear_factor
-from toolkit.models.state import MotionModel
+from toolkit.models.graph_state import MotionModel
 
 # Accepted relative error of a standard deviation, which is read to a tenth.
 _MOST_ROUNDED = 0.01

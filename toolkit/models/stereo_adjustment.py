@@ -30,7 +30,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, huber_losses, huber_weights
-from toolkit.models.state import MotionModel
+from toolkit.models.graph_state import MotionModel
 
 # Squared norm of a point behind the camera: it has no gradient and must not cost less than one in front of it.
 _BEHIND = 100.0**2

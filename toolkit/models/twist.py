@@ -29,7 +29,8 @@ from toolkit.geometry import (
 )
 from toolkit.measurements import Motion, TwistChangeNoise, TwistMotion, TwistNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X
-from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, MotionModel, Prediction
+from toolkit.models.graph_state import MotionModel
+from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, Prediction
 
 
 class TwistStep(NamedTuple):

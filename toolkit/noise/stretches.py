@@ -20,8 +20,9 @@ from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior
 from toolkit.models import stereo
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.gating import chi2_bound
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief, MotionModel
+from toolkit.models.state import Belief
 from toolkit.models.stereo_adjustment import (
     Ending,
     Evaluated,

@@ -14,6 +14,7 @@ from typing import cast
 
 import numpy as np
 
+from toolkit import runner
 from toolkit.answers import COV_SIZES, Run, check_state
 from toolkit.discovery import shown_name
 from toolkit.errors import EstimatorError
@@ -81,7 +82,7 @@ class Watched:
 def setup_of(sequence: Sequence) -> Setup:
     """Return the setup of an estimator for a recording with its own prior, as a simulated one has."""
     assert sequence.prior is not None
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    return runner.setup_of(sequence, sequence.prior)
 
 
 def watch(build: Build, sequence: Sequence) -> Watched:

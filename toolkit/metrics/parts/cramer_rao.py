@@ -34,8 +34,9 @@ from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import chi2_bound
+from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief, Layout, MotionModel
+from toolkit.models.state import Belief, Layout
 from toolkit.models.state_covariances import state_covs
 from toolkit.sequence import Sequence
 
