@@ -577,7 +577,7 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     return Symptom.warning(
         count=len(wrongs),
         detail="; ".join(one.summary for one in wrongs),
-        treatment=f"check {', '.join(dict.fromkeys(one.check for one in wrongs))}",
+        treatment=f"check {', '.join(dict.fromkeys(part for one in wrongs for part in one.check.split(', ')))}",
     )
 
 
@@ -715,8 +715,8 @@ def steady_difference(evidence: Evidence) -> Symptom | None:
         count=len(differences),
         detail=f"vision and odometry differ during the whole recording: {'; '.join(differences)}",
         treatment=(
-            "a wrong focal length, baseline, principal point or wheel scale, or slip and pitch, which cause as much in "
-            "recordings of cars without faults; by default estimators model none of these"
+            "possible causes are a wrong focal length, baseline, principal point or wheel scale, or slip and pitch, "
+            "which cause as much in recordings of cars without faults; by default estimators model none of these"
         ),
     )
 

@@ -197,7 +197,7 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
         count=1,
-        detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} then{doubt}",
+        detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} corrected{doubt}",
         treatment=taken.done if certain else f"{readings[second].name} explains it as well: choose one",
         remedy=remedy if certain else None,
         spoils_vision=not certain,
@@ -401,7 +401,7 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
         count=1,
         detail=(
             f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: the residual against the camera's "
-            f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 then (median)"
+            f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 in that order (median)"
         ),
         treatment=f"its channels are exchanged or have the wrong sign: correct them{MIRRORED}",
         remedy=None,

@@ -48,8 +48,8 @@ SENSORS: dict[MotionKind, tuple[Sensor, ...]] = {
         Sensor("rate of rotation", "rates of rotation", _ANGULAR, "rad/s"),
     ),
     "imu": (
-        Sensor("accelerometer", "accelerometer", _LINEAR, "m/s^2"),
-        Sensor("gyro", "gyro", _ANGULAR, "rad/s"),
+        Sensor("accelerometer", "accelerations", _LINEAR, "m/s^2"),
+        Sensor("gyro", "rates of rotation", _ANGULAR, "rad/s"),
     ),
 }
 
@@ -327,7 +327,7 @@ def saturated_samples(evidence: Evidence) -> Symptom | None:
             at_end = _at_range_end(sign * column)
             if at_end.any():
                 rows |= at_end
-                at = f"{column[at_end][0]:.3g} {sensor.unit}"
+                at = f"{column[at_end][0]:z.3g} {sensor.unit}"
                 findings.append(f"{sensor.name} {axis} at {at} ({at_end.sum()} samples)")
     if not findings:
         return None
@@ -608,7 +608,7 @@ def _baseline(evidence: Evidence) -> _WrongUnit | None:
         measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
         unit = _in_other_unit(ratio, measured, WITHIN_FACTOR, UNIT_SIGMAS)
         fitting = [unit] if unit is not None else []
-        summary += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
+        summary += f", and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
     if len(fitting) != 1:
         return _WrongUnit(f"{summary}: it is not in metres", None)
     baseline_m = rig.baseline_m / LENGTHS[fitting[0]]

@@ -79,7 +79,11 @@ def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
     if not jumps:
         open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
         summary = f"the stamps of frames and samples jump together by {', '.join(open_s)}"
-        return Undecided(f"{summary}: the tracks do not determine whether time passed") if open_s else None
+        return (
+            Undecided(f"{summary}: the tracks do not determine whether time passed or a clock was set")
+            if open_s
+            else None
+        )
     usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     jumps_text = [
         f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
@@ -296,12 +300,13 @@ def outside_motion(evidence: Evidence) -> Symptom | None:
         return None
     if sequence.frame_count - count < LEAST_FRAMES:
         frames_s, motion_s = (
-            f"{t.min() / NS_PER_S:.6g} to {t.max() / NS_PER_S:.6g} s" for t in (frames_t_ns, motion_t_ns)
+            f"{(t.min() - motion_t_ns.min()) / NS_PER_S:.6g} to {(t.max() - motion_t_ns.min()) / NS_PER_S:.6g} s"
+            for t in (frames_t_ns, motion_t_ns)
         )
         return Symptom(
             count=count,
-            detail=f"the frames are at {frames_s} and the motion samples at {motion_s}: {count} of "
-            f"{sequence.frame_count} frames lie outside",
+            detail=f"counted from the first motion sample, the samples are at {motion_s} and the frames at {frames_s}: "
+            f"{count} of {sequence.frame_count} frames lie outside",
             treatment="no motion is left: stamp both by one clock, in one unit",
             remedy=None,
         )
@@ -383,7 +388,7 @@ def sparse_motion(evidence: Evidence) -> Symptom | None:
     )
     if step_s <= GAP_RATIO * frame_s:
         return None
-    detail = f"motion samples come every {step_s:.2g} s and frames every {frame_s:.2g} s"
+    detail = f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s"
     if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
         return Symptom(
             count=int(sequence.motion.t_ns.size),
@@ -428,7 +433,7 @@ def motion_gap(evidence: Evidence) -> Symptom | None:
         detail=f"{rows.size} gap(s) in the motion samples, the longest of {longest_s:.3g} s",
         treatment=(
             f"bridged by linear interpolation, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times "
-            "the noise there, as measured stretches bridged likewise need"
+            "the noise there, to cover the error that the same interpolation has over measured stretches"
         ),
         remedy=replace(
             sequence,
@@ -599,8 +604,8 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom(
         count=1,
         detail=(
-            f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval away from its "
-            f'start, which is "{nearest}", not "{present}"'
+            f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval after its "
+            f'start: they belong to its "{nearest}", and are stated to belong to its "{present}"'
         ),
         treatment=f'an interval is paired with the sample of its "{nearest}"',
         remedy=replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
@@ -678,7 +683,7 @@ def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided
     if abs(beyond_s) < max(least_s, OFFSET_SIGMAS * found.error) or found.error > surely_s:
         return _as_often(sequence, Scalar(offset_s, found.error)) or _unseen_offset(found, largest_s, is_twist)
     seen = (
-        f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
+        f"the camera turns as the gyro does when the frames' stamps are shifted by {1e3 * offset_s:.1f} +- "
         f"{1e3 * found.error:.1f} ms"
     )
     detail = f"{seen}: frames are stamped {'late' if offset_s < 0.0 else 'early'}"
@@ -705,7 +710,8 @@ def _unseen_offset(found: Scalar, largest_s: float, is_twist: bool) -> Undecided
     late = "late" if found.value < 0.0 else "early"
     seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
     return Undecided(
-        f"frames look as if stamped {late} by {seen}, too little change of rotation to distinguish that from chance"
+        f"frames look as if stamped {late} by {seen}, and there is too little change of rotation to distinguish that "
+        "from chance"
     )
 
 

@@ -325,8 +325,8 @@ def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
             "exchanged"
         ),
         treatment=(
-            "the depth is lost with the exchange: these and all others that look like rows dropped "
-            f"({candidates.sum()})"
+            "the depth is lost with the exchange: these and all others that look like rows are "
+            f"dropped ({candidates.sum()})"
         ),
         remedy=replace(sequence, observations=sequence.observations.select(~candidates)),
     )
@@ -398,7 +398,7 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
         return Symptom(
             count=count,
             detail=f"{count} {of_all} are {filler:g} in every coordinate: missing ones, written as {filler:g}",
-            treatment="dropped; a course file has -1 for them, a table no row",
+            treatment="dropped; write -1 for them in a course file, and leave their rows out of a table",
             remedy=replace(sequence, observations=observations.select(~missing)),
             harmful=False,
         )
