@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import interval_means, subdivided
+from toolkit.audit.intervals import interval_means, subdivided, usual_step_s
 from toolkit.geometry import Array, IntArray, se3, se3_exp, skew, so3_exp, so3_log
 from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistMotion, TwistNoise
 from toolkit.models.gating import CHI2_3_MEDIAN
@@ -173,7 +173,7 @@ def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
     """
     noise = sequence.noise
     assert isinstance(noise, ImuNoise)
-    sample_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    sample_s = usual_step_s(sequence.motion.t_ns)
     gyro, accel = float(np.hypot(noise.gyro_noise_density, GYRO_ERROR * sample_s)), noise.accel_noise_density
     whitener, one = np.zeros((len(dt_s), 9, 9)), np.eye(3)
     rest = (np.sqrt(12.0 / dt_s**3) / accel)[:, None, None]

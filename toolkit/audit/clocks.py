@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import LEAST_INTERVALS, Integral, Intervals
+from toolkit.audit.intervals import LEAST_INTERVALS, Integral, Intervals, usual_step_s
 from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, slope, spread
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
@@ -60,7 +60,7 @@ LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 
 def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
     """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
-    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.frames_t_ns)
     gyro, w_imu = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:]), intervals.w_seen_radps
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
     some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
@@ -104,7 +104,7 @@ def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolA
     """
     seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
     seen[intervals.interval + 1], known[intervals.interval + 1] = intervals.w_seen_radps, True
-    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.frames_t_ns)
     before, after = intervals.interval, intervals.interval + 2
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
 
@@ -238,7 +238,7 @@ def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar
                 found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
         if at is None or abs(found[1]) >= MOST_RATE:
             return None
-        step_s = float(np.median(np.diff(as_gyro.frames_t_ns))) / NS_PER_S
+        step_s = usual_step_s(as_gyro.frames_t_ns)
         if abs(found[1]) * 0.5 * as_gyro.duration_s >= step_s:
             both = [_linearised(as_gyro, seen, one, np.arange(count)) for one in (found, np.array([offset_s, 0.0]))]
             left, without = (np.inf if one is None else float(np.sum(spread(one.unexplained) ** 2)) for one in both)

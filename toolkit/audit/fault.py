@@ -5,15 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Self
 
-import numpy as np
-
 from toolkit.audit.alignment import ForceBesideCamera, Position, VelocityFit, force_beside_camera, velocity_fit
 from toolkit.audit.clocks import TruthClock, truth_clock
-from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable, usual_step_s
 from toolkit.audit.one_step import Agreement, OneStep, agreement, one_step, step_correlation
 from toolkit.audit.robust import Scalar
 from toolkit.audit.self_calibration import SelfCalibration, self_calibration
-from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -140,7 +137,7 @@ class Evidence:
         """The camera's scale and pose by the velocities of odometry; None without ``intervals`` or velocities."""
         if self.intervals is None or self.intervals.v_mps is None:
             return None
-        step_s = float(np.median(np.diff(self.sequence.frames_t_ns))) / NS_PER_S
+        step_s = usual_step_s(self.sequence.frames_t_ns)
         return velocity_fit(self.intervals, step_s)
 
     @cached_property

@@ -22,6 +22,11 @@ STEP_S = 0.02
 MOST_BIAS_RADPS = 0.2
 
 
+def usual_step_s(t_ns: IntArray) -> float:
+    """Return the median time (s) from one of at least two stamps (N,) to the next."""
+    return float(np.median(np.diff(t_ns))) / NS_PER_S
+
+
 class Intervals(NamedTuple):
     """The M intervals whose camera motion is known.
 

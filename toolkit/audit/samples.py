@@ -20,6 +20,7 @@ from toolkit.audit.intervals import (
     rotation_ratio,
     speed_ratio,
     stated_densities,
+    usual_step_s,
 )
 from toolkit.audit.one_step import median_one_step_px
 from toolkit.audit.robust import Scalar
@@ -215,7 +216,7 @@ def stuck_samples(evidence: Evidence) -> Symptom | None:
     if sequence.motion_kind == "none" or not sequence.motion.t_ns.size:
         return None
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
-    step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
+    step_s = usual_step_s(t_ns) if t_ns.size > 1 else LEAST_S
     least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
     if sequence.motion_kind == "twist":
         if (never := _never_moves(evidence)) is not None:
@@ -362,7 +363,7 @@ def coarse_samples(evidence: Evidence) -> Symptom | None:
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or sequence.motion.t_ns.size < LEAST_COARSE_SAMPLES:
         return None
-    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.motion.t_ns)
     if not step_s > 0.0:
         return None
     sigma, found = stated_densities(sequence.noise) / np.sqrt(step_s), list[str]()
@@ -588,7 +589,7 @@ def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
     """Report stamps whose steps between frames are not those of a vehicle's camera."""
     if evidence.sequence.frame_count < 2 or evidence.intervals is None:
         return None
-    step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
+    step_s = usual_step_s(evidence.sequence.frames_t_ns)
     if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
         return None
     return _WrongUnit(

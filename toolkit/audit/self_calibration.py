@@ -25,11 +25,11 @@ from toolkit.audit.bundle import (
     reduce,
     twist_strides,
 )
-from toolkit.audit.intervals import Intervals, chained, interval_means, moved_as_measured, moved_by
+from toolkit.audit.intervals import Intervals, chained, interval_means, moved_as_measured, moved_by, usual_step_s
 from toolkit.audit.robust import LEVEL
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.measurements import NS_PER_S, MotionKind, is_left_only
+from toolkit.measurements import MotionKind, is_left_only
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.stereo import disparity_px, triangulate
 from toolkit.sequence import Sequence
@@ -238,7 +238,7 @@ def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[
 
 def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[KeyFrameWindow]:
     """Return the windows in which the motion is known and there are enough tracks."""
-    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.frames_t_ns)
     stride = max(1, round(STRIDE_S / step_s))
     keys = np.arange(0, sequence.frame_count, stride)
     whole = round(sequence.duration_s / WINDOW_S)

@@ -10,7 +10,7 @@ from toolkit.audit.bundle import CHANGE, LATE
 from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
-from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities
+from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities, usual_step_s
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
 from toolkit.audit.self_calibration import self_calibration
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -84,7 +84,7 @@ def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
             if open_s
             else None
         )
-    usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    usual_s = usual_step_s(sequence.frames_t_ns)
     jumps_text = [
         f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
         f"{usual_s * gone.value:.3f} +- {usual_s * gone.error:.3f} s passed)"
@@ -329,20 +329,18 @@ def time_gap(evidence: Evidence) -> Symptom | None:
     in the frames alone is information, because the motion samples cover it.
     """
     sequence = evidence.sequence
-    holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    holes = _holes(t_ns, MOTION_GAP_S)
     # Gaps outside the time of the frames do not matter.
-    inside = (sequence.motion.t_ns[holes + 1] > sequence.frames_t_ns[:1]) & (
-        sequence.motion.t_ns[holes] < sequence.frames_t_ns[-1:]
-    )
+    inside = (t_ns[holes + 1] > frames_t_ns[:1]) & (t_ns[holes] < frames_t_ns[-1:])
     return _motion_symptom(sequence, holes[inside]) if inside.any() else _frames_symptom(sequence)
 
 
 def _holes(t_ns: IntArray, least_s: float) -> IntArray:
     """Return the rows after which the next stamp is too far away."""
-    step_s = np.diff(t_ns) / NS_PER_S
-    if step_s.size == 0:
+    if t_ns.size < 2:
         return np.empty(0, dtype=np.int64)
-    return np.flatnonzero(step_s > max(least_s, GAP_RATIO * float(np.median(step_s))))
+    return np.flatnonzero(np.diff(t_ns) / NS_PER_S > max(least_s, GAP_RATIO * usual_step_s(t_ns)))
 
 
 def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
@@ -383,9 +381,7 @@ def sparse_motion(evidence: Evidence) -> Symptom | None:
     sequence = evidence.sequence
     if sequence.motion.t_ns.size < 2 or sequence.frame_count < 2 or not is_comparable(sequence):
         return None
-    step_s, frame_s = (
-        float(np.median(np.diff(t_ns))) / NS_PER_S for t_ns in (sequence.motion.t_ns, sequence.frames_t_ns)
-    )
+    step_s, frame_s = usual_step_s(sequence.motion.t_ns), usual_step_s(sequence.frames_t_ns)
     if step_s <= GAP_RATIO * frame_s:
         return None
     detail = f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s"
@@ -449,14 +445,13 @@ def _short_holes(sequence: Sequence) -> tuple[IntArray, float]:
     A twist may be the mean over the whole interval to the next one, so a gap between twists needs a frame inside it.
     """
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
-    step_ns = np.diff(t_ns)
-    if not step_ns.size or isinstance(sequence.motion, NoSamples):
+    if t_ns.size < 2 or isinstance(sequence.motion, NoSamples):
         return np.empty(0, dtype=np.int64), 0.0
-    usual_ns = float(np.median(step_ns))
-    inside = (t_ns[1:] > frames_t_ns[0]) & (t_ns[:-1] < frames_t_ns[-1])
+    rows = _holes(t_ns, 0.0)
+    inside = (t_ns[rows + 1] > frames_t_ns[0]) & (t_ns[rows] < frames_t_ns[-1])
     if isinstance(sequence.motion, TwistSamples):
-        inside = np.searchsorted(frames_t_ns, t_ns[1:]) > np.searchsorted(frames_t_ns, t_ns[:-1], side="right")
-    return np.flatnonzero((step_ns > GAP_RATIO * usual_ns) & inside), usual_ns
+        inside = np.searchsorted(frames_t_ns, t_ns[rows + 1]) > np.searchsorted(frames_t_ns, t_ns[rows], side="right")
+    return rows[inside], float(np.median(np.diff(t_ns)))
 
 
 def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
@@ -748,7 +743,7 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     """Report twists at the rate and a constant time from the frames, if the tracks allow an offset of that time."""
     if not isinstance(sequence.motion, TwistSamples) or (late_s := _constant_phase_s(sequence)) is None:
         return None
-    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.motion.t_ns)
     near = [shift for shift in (-late_s, step_s - late_s) if abs(offset.value - shift) <= NEAR_SIGMAS * offset.error]
     if not near:
         return None
@@ -782,7 +777,7 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
     """Return the offset (s) that the pairing of twists implies, and the largest difference that is no fault."""
     if not isinstance(sequence.motion, TwistSamples):
         return 0.0, LEAST_OFFSET_S
-    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    step_s = usual_step_s(sequence.motion.t_ns)
     least_s = (
         LEAST_TWIST_INTERVALS * step_s
         if is_stamped_at_frames(sequence)
