@@ -416,7 +416,7 @@ def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
         least = BY_TRACK_DRIFT * gravity + GRAVITY_SIGMAS * step.error
     if abs(step.value) < least:
         hidden = least / gravity
-        unseen = Undecided(f"a change of the gravity it reads by less than {hidden:.0%} would not show")
+        unseen = Undecided(f"a change by less than {hidden:.0%} of the gravity that it reads would not show")
         return None if hidden < LARGEST_HIDDEN_GRAVITY else unseen
     return Symptom.warning(
         detail=(
