@@ -132,16 +132,6 @@ def test_what_is_planted_is_named_with_what_to_do(newcomer, capsys, plant: str, 
         assert list(found) == [promise]
 
 
-def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
-    some = ("2 s without sightings", "0.25 s that is not a number")
-    monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
-    monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
-    assert main(["verify", str(newcomer("pass"))]) == 0
-    messages = capsys.readouterr().out
-    assert "my-filter keeps every promise" in messages
-    assert messages.count("  passed") == 12
-
-
 @pytest.mark.usefixtures("only_runs")
 def test_one_without_a_covariance_is_fine(newcomer, capsys) -> None:
     assert main(["verify", str(newcomer("cov = None")), "--json"]) == 0
@@ -222,7 +212,7 @@ def test_one_that_takes_no_input_at_all_does_not_run(for_twists_alone, capsys) -
     assert "it needs measured velocities" in failed(capsys)[RUNS]["found"]
 
 
-@pytest.mark.parametrize("plant", ["1 / (k - 1)", "assert not packet.index", "T = None"])
+@pytest.mark.parametrize("plant", ["1 / (k - 1)", "T = None"])
 @pytest.mark.usefixtures("only_runs")
 def test_any_other_error_at_the_first_motion_is_a_broken_promise(newcomer, capsys, plant: str) -> None:
     assert main(["verify", str(newcomer(plant)), "--json"]) == 1
@@ -254,7 +244,9 @@ def test_the_filter_of_the_notebook_keeps_every_promise(tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     Path("two_view.py").write_text(imports + cell)
     assert main(["verify", "two_view.py"]) == 0
-    assert "two-view keeps every promise" in capsys.readouterr().out
+    messages = capsys.readouterr().out
+    assert "two-view keeps every promise" in messages
+    assert messages.count("  passed") == 12
 
 
 def test_a_covariance_may_round_but_not_differ_from_its_transpose() -> None:
