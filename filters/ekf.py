@@ -6,7 +6,6 @@ landmark, but the filter is overconfident: its covariance does not grow with the
 
 import numpy as np
 
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import (
     LandmarkMap,
     TrackedMap,
@@ -21,7 +20,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.measurements import Packet, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.gating import FrameGate, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 
 CITES = ("kang_vislam",)

@@ -27,7 +27,6 @@ import numpy as np
 
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InverseDepthBelief
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtFirstEstimates, JointBelief, Linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.tracks import TrackSightings
@@ -36,7 +35,7 @@ from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet, StereoFrame, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, FrameGate
 from toolkit.models.state import Belief
 
 CITES = ("smith1990estimating", "huang2010observability")

@@ -27,13 +27,13 @@ from scipy.sparse import csr_array
 from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation
 from filters.kalman.joint_landmarks import LandmarkSightings
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import StereoFrame, StereoRig
+from toolkit.models.gating import FrameGate
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"

@@ -11,7 +11,6 @@ state does in the smoothers.
 import numpy as np
 
 from filters.kalman import joint_landmarks
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
@@ -29,7 +28,7 @@ from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
-from toolkit.models.gating import FEWEST_SIGHTINGS
+from toolkit.models.gating import FEWEST_SIGHTINGS, FrameGate
 
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"

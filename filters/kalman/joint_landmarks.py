@@ -10,7 +10,6 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dgeqrf
 from scipy.sparse import csr_array
 
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief, Linearisation
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.tracks import TrackSightings
@@ -18,7 +17,7 @@ from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.gating import FrameGate, mahalanobis_squared
 
 
 class LandmarkSightings(NamedTuple):

@@ -26,7 +26,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import (
     JointBelief,
     cholesky_root,
@@ -45,6 +44,7 @@ from toolkit.models.gating import (
     LEAST_DEPTH_M,
     LEAST_DISPARITY_PX,
     MISMATCHED_TRACK_FACTOR,
+    FrameGate,
     huber_threshold,
 )
 from toolkit.models.state import POSE, Belief

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from filters.ekf import correct_pose
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, correct_landmarks, informed
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
-from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
+from toolkit.models.gating import FrameGate, chi2_bound, huber_weights, mahalanobis_squared
 from toolkit.models.state import IMU_LAYOUT, TWIST_LAYOUT, Belief, Layout
 from toolkit.simulation import DRIVE
 

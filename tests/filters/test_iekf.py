@@ -17,7 +17,6 @@ from filters import iekf
 from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from filters.kalman.online_output import LandmarkMemory
 from toolkit import runner
@@ -25,6 +24,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings

@@ -7,11 +7,11 @@ import pytest
 
 from filters import iekf
 from filters.kalman import joint_landmarks
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief
 from toolkit.geometry import Array, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
+from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
 from toolkit.simulation import FLIGHT, simulate
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from filters.kalman import joint_landmarks
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import AcceptedTracks, WindowPoses, WindowTracks, accepted_tracks
 from filters.msckf import Msckf
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
+from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
 from toolkit.settings import Settings
 from toolkit.settings import Window as WindowSettings

@@ -16,13 +16,13 @@ from filters import iekf
 from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from filters.kalman.online_output import LandmarkMemory
 from toolkit import runner
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
 from toolkit.measurements import Prior
+from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
 from toolkit.models.state import IMU_LAYOUT, Belief
 from toolkit.sequence import Sequence

@@ -14,7 +14,6 @@ from scipy.optimize import least_squares
 
 from filters import msckf, msckf_fej
 from filters.kalman import kernels
-from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import AtFirstEstimates, JointBelief, propagate
 from filters.kalman.tracks import (
     TrackSightings,
@@ -27,7 +26,7 @@ from filters.kalman.tracks import (
 from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, chi2_bound
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, FrameGate, chi2_bound
 from toolkit.models.motion import motion_model
 from toolkit.runner import run
 from toolkit.settings import POLICIES
