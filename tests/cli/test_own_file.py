@@ -43,7 +43,7 @@ def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path,
     for change in ("", "", "# another filter\n"):
         with my_filter.open("a") as file:
             file.write(change)
-        assert main([*words, "--workers", "2"]) == 0
+        assert main([*words, "--workers", "1"]) == 0
         said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("results:")]
         found.append(said[-1].partition(";")[0])
     assert found == [
@@ -74,9 +74,7 @@ def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter: Path, capsys) ->
     ("estimators", "text", "told"),
     [
         ("my_filter", "", "is given as its file, as in my_filter.py"),
-        ("nowhere.py", "", "nowhere.py: there is no such file"),
         ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported"),
-        ("mine.py", "x = 1\n", "mine.py defines no function build(setup)"),
         ("ekf.py", "def build(setup): ...\n", "give the file another name"),
         ("my_filter.py,deeper/my_filter.py", "def build(setup): ...\n", "give the file another name"),
     ],
