@@ -87,14 +87,23 @@ def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: 
     return LandmarkMap(frame.track_ids[rows][near], *started(uvs_px[near], T_world_imu, rig))
 
 
+class SightingResiduals(NamedTuple):
+    """Residuals (N, 3) px of sightings, with Jacobians (N, 3, 6) and (N, 3, 3), and the predicted depths (N,) m."""
+
+    residual_px: Array
+    H_pose: Array
+    H_point: Array
+    depth_m: Array
+
+
 def residuals_with_jacobians(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig
-) -> stereo.StereoPrediction:
-    """Return the residuals (N, 3) px of sightings, with Jacobians; both are zero where uR is missing."""
+) -> SightingResiduals:
+    """Return the residuals of sightings (N, 3) px from a pose (4, 4), with Jacobians; zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
     if not stereo.any_missing(uvs_px):
-        return predicted._replace(uv_px=uvs_px - predicted.uv_px)
-    return stereo.StereoPrediction(
+        return SightingResiduals(uvs_px - predicted.uv_px, *predicted[1:])
+    return SightingResiduals(
         stereo.residuals_px(uvs_px, predicted.uv_px),
         stereo.seen_rows(uvs_px, predicted.d_uv_d_pose),
         stereo.seen_rows(uvs_px, predicted.d_uv_d_point),

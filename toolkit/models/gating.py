@@ -89,8 +89,8 @@ def huber_losses(distances_squared: Array, threshold: float | None) -> Array:
 class FrameGate:
     """Accepts innovations below the chi-square quantile of a probability, counts them, and weighs them by Huber's loss.
 
-    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. Every accepted innovation
-    is weighted by ``track_weight``, a factor in (0, 1] on its information: the rig's.
+    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. ``track_weight``, a
+    factor in (0, 1] on an innovation's information, is part of its weight; 1 where the update applies the rig's itself.
 
     ``nis`` and ``dof`` are sums over the accepted innovations. ``nis_expected`` is the expected sum of NIS if the
     innovations match their covariance; it is less than ``dof``, because the gate has removed the largest ones. Robust
