@@ -113,6 +113,15 @@ def test_another_truth_is_not_compared_with(scene, vislam, capsys):
     assert failures(vislam, "--truth", "moved") == []
 
 
+def test_a_plan_says_the_chances_and_writes_nothing(vislam, capsys):
+    Path("base.json").unlink()
+    assert vislam(*BASELINE, "--bound", "1", "--plan") == 0
+    printed = capsys.readouterr().out
+    assert "maze" in printed
+    assert "bound (1 %)" in printed
+    assert not Path("base.json").exists()
+
+
 def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vislam):
     t_ns = scene.stamps(10.0)
     poses = scene.poses_at(t_ns)
@@ -158,8 +167,9 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vis
         ),
         (("baseline", "--trajectories", "results"), 3, "lap: no truth is given; name it with --truth"),
         (("baseline", "--trajectories", "results", "--truth", "results"), 3, "maze: results has 5 truths for it"),
+        (("baseline", "--trajectories", "truth", "--truth", "truth", "--plan"), 3, "no sequence has 3 runs"),
         (("baseline", "drive", "--trajectories", "results"), 2, "--trajectories takes no SEQUENCE"),
-        (("baseline", "drive", "--gap", "3"), 2, "--align and --gap go with --trajectories"),
+        (("baseline", "drive", "--gap", "3"), 2, "--gap, --bound and --plan go with --trajectories"),
     ],
 )
 def test_trouble_is_reported_in_one_line(vislam, capsys, words, status, wanted):

@@ -19,16 +19,17 @@ from toolkit.cli.arguments import (
     command,
     estimators,
     flag,
+    number_within,
     positive_seconds,
     requested_changes,
     requested_settings,
 )
-from toolkit.errors import printable
+from toolkit.errors import DataError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from toolkit.evaluation.against_baseline import GivenRuns
+    from toolkit.evaluation.against_baseline import GivenRuns, TrajectoryBaselineRecord
     from toolkit.gate.baseline import Baseline, Case
     from toolkit.gate.verdict import Check
     from toolkit.settings import Settings
@@ -76,6 +77,16 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
                 "the longest time between two keyframes that counts as covered (default: 5)",
                 positive_seconds,
             ),
+            arg(
+                "--bound PERCENT",
+                "the growth of an error that is allowed (default: 5)",
+                number_within("a growth in percent", 0.0, 1000.0),
+            ),
+            flag(
+                "--plan",
+                "write nothing; say with what chance a growth by 5, 10 and 20 %% would be found with as many runs, and "
+                "how many runs find it",
+            ),
         ),
     ),
     *SETTINGS,
@@ -88,8 +99,8 @@ def baseline(options: argparse.Namespace) -> int:
     """
     if options.trajectories is not None:
         return _baseline_of_trajectories(options)
-    if options.align or options.gap:
-        raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
+    if options.align or options.gap or options.bound is not None or options.plan:
+        raise UsageError("--align, --gap, --bound and --plan go with --trajectories (see vislam baseline --help)")
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.workers import usable_cpus
     from toolkit.files.writing import check_writable, write_text
@@ -118,7 +129,7 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
-    from toolkit.evaluation.against_baseline import new_trajectory_baseline, to_text
+    from toolkit.evaluation.against_baseline import BOUND_PERCENT, new_trajectory_baseline, to_text
     from toolkit.evaluation.scoring import Terms
     from toolkit.files.writing import check_writable, write_text
     from toolkit.report.manifest import made_here
@@ -127,13 +138,33 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     if any(asked):
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
     out = options.out or Path("trajectory-baseline.json")
-    check_writable(out, "{")
+    if not options.plan:
+        check_writable(out, "{")
     made_by = made_here(command_to_keep(options.command_line))
     given = _runs_given(options.trajectories, options.truth)
-    made = new_trajectory_baseline(given, options.align or "se3", options.gap or Terms.gap_s, made_by)
+    bound = BOUND_PERCENT if options.bound is None else options.bound
+    made = new_trajectory_baseline(given, options.align or "se3", options.gap or Terms.gap_s, made_by, bound)
+    if options.plan:
+        return _print_plan(made)
     write_text(out, to_text(made))
     runs = sum(len(one.files) for one in made.sequences)
     print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))
+    return 0
+
+
+def _print_plan(made: TrajectoryBaselineRecord) -> int:
+    from toolkit.evaluation.planning import planned
+    from toolkit.gate.significance import FEWEST_RUNS
+    from toolkit.report.gate import plan_text
+    from toolkit.report.text import width_of_output
+
+    plan = planned(made)
+    if not plan:
+        raise DataError(
+            f"no sequence has {FEWEST_RUNS} runs, of which the scatter is known; give the files of repeated runs, "
+            "SEQUENCE/RUN.tum"
+        )
+    print(plan_text(plan, width_of_output()))
     return 0
 
 

@@ -24,13 +24,15 @@ from toolkit.files import documents
 from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, MetricValues, Percent, Values, json_text
 from toolkit.gate.case_check import check_recorded
 from toolkit.gate.measuring import place_of
-from toolkit.gate.significance import FEWEST_RUNS, Repeats, Where, check_metrics
+from toolkit.gate.significance import FEWEST_RUNS, Everywhere, Repeats, Where, check_metrics
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.geometry import Array
 
 Align = Literal["se3", "yaw", "sim3"]
 # Growth of an error that is no regression (percent), and loss of time coverage that is accepted (percentage points).
 BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
+# In the place of a sequence's name, where all of them are judged together.
+EVERYWHERE = "all sequences"
 
 
 class SequenceRecord(Struct, frozen=True, kw_only=True):
@@ -226,7 +228,7 @@ def _check_truth(path: str, digest: str, before: SequenceRecord | None) -> None:
 
 
 def new_trajectory_baseline(
-    given: GivenRuns, align: Align, gap_s: float, made_by: Mapping[str, str]
+    given: GivenRuns, align: Align, gap_s: float, made_by: Mapping[str, str], bound_percent: float = BOUND_PERCENT
 ) -> TrajectoryBaselineRecord:
     """Score every run there is; raises DataError for the first that cannot be used."""
     return TrajectoryBaselineRecord(
@@ -234,7 +236,7 @@ def new_trajectory_baseline(
         made_by=dict(made_by),
         align=align,
         gap_s=gap_s,
-        bounds={key: BOUND_PERCENT for key in scored_metrics(align) if key != TIME_COVERAGE},
+        bounds={key: bound_percent for key in scored_metrics(align) if key != TIME_COVERAGE},
         coverage_points=COVERAGE_POINTS,
         false_alarm_rate=FALSE_ALARM_RATE,
         sequences=tuple(given.scored(sequence, align, gap_s, None) for sequence in given.sequences),
@@ -271,11 +273,22 @@ def check_trajectories(
                 medians = float(np.median(was)), float(np.median(is_))
                 verdicts.append(check_recorded(where, criterion, *medians, accept_better=accept_better))
                 notes += _other_rule(before.sequence, was, is_)
+    tests += list(everywhere(tests))
     rate = baseline.false_alarm_rate
     verdicts += check_metrics(tests, rate, accept_better=accept_better)
-    verdicts.sort(key=lambda verdict: order.index(verdict.sequence))
+    verdicts.sort(key=lambda verdict: [*order, EVERYWHERE].index(verdict.sequence))
     notes, seconds = list(dict.fromkeys(notes)), time.monotonic() - began
     return Check(name, tuple(verdicts), tuple(notes), rate, len(tests), {}, seconds, accept_better)
+
+
+def everywhere(tests: Iterable[Repeats]) -> Iterator[Repeats]:
+    """Yield the test of each metric on all sequences together, where it is tested on two or more."""
+    by_metric: dict[str, list[Repeats]] = {}
+    for one in tests:
+        by_metric.setdefault(one.where.metric, []).append(one)
+    for key, parts in by_metric.items():
+        if len(parts) > 1:
+            yield Everywhere.of(Where(EVERYWHERE, "", "", key), parts)
 
 
 def _verdict(before: SequenceRecord, metric: str, finding: Finding, *rest: object) -> Verdict:

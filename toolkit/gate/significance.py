@@ -124,11 +124,16 @@ class Repeats(Compared):
         return self.criterion.margin
 
     @property
+    def variances(self) -> tuple[Array, Array]:
+        """The variances (k,) whose sum is that of the change, each of one side's mean, and their degrees of freedom."""
+        sides = [log_of(side) for side in (self.before, self.after)]
+        of_means = [0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides]
+        return np.array(of_means), np.array([side.size - 1.0 for side in sides])
+
+    @property
     def error_and_dof(self) -> tuple[float, float]:
         """Return the standard error of the change, and its degrees of freedom."""
-        sides = [log_of(side) for side in (self.before, self.after)]
-        variances = np.array([0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides])
-        of_each = np.array([side.size - 1 for side in sides])
+        variances, of_each = self.variances
         total = float(variances.sum())
         dof = total**2 / float((variances**2 / of_each).sum()) if total else float(of_each.sum())
         return float(np.sqrt(total)), dof
@@ -149,6 +154,40 @@ class Repeats(Compared):
     def _beyond_p(self, sign: float) -> float:
         excess, (error, dof) = sign * self.change - self.criterion.margin, self.error_and_dof
         return float(stdtr(dof, -excess / error)) if error else float(excess <= 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Everywhere(Repeats):
+    """One metric on all sequences together: the mean over them of each one's change, by Welch's test.
+
+    A change of the system shows on every sequence, and its mean scatters less than on any of them. The values of a side
+    are the geometric means (S,) of its runs on each of S sequences.
+    """
+
+    parts: tuple[Repeats, ...] = ()
+
+    @classmethod
+    def of(cls, where: Where, parts: Sequence[Repeats]) -> "Everywhere":
+        """Return the test of all sequences of those of single ones, at least one."""
+        before, after = (np.array([geometric_mean(side) for side in sides]) for sides in _sides(parts))
+        return cls(where, parts[0].criterion, before, after, tuple(parts))
+
+    @property
+    def runs(self) -> str:
+        """Return what was compared, in words."""
+        before, after = (sum(side.size for side in sides) for sides in _sides(self.parts))
+        return f"over {before} runs before, {after} now"
+
+    @property
+    def variances(self) -> tuple[Array, Array]:
+        """The variances (2 S,) whose sum is that of the change, and their degrees of freedom."""
+        of_each = [part.variances for part in self.parts]
+        variances, dof = (np.concatenate(one) for one in zip(*of_each, strict=True))
+        return variances / len(self.parts) ** 2, dof
+
+
+def _sides(parts: Sequence[Repeats]) -> tuple[list[Array], list[Array]]:
+    return [part.before for part in parts], [part.after for part in parts]
 
 
 def log_of(values: Array) -> Array:

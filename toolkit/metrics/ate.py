@@ -56,6 +56,7 @@ METRICS = (
         "RMSE of the rotation angle after the fit of ate_se3_m (deg)",
         "deg",
         ("ATE rot", "SE(3)"),
+        gate_name="rotation error (ATE, SE(3))",
         in_contract=True,
     ),
 )

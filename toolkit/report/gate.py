@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from toolkit.errors import printable
+from toolkit.evaluation.planning import CHANGES_PERCENT, MOST_RUNS, WANTED, Planned
 from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
 from toolkit.gate.case_check import SHOWN
@@ -123,10 +124,14 @@ def failure_lines(check: Check) -> Iterator[str]:
 
 def about(verdict: Verdict) -> str:
     """Return what a verdict is about, in words."""
-    metric = _metric(verdict.metric)
-    what = metric.gate_name if metric is not None and metric.gate_name else verdict.metric
+    what = _named(verdict.metric)
     found = _FAILED.get(verdict.finding, "")
     return f"{_of(verdict)}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
+
+
+def _named(key: str) -> str:
+    metric = _metric(key)
+    return metric.gate_name if metric is not None and metric.gate_name else key
 
 
 def _of(verdict: Verdict) -> str:
@@ -142,13 +147,11 @@ def note_lines(check: Check) -> Iterator[str]:
     """Yield what a reader must know beside the verdicts."""
     yield from check.notes
     if check.tests:
-        blind = [v for v in check.verdicts if v.seen_percent is not None and v.seen_percent > 10.0 and not v.fails]
         yield (
             f"{check.tests} tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
             "'detects' is the change each of them finds with 95 % power, from how much it scatters"
         )
-        if blind:
-            yield f"{len(blind)} of them would not have detected 10 %: the change scatters too much for so few seeds"
+        yield f"what this check would have found in 95 % of cases: {'; '.join(_detected(check))}"
     if any(verdict.finding == "moved" for verdict in check.failures):
         yield (
             "what moved differs from the baseline and is no worse: --accept-better lets it pass, "
@@ -156,6 +159,49 @@ def note_lines(check: Check) -> Iterator[str]:
         )
     releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
     yield "; ".join(filter(None, (releases, f"took {check.seconds:.0f} s")))
+
+
+def _detected(check: Check) -> Iterator[str]:
+    """Yield, for each metric that was tested, the least change that a test of it finds, and the largest that one needs.
+
+    Both with where they are.
+    """
+    tested = [verdict for verdict in check.verdicts if verdict.seen_percent is not None]
+    for key in dict.fromkeys(verdict.metric for verdict in tested):
+        seen = sorted((v.seen_percent or 0.0, _of(v)) for v in tested if v.metric == key)
+        ends = [f"{_percent(percent)} % ({of})" for percent, of in dict.fromkeys((seen[0], seen[-1]))]
+        yield f"{_named(key)} {' to '.join(ends)}"
+
+
+def plan_table(plan: Sequence[Planned]) -> Table:
+    """Return how likely changes are found with the runs there are, and how many runs find them."""
+    found = [(f"{change:g} %", "found", "%") for change in CHANGES_PERCENT]
+    wanted = [(f"{change:g} %", f"runs for {100.0 * WANTED:g} %", "") for change in CHANGES_PERCENT]
+    headings = (*_LABELS[:1], *_LABELS[3:4], ("runs", "", ""), ("scatter", "", "%"), *found, *wanted)
+    rows = tuple(
+        (
+            _escaped(one.where.sequence),
+            one.where.metric,
+            str(one.runs),
+            number(one.scatter_percent, 2),
+            *(MISSING if one.is_allowed(i) else f"{100.0 * chance:.0f}" for i, chance in enumerate(one.seen)),
+            *(MISSING if one.is_allowed(i) else str(n or f"> {MOST_RUNS}") for i, n in enumerate(one.needed)),
+        )
+        for one in plan
+    )
+    return Table(headings, rows, labels=2)
+
+
+def plan_text(plan: Sequence[Planned], width: Width = WIDTH) -> str:
+    """Return the plan as plain text: the table, and how it is to be read."""
+    bounds = ", ".join(f"{percent:g} %" for percent in sorted({one.bound_percent for one in plan}))
+    notes = (
+        "a growth of an error by so much is found with this chance in a check of as many runs a sequence as there are "
+        f"here; then the runs a sequence, now and in the baseline, for a chance of {100.0 * WANTED:g} %",
+        "scatter is that of one run, of the mean of all sequences where they are judged together",
+        f"what is not beyond the bound ({bounds}) is allowed, and never found: --bound sets it",
+    )
+    return "\n".join([as_text(plan_table(plan)), *section("notes", notes, width)])
 
 
 def gate_text(check: Check, width: Width = WIDTH, *, verbose: bool = False) -> str:
