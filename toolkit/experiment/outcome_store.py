@@ -41,11 +41,12 @@ _FILES_START = b'{"schema":"vislam.outcome-files/1"'
 class UnitKey(Struct, frozen=True, kw_only=True):
     """Everything that an outcome depends on: equal keys give equal outcomes, except for the times."""
 
-    data: Annotated[str, Meta(description="SHA-256 of the recording as it is read under seed 0")]
+    data: Annotated[str, Meta(description="SHA-256 of the recording under seed 0, repaired, and of the part used")]
     seed: int
     estimator: str
     settings: Annotated[dict[str, Any], Meta(description="those that reach a run of this estimator")]
     keep: Annotated[tuple[str, ...], Meta(description="faults that are not repaired")]
+    faults: Annotated[tuple[tuple[str, float], ...] | None, Meta(description="planted ones, with their doses")] = None
     code: Annotated[str, Meta(description="SHA-256 of the toolkit's code and of the estimators'")]
     versions: Annotated[dict[str, str], Meta(description="of Python and of the packages that compute")]
 
@@ -62,6 +63,8 @@ class ScoredRecord(Struct, frozen=True, kw_only=True):
     nees_pose: Series
     position_m: Series
     nis_dof: Number
+    drift_m: Annotated[tuple[Number, ...], Meta(description="over equal stretches of time")] = ()
+    heldout_px: Annotated[tuple[Number, ...], Meta(description="over equal stretches of time")] = ()
 
 
 class UncheckedRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/1"):
@@ -131,7 +134,7 @@ def outcome_of_record(record: OutcomeRecord, requested: tuple[str, ...]) -> Outc
     outputs = {output: _scored(one, requested) for output, one in record.outputs.items()}
     if record.final_is_causal:
         causal = outputs["causal"]
-        final = Scored(repeated(causal.scores), causal.nees_pose, causal.position_m, causal.nis_dof)
+        final = replace(causal, scores=repeated(causal.scores))
         outputs = {"causal": causal, "final": final}
     return Outcome(
         seed=record.unit.seed,
@@ -152,6 +155,8 @@ def _scored_record(scored: Scored) -> ScoredRecord:
         nees_pose=_numbers(scored.nees_pose),
         position_m=_numbers(scored.position_m),
         nis_dof=None if scored.nis_dof is None else _number(float(scored.nis_dof)),
+        drift_m=_numbers(scored.drift_m),
+        heldout_px=_numbers(scored.heldout_px),
     )
 
 
@@ -163,7 +168,8 @@ def _plain(value: float | None) -> float | None:
 def _scored(record: ScoredRecord, requested: tuple[str, ...]) -> Scored:
     scores = without_requests(Scores(dict(record.values), dict(record.notes)), requested)
     nis_dof = None if record.nis_dof is None else float(record.nis_dof)
-    return Scored(scores, _series(record.nees_pose), _series(record.position_m), nis_dof)
+    stretches = _series(record.drift_m), _series(record.heldout_px)
+    return Scored(scores, _series(record.nees_pose), _series(record.position_m), nis_dof, *stretches)
 
 
 def _numbers(values: Array) -> tuple[Number, ...]:
@@ -192,6 +198,9 @@ class Store(Protocol):
     def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
         """Keep an outcome; return it as it will be found again."""
 
+    def close(self) -> None:
+        """Let others add to what is kept."""
+
 
 class Nowhere:
     """Keeps nothing: every unit is run, and its outcome is in memory alone."""
@@ -203,15 +212,18 @@ class Nowhere:
         """Return the outcome."""
         return outcome
 
+    def close(self) -> None:
+        """Do nothing."""
+
 
 NOWHERE = Nowhere()
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the units of a case share: the ``data``, as the hash of the recording under seed 0, and what is kept.
+    """What the units of a case share: the ``data``, as :class:`Prepared` has it under seed 0, and what is kept.
 
-    ``own`` are the SHA-256 of estimators in files of the user's own, by name.
+    A unit may keep more. ``own`` are the SHA-256 of estimators in files of the user's own, by name.
     """
 
     data: str
@@ -225,15 +237,16 @@ class Conditions:
             seed=unit.seed,
             estimator=unit.estimator,
             settings=_settings_of_a_run(unit.settings, unit.estimator),
-            keep=tuple(sorted(self.keep)),
+            keep=tuple(sorted(self.keep | unit.requested.keep)),
+            faults=unit.requested.faults,
             code=_code("" if unit.entry is None else unit.entry.own_digest),
             versions=numeric_versions(),
         )
 
     def fit(self, key: UnitKey) -> bool:
         """Say whether a key can be that of a unit of this case, with some seed, estimator and settings."""
-        ours = (self.data, tuple(sorted(self.keep)), _code(self.own.get(key.estimator, "")), numeric_versions())
-        return (key.data, key.keep, key.code, key.versions) == ours
+        ours = (self.data, _code(self.own.get(key.estimator, "")), numeric_versions())
+        return (key.data, key.code, key.versions) == ours and self.keep <= set(key.keep)
 
 
 def _code(own: str) -> str:

@@ -1,10 +1,10 @@
 """The one experiment: load, audit, start, run, score. The command line, the gate, notebooks and users all call this."""
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
@@ -155,9 +155,13 @@ def stores_of(plan: Plan, cases: Sequence[Prepared], directories: Sequence[Path]
     """
     if len(plan.seeds) == 1:
         return []
+    return [store_of(plan, case, directory) for case, directory in zip(cases, directories, strict=True)]
+
+
+def store_of(plan: Plan, case: Prepared, directory: Path) -> OutcomeStore:
+    """Return where the outcomes of a case are kept, in a directory. Raises as :func:`stores_of`."""
     own = _own_digests(find_all(plan.estimators))
-    conditions = [Conditions(_hash_under_seed_0(plan, case), plan.keep, own) for case in cases]
-    return [OutcomeStore(directory, one) for directory, one in zip(directories, conditions, strict=True)]
+    return OutcomeStore(directory, Conditions(_data_under_seed_0(plan, case), plan.keep, own))
 
 
 def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
@@ -165,9 +169,8 @@ def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.own_digest for name, entry in entries.items() if entry.own_digest}
 
 
-def _hash_under_seed_0(plan: Plan, case: Prepared) -> str:
-    prepared = case if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
-    return prepared.sequence.content_hash()
+def _data_under_seed_0(plan: Plan, case: Prepared) -> str:
+    return case.data if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0)).data
 
 
 def comparisons(
@@ -183,52 +186,54 @@ def comparisons(
     so. Raises DataError where a recording cannot be used under a seed.
     """
     entries = find_all(plan.estimators)
-    kept_in = stores or [NOWHERE] * len(cases)
-    outcomes, units, owner = _found_and_missing(plan, cases, entries, kept_in)
-    missing, shown = Counter(owner), 0
+    jobs = [
+        Job(unit, store)
+        for case, store in zip(cases, stores or [NOWHERE] * len(cases), strict=True)
+        for unit in _units(plan, case, entries)
+    ]
+    outcomes: list[list[Outcome]] = [[] for _ in cases]
+    names, shown = ", ".join(dict.fromkeys(case.name for case in cases)), 0
+    for place, outcome in outcomes_of(jobs, workers, names, progress_for):
+        outcomes[place * len(cases) // len(jobs)].append(outcome)
+        while shown < len(cases) and len(outcomes[shown]) * len(cases) == len(jobs):
+            yield _comparison(plan, cases[shown], outcomes[shown], entries, workers.count)
+            shown += 1
+    for case in cases[shown:]:  # that no estimator runs on
+        yield _comparison(plan, case, (), entries, workers.count)
+
+
+class Job(NamedTuple):
+    """A unit of work, and where its outcome is looked for first and kept afterwards."""
+
+    unit: Unit
+    store: Store = NOWHERE
+
+
+def outcomes_of(
+    jobs: Sequence[Job], workers: Pool, names: str, progress_for: ProgressFor = silent
+) -> Iterator[tuple[int, Outcome]]:
+    """Yield place and outcome of every job: at once where it is kept already, the others as they are run and kept.
+
+    A job whose process died is a run that failed. Raises DataError where a recording cannot be used.
+    """
+    found = [job.store.find(job.unit) for job in jobs]
+    yield from ((place, one) for place, one in enumerate(found) if one is not None)
+    missing = [place for place, one in enumerate(found) if one is None]
+    there = f" ({len(jobs) - len(missing)} are there)" if len(missing) < len(jobs) else ""
+    units = [jobs[place].unit for place in missing]
     with (
-        progress_for(_label(cases, len(units), sum(map(len, outcomes)))) as progress,
+        progress_for(f"{names}: {len(missing)} runs{there}") as progress,
         closing(workers.results(units, run_unit, progress, recording_to_prepare)) as coming,
     ):
-        for place, result in coming:
-            case = owner[place]
-            outcomes[case].append(_outcome(result, units[place], kept_in[case]))
-            missing[case] -= 1
-            while shown < len(cases) and not missing[shown]:
-                yield _comparison(plan, cases[shown], outcomes[shown], entries, workers.count)
-                shown += 1
-    for one, found in zip(cases[shown:], outcomes[shown:], strict=True):
-        yield _comparison(plan, one, found, entries, workers.count)
-
-
-def _found_and_missing(
-    plan: Plan, cases: Sequence[Prepared], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
-) -> tuple[list[list[Outcome]], list[Unit], list[int]]:
-    """Return the outcomes that are there, by case, the units that have to be run, and the case of each of these."""
-    outcomes: list[list[Outcome]] = [[] for _ in cases]
-    units: list[Unit] = []
-    owner: list[int] = []
-    for i, (case, store) in enumerate(zip(cases, stores, strict=True)):
-        for unit in _units(plan, case, entries):
-            found = store.find(unit)
-            if found is not None:
-                outcomes[i].append(found)
-            else:
-                units.append(unit)
-                owner.append(i)
-    return outcomes, units, owner
-
-
-def _label(cases: Sequence[Prepared], missing: int, there: int) -> str:
-    names = ", ".join(dict.fromkeys(case.name for case in cases))
-    return f"{names}: {missing} runs" + (f" ({there} are there)" if there else "")
+        for i, result in coming:
+            yield missing[i], _outcome(result, *jobs[missing[i]])
 
 
 def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
     """Yield the work of a case: seed by seed, the estimators that take longest first."""
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
     # A worker of a cluster stands in another folder.
-    source = case.source if plan.scheduler is None else _located(case.source)
+    source = case.source if plan.scheduler is None else located(case.source)
     single = len(plan.seeds) == 1
     for seed in plan.seeds:
         # Processes here use the prepared recording; workers of a cluster prepare it themselves and need not be sent it.
@@ -239,7 +244,7 @@ def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) ->
             yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories, entry=entries.get(name))
 
 
-def _located(source: str | Recorded) -> str | Recorded:
+def located(source: str | Recorded) -> str | Recorded:
     """Return a path as an absolute path, anything else unchanged."""
     if isinstance(source, Recorded) or source in built_ins():
         return source

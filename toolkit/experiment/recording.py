@@ -1,5 +1,6 @@
 """From a source to what every estimator reads: loaded, audited, cut, with its noise and a state to start from."""
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,6 +24,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, Settings, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
+from toolkit.simulation.faults import Doses, planted
 from toolkit.threads import on_one_thread
 
 Start = Literal["measurements", "truth"]
@@ -68,7 +70,8 @@ class Recording:
 
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
     reports and leaves as they are. ``part`` selects the frames that are used, ``max_frames`` the first of these;
-    ``duration_s`` cuts the recording before that, and a simulation is made that long. ``vary`` says which parts of a
+    ``duration_s`` cuts the recording before that, and a simulation is made that long. ``faults`` are planted in the
+    part that is run, by name and dose, after the audit and before its noise is measured. ``vary`` says which parts of a
     simulation the seed draws; ``card`` requests the card of its tracks.
     """
 
@@ -85,6 +88,7 @@ class Recording:
     vary: Varied = DEFAULTS.vary
     card: bool = False
     part: Part = WHOLE
+    faults: Doses | None = None
 
     @classmethod
     def under(cls, settings: Settings, source: str | Sequence, seed: int, **others: Any) -> "Recording":
@@ -93,20 +97,24 @@ class Recording:
         return cls(source, seed, **own, **others)
 
 
+_NO_RECORDING = Recording("")
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording as the estimators read it, the findings of the audit in it before, and the state they start from.
 
-    ``source`` is what it was loaded from, and ``whole`` the recording before it was cut; ``undecided`` has the faults
-    that could not be judged, and why; ``measured`` is what was measured of its noise, None where the settings state it;
-    ``references`` are the runs of other systems on it.
+    ``recording`` is what it was prepared from, ``data`` the SHA-256 of what its preparation began with, and ``whole``
+    the recording before it was cut; ``undecided`` has the faults that could not be judged, and why; ``measured`` is
+    what was measured of its noise, None where the settings state it; ``references`` are the runs of other systems.
     """
 
-    source: str | Sequence
+    recording: Recording
     sequence: Sequence
     findings: tuple[Finding, ...]
     prior: Prior
     whole: Sequence
+    data: str
     undecided: Mapping[str, str] = field(default_factory=dict)
     measured: MeasuredNoise | None = None
     card: Card | None = None
@@ -117,6 +125,11 @@ class Prepared:
         """Return the sequence's name."""
         return self.sequence.name
 
+    @property
+    def source(self) -> str | Sequence:
+        """Return what it was loaded from."""
+        return self.recording.source
+
 
 def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     """Load, audit, cut and find the start, with linear algebra on one thread: the same bits wherever that is done.
@@ -124,22 +137,52 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     Raises DataError where the source or the truth cannot be used, VislamError where ``keep`` names no fault.
     """
     with on_one_thread():
-        audited = audited_recording(recording, progress)
-        whole = _with_pixel_noise(audited.sequence, recording.noise.pixel_sigma_px)
-        if whole is not audited.sequence:
-            audited = _audited_with_its_noise(audited, _cut(whole, recording))
-        card = None
-        if recording.card:
-            whole, card = _with_card(whole, _cut(whole, recording))
-        whole, measured = _with_measured_noise(whole, recording)
-        used = _cut(whole, recording)
-        used = with_gap_twists(used) if recording.noise.bridge_gaps else used
-        sequence = _within_budget(used, recording.tracks.budget)
-        prior = STARTS[recording.start](sequence)
-        if recording.tracks.leave_out_moving:
-            sequence = _within_budget(_without_moving_tracks(used, prior), recording.tracks.budget)
-        findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
-        return Prepared(recording.source, sequence, findings, prior, whole, audited.undecided, measured, card)
+        return _prepared(recording, audited_recording(recording, progress))
+
+
+@lru_cache(maxsize=1)
+def prepare_once(recording: Recording) -> Prepared:
+    """Prepare a recording, or return it where it is the one that was prepared last in this process.
+
+    Its audit is taken from the one before, where that differs by nothing an audit depends on.
+    """
+    with on_one_thread():
+        others = {name: getattr(_NO_RECORDING, name) for name in ("noise", "tracks", "start", "card", "faults")}
+        return _prepared(recording, _audited_once(replace(recording, **others)))
+
+
+@lru_cache(maxsize=1)
+def _audited_once(recording: Recording) -> Audit:
+    return audited_recording(recording)
+
+
+def _prepared(recording: Recording, audited: Audit) -> Prepared:
+    data, whole, requested = _data_hash(recording, audited.sequence), audited.sequence, recording
+    if recording.faults is not None:
+        # Where a fault strikes is drawn within the part that is run.
+        whole = planted(_cut(whole, recording), recording.faults, recording.seed)
+        recording = replace(recording, part=WHOLE, max_frames=None, duration_s=None)
+    stated = _with_pixel_noise(whole, recording.noise.pixel_sigma_px)
+    if stated is not whole:
+        whole, audited = stated, _audited_with_its_noise(audited, _cut(stated, recording))
+    card = None
+    if recording.card:
+        whole, card = _with_card(whole, _cut(whole, recording))
+    whole, measured = _with_measured_noise(whole, recording)
+    used = _cut(whole, recording)
+    used = with_gap_twists(used) if recording.noise.bridge_gaps else used
+    sequence = _within_budget(used, recording.tracks.budget)
+    prior = STARTS[recording.start](sequence)
+    if recording.tracks.leave_out_moving:
+        sequence = _within_budget(_without_moving_tracks(used, prior), recording.tracks.budget)
+    findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
+    return Prepared(requested, sequence, findings, prior, whole, data, audited.undecided, measured, card)
+
+
+def _data_hash(recording: Recording, repaired: Sequence) -> str:
+    """Return the SHA-256 of what preparation begins with: the repaired recording, and the part of it that is used."""
+    part = (recording.part, recording.max_frames, recording.duration_s)
+    return hashlib.sha256(f"{repaired.content_hash()}{part}".encode()).hexdigest()
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:
@@ -182,12 +225,6 @@ def recording_card(recording: Recording, progress: Progress = SILENT) -> tuple[S
     with on_one_thread():
         sequence = _cut(audited_recording(recording, progress).sequence, recording)
         return sequence, card_of(sequence)
-
-
-@lru_cache(maxsize=1)
-def prepare_once(recording: Recording) -> Prepared:
-    """Prepare a recording, or return it where it is the one that was prepared last in this process."""
-    return prepare(recording)
 
 
 def _loaded(recording: Recording, progress: Progress) -> Sequence:

@@ -9,8 +9,10 @@ from toolkit import runner
 from toolkit.answers import Output, Run, Status
 from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
+from toolkit.errors import DataError
 from toolkit.estimator import Build
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
+from toolkit.experiment.stretches import drift_over_stretches, held_out_over_stretches, no_stretches
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, repeated, score_run
 from toolkit.metrics.parts.consistency import body_errors, nees_over_time, nis_over_time
@@ -40,18 +42,27 @@ class Unit:
     keep_trajectories: bool = False
     entry: EstimatorEntry | None = None
 
+    @property
+    def requested(self) -> Recording:
+        """Return the recording as it is asked for."""
+        return self.recording.recording if isinstance(self.recording, Prepared) else self.recording
+
 
 @dataclass(frozen=True, eq=False)
 class Scored:
     """One output's scores, and at each frame (K,) its pose NEES over 6 and its position error, NaN where unknown.
 
     ``nis_dof`` is how many degrees of freedom of the mean NIS are independent, None where there is no NIS.
+    ``drift_m`` and ``heldout_px`` (40,) are errors over equal stretches of time, whose pairs are compared where there
+    is one recording only.
     """
 
     scores: Scores
     nees_pose: Array
     position_m: Array
     nis_dof: float | None = None
+    drift_m: Array = field(default_factory=no_stretches)
+    heldout_px: Array = field(default_factory=no_stretches)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +97,17 @@ class Outcome:
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
     """Run the estimator of a unit and score its outputs.
 
-    Raises DataError where the recording cannot be used, EstimatorError where the estimator cannot be used.
+    Raises DataError where the recording cannot be used, EstimatorError where the estimator cannot be used. A recording
+    that planted faults make unusable is a run that failed.
     """
-    prepared = prepared_of(unit)
+    try:
+        prepared = prepared_of(unit)
+        run = run_estimator(unit, prepared, progress)
+    except DataError as error:
+        if not unit.requested.faults:
+            raise
+        return Outcome(unit.seed, unit.estimator, "failed", log=(str(error),))
     requested = unit.settings.metrics.requested()
-    run = run_estimator(unit, prepared, progress)
     outcome = outcome_of(run, prepared.sequence, unit.seed, requested)
     texts = _trajectory_texts(run) if unit.keep_trajectories else {}
     return replace(outcome, run=run if unit.keep_run else None, tum=texts)
@@ -149,7 +166,9 @@ def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, 
             _put(nees_pose, sequence.frames_t_ns, nees.t_ns, nees.pose)
         except Unavailable:
             pass  # the scores have the reason
-    return Scored(score_run(run, output, sequence, requested), nees_pose, position_m, _nis_dof(evaluation))
+        drift_m, heldout_px = drift_over_stretches(evaluation), held_out_over_stretches(evaluation)
+    scores = score_run(run, output, sequence, requested)
+    return Scored(scores, nees_pose, position_m, _nis_dof(evaluation), drift_m, heldout_px)
 
 
 def _nis_dof(evaluation: Evaluation) -> float | None:

@@ -8,7 +8,7 @@ of the motion, unless the fault is one of the truth.
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,19 +21,72 @@ from toolkit.sequence import Observations, Sequence, Truth
 from toolkit.simulation.sensors import TrackNoise, with_slips, with_track_noise
 
 Fault = Callable[[Sequence, float, int], Sequence]
+F = TypeVar("F", bound=Fault)
+# Names of faults with their doses, planted one after the other.
+Doses = tuple[tuple[str, float], ...]
 # Points whose tracks begin within this many seconds are on one vehicle.
 _ONE_VEHICLE_S = 2.0
+
+
+# What can be planted --------------------------------------------------------------------------------------------------
+
+
+class Injector(NamedTuple):
+    """A fault that a dose leads up to: ``clean`` is the dose that leaves a recording as it is."""
+
+    plant: Fault
+    unit: str
+    clean: float
+
+    @property
+    def meaning(self) -> str:
+        """Return what it does, and what it stands for, in one sentence."""
+        return (self.plant.__doc__ or "").partition("\n")[0]
+
+
+INJECTORS: dict[str, Injector] = {}
+
+
+def _injector(unit: str, clean: float = 0.0) -> Callable[[F], F]:
+    """Register a fault by its name, with the unit of its dose and the dose of a clean recording."""
+
+    def registered(fault: F) -> F:
+        INJECTORS[fault.__name__] = Injector(fault, unit, clean)
+        return fault
+
+    return registered
+
+
+def planted(sequence: Sequence, doses: Doses, seed: int) -> Sequence:
+    """Return a sequence with faults planted, each drawn by itself from the seed: a smaller dose strikes the same first.
+
+    Raises DataError where a fault cannot be planted in it, or its dose leaves no recording.
+    """
+    for name, dose in doses:
+        own_seed = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
+        sequence = INJECTORS[name].plant(sequence, dose, own_seed)
+    return sequence
 
 
 # Tracks: single sightings, and whole tracks ---------------------------------------------------------------------------
 
 
+@_injector("share")
 def dropped_sightings(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
     """Lose a share of the sightings, each independently: a matcher that sometimes fails, or lost data packets."""
     kept = np.random.default_rng(seed).uniform(size=len(sequence.observations)) >= dose
     return replace(sequence, observations=sequence.observations.select(kept))
 
 
+@_injector("share")
+def dropped_frames(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
+    """Lose a share of the frames, each independently, but the first and the last: a full disk, a busy computer."""
+    kept = np.random.default_rng(seed).uniform(size=sequence.frame_count) >= dose
+    kept[[0, -1]] = True
+    return _with_frames(sequence, kept)
+
+
+@_injector("share")
 def missing_right(sequence: Sequence, dose: float = 0.33, seed: int = 0) -> Sequence:
     """Lose the right image of a share of the sightings, each independently: a stereo matcher that sometimes fails."""
     uv_px = sequence.observations.uv_px.copy()
@@ -41,16 +94,18 @@ def missing_right(sequence: Sequence, dose: float = 0.33, seed: int = 0) -> Sequ
     return _with_pixels(sequence, uv_px)
 
 
+@_injector("s")
 def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Lose all sightings for the dose (s), and start new tracks after that: a tunnel, glare, a covered lens."""
     seen, begin_s, end_s = sequence.observations, *_span_s(sequence, dose, seed)
     time_s = sequence.frames_s[seen.frame]
-    later = time_s >= end_s
+    later = (time_s >= end_s) & (dose > 0.0)
     track_id = np.where(later, seen.track_id + seen.track_id.max(initial=-1) + 1, seen.track_id)
-    rows = (time_s < begin_s) | later
+    rows = (time_s < begin_s) | (time_s >= end_s)
     return replace(sequence, observations=Observations(seen.frame, track_id, seen.uv_px).select(rows))
 
 
+@_injector("share")
 def outlier_tracks(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequence:
     """Let a share of the tracks slide over the image by a steady few pixels a frame: points on moving vehicles."""
     rng, seen = np.random.default_rng(seed), sequence.observations
@@ -62,6 +117,7 @@ def outlier_tracks(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequ
     return _with_pixels(sequence, seen.uv_px + age[:, None] * step_px[row][:, [0, 0, 1]])
 
 
+@_injector("share")
 def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Let a share of the points move as one for a third of the recording: traffic that flows with the vehicle.
 
@@ -73,6 +129,8 @@ def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
     seen_s = sequence.frames_s[seen.frame]
     moves = _struck_tracks(sequence, dose, seed) & (seen.uv_px[:, 0] > seen.uv_px[:, 1])
     moves &= (seen_s >= begin_s) & (seen_s < end_s)
+    if not moves.any():
+        return sequence
     angle, points = rng.uniform(0.0, 2.0 * np.pi), triangulate(seen.uv_px[moves], rig)
     velocity_mps = 0.25 * np.median(points[:, 2]) * np.array([np.cos(angle), 0.0, np.sin(angle)])
     _, first, row = np.unique(seen.track_id[moves], return_index=True, return_inverse=True)
@@ -83,6 +141,7 @@ def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
     return replace(sequence, observations=Observations(seen.frame, seen.track_id, uv_px).select(kept))
 
 
+@_injector("tracks", clean=np.inf)
 def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence:
     """Keep at most the dose in tracks a frame, each for as long as it lasts: fog, a bare wall, a cheap tracker."""
     seen = sequence.observations
@@ -93,12 +152,13 @@ def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence
         here = seen.track_id[begin:end]
         followed = followed[np.isin(followed, here)]
         others = np.setdiff1d(here, followed)
-        free = max(int(dose) - followed.size, 0)
+        free = int(np.clip(dose - followed.size, 0, others.size))
         followed = np.concatenate([followed, others[np.argsort(chance[others])][:free]])
         kept[begin:end] = np.isin(here, followed)
     return replace(sequence, observations=seen.select(kept))
 
 
+@_injector("share")
 def one_sided_view(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Lose a share of the image, starting at its left or its right edge: a dirty lens, a wall on one side only."""
     seen, side = sequence.observations, np.random.default_rng(seed).choice([-1.0, 1.0])
@@ -107,12 +167,14 @@ def one_sided_view(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
     return replace(sequence, observations=seen.select(~hidden))
 
 
+@_injector("share")
 def swapped_images(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Exchange left and right in a share of the tracks; in all of them if the cameras' cables are exchanged."""
     seen, struck = sequence.observations, _struck_tracks(sequence, dose, seed)
     return _with_pixels(sequence, np.where(struck[:, None], seen.uv_px[:, [1, 0, 2]], seen.uv_px))
 
 
+@_injector("share")
 def swapped_coordinates(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Exchange u and v in a share of the tracks: row and column mixed up by who wrote the file.
 
@@ -126,16 +188,19 @@ def swapped_coordinates(sequence: Sequence, dose: float = 1.0, seed: int = 0) ->
     return _with_pixels(sequence, np.where(struck[:, None], swapped, seen.uv_px))
 
 
+@_injector("px")
 def shifted_pixels(sequence: Sequence, dose: float = 5000.0, seed: int = 0) -> Sequence:
     """Add the dose (px) to every image coordinate: pixels of a crop or a mosaic, or of another origin."""
     return _with_pixels(sequence, sequence.observations.uv_px + dose)
 
 
+@_injector("px")
 def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Sequence:
     """Shift vR by the dose (px) against vL: a pair that is not rectified. v, their mean, shifts by half of it."""
     return _with_pixels(sequence, sequence.observations.uv_px + np.array([0.0, 0.0, 0.5 * dose]))
 
 
+@_injector("rad")
 def rolled_right(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Roll the right camera by the dose (rad) about its optical axis: a mount that was bent after the calibration.
 
@@ -149,11 +214,13 @@ def rolled_right(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Seque
     return _with_pixels(sequence, uv_px)
 
 
+@_injector("px")
 def shifted_right(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Add the dose (px) to the columns of the right image: cameras that turned apart, two principal points."""
     return _with_pixels(sequence, sequence.observations.uv_px + dose * np.array([0.0, 1.0, 0.0]))
 
 
+@_injector("factor", clean=1.0)
 def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
     """Multiply all disparities by the dose: images scaled after the matching, a matcher that is biased."""
     uv_px = sequence.observations.uv_px.copy()
@@ -161,12 +228,14 @@ def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -
     return _with_pixels(sequence, uv_px)
 
 
+@_injector("px")
 def jumped_image(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
     """Shift every image of the second half by the dose (px): a camera that is knocked, a crop that changes."""
     later = sequence.observations.frame >= sequence.frame_count // 2
     return _with_pixels(sequence, sequence.observations.uv_px + dose * later[:, None])
 
 
+@_injector("share")
 def exchanged_tracks(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
     """Exchange the ids of a share of the sightings with others of their frame: a matcher that takes the wrong point."""
     rng, seen = np.random.default_rng(seed), sequence.observations
@@ -186,16 +255,25 @@ def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:
 # Errors of real trackers that last over a track, unlike the noise of single sightings ---------------------------------
 
 
+@_injector("px")
+def track_noise(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Add white noise of the dose (px) as sigma to mean column, disparity and row of each sighting: blur, low light."""
+    return _with_track_noise(sequence, TrackNoise(np.full(3, dose), np.zeros(3), np.zeros(3)), seed)
+
+
+@_injector("px")
 def track_walk(sequence: Sequence, dose: float = 0.13, seed: int = 0) -> Sequence:
     """Let every track wander by the dose (px per root frame) in mean column, disparity and row: a tracker's drift."""
     return _with_track_noise(sequence, TrackNoise(np.zeros(3), np.full(3, dose), np.zeros(3)), seed)
 
 
+@_injector("px")
 def match_offset(sequence: Sequence, dose: float = 0.7, seed: int = 0) -> Sequence:
     """Give every track a constant disparity error, of the dose (px) as sigma: matched once, at its start, and wrong."""
     return _with_track_noise(sequence, TrackNoise(np.zeros(3), np.zeros(3), np.array([0.0, dose, 0.0])), seed)
 
 
+@_injector("share")
 def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequence:
     """End every track before a share of the frames, and continue with new ones: repeated images, a tracker that fails.
 
@@ -208,12 +286,14 @@ def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequenc
     return replace(sequence, observations=replace(seen, track_id=track_id))
 
 
+@_injector("share")
 def persistent_mismatch(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
     """Let a share of the tracks slip to a point 5 to 30 px nearer to the middle, and follow that point to their end."""
     slipped = with_slips(sequence.observations, dose, sequence.rig, np.random.default_rng(seed))
     return replace(sequence, observations=slipped)
 
 
+@_injector("share")
 def moving_vehicles(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequence:
     """Let a share of the points drive along the camera's course at a speed of their vehicle, up to 1.5 times its own.
 
@@ -247,6 +327,7 @@ def _with_track_noise(sequence: Sequence, noise: TrackNoise, seed: int) -> Seque
 # Motion samples -------------------------------------------------------------------------------------------------------
 
 
+@_injector("s")
 def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Lose the motion samples of a span whose length is the dose (s): a full buffer, a loose cable."""
     begin_s, end_s = _span_s(sequence, dose, seed)
@@ -254,6 +335,7 @@ def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence
     return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
 
 
+@_injector("s")
 def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Repeat the last motion sample for the dose (s): a driver that hangs."""
     begin_s, end_s = _span_s(sequence, dose, seed)
@@ -263,6 +345,7 @@ def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequen
     return _with_values(sequence, values)
 
 
+@_injector("share", clean=1.0)
 def saturated_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Clip the motion samples at this share of the largest on each axis: a sensor whose range is too small."""
     values = sequence.motion.values
@@ -277,6 +360,7 @@ def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
     return _with_values(sequence, values)
 
 
+@_injector("m/s or m/s^2")
 def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Add the dose (m/s, or m/s^2) along a random axis to a third of the motion samples: slipping wheels, vibration."""
     begin_s, end_s = _span_s(sequence, sequence.duration_s / 3.0, seed)
@@ -285,6 +369,7 @@ def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Se
     return _with_values(sequence, sequence.motion.values + ((t_s >= begin_s) & (t_s < end_s))[:, None] * added)
 
 
+@_injector("s")
 def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
     """Write NaN to all motion samples and sightings of a span of the dose (s): a driver that fails and recovers."""
     begin_s, end_s = _span_s(sequence, dose, seed)
@@ -295,11 +380,13 @@ def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
     return _with_values(_with_pixels(sequence, uv_px), values)
 
 
+@_injector("factor", clean=1.0)
 def linear_unit(sequence: Sequence, dose: float = 3.6, seed: int = 0) -> Sequence:
     """Multiply velocities, or accelerations, by the dose: 3.6 for km/h, 100 for cm/s, 0.102 for g."""
     return _with_values(sequence, sequence.motion.values * np.repeat([dose, 1.0], 3))
 
 
+@_injector("factor", clean=1.0)
 def changed_speed(sequence: Sequence, dose: float = 1.08, seed: int = 0) -> Sequence:
     """Multiply the velocities, or accelerations, of the second half by the dose: a tyre that loses air."""
     later = sequence.motion.t_ns > sequence.frames_t_ns[sequence.frame_count // 2]
@@ -307,16 +394,19 @@ def changed_speed(sequence: Sequence, dose: float = 1.08, seed: int = 0) -> Sequ
     return _with_values(sequence, factor * sequence.motion.values)
 
 
+@_injector("samples", clean=1.0)
 def thinned_motion(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
     """Keep one motion sample in as many as the dose: a log that was thinned out, a bus that is busy."""
     return _with_samples(sequence, np.arange(sequence.motion.t_ns.size) % int(dose) == 0)
 
 
+@_injector("factor", clean=1.0)
 def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0) -> Sequence:
     """Multiply angular velocities by the dose: 57.3 for degrees."""
     return _with_values(sequence, sequence.motion.values * np.repeat([1.0, dose], 3))
 
 
+@_injector("factor", clean=1.0)
 def gyro_axis_scale(sequence: Sequence, dose: float = 0.9, seed: int = 0) -> Sequence:
     """Multiply the rates about the axis that turns most by the dose: a channel of another sensitivity."""
     scale = np.ones(6)
@@ -329,6 +419,7 @@ def coarse_samples(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequ
     return _with_values(sequence, dose * np.round(sequence.motion.values / dose))
 
 
+@_injector("rad/s")
 def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Add a constant of the dose (rad/s) in a random direction to every angular velocity: a warm gyro."""
     axis = np.random.default_rng(seed).standard_normal(3)
@@ -336,12 +427,14 @@ def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence
     return _with_values(sequence, sequence.motion.values + bias)
 
 
+@_injector("factor", clean=1.0)
 def wrong_noise(sequence: Sequence, dose: float = 2.0, seed: int = 0) -> Sequence:
     """State the dose times the noise of tracks and motion, whose errors stay: a data sheet of another sensor."""
     rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 * dose**2)
     return replace(sequence, rig=rig, noise=sequence.noise.scaled(dose))
 
 
+@_injector("s")
 def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
     """Stop at a frame for the dose (s) and continue from there: a red light. For twists, whose motion may just stop.
 
@@ -415,6 +508,7 @@ def _truth_standing(truth: Truth, pause: _Pause) -> Truth:
 # Clocks ---------------------------------------------------------------------------------------------------------------
 
 
+@_injector("s")
 def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
     """Stamp all frames late by the dose (s): exposure and transfer not accounted for, a clock set by hand.
 
@@ -423,30 +517,35 @@ def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Seque
     return _with_frames_at(sequence, sequence.frames_t_ns + _ns(dose))
 
 
+@_injector("s")
 def camera_clock_step(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
     """Stamp the frames of the second half late by the dose (s): only the camera's clock is set during the recording."""
     later = np.arange(sequence.frame_count) >= sequence.frame_count // 2
     return _with_frames_at(sequence, sequence.frames_t_ns + np.where(later, _ns(dose), 0))
 
 
+@_injector("s")
 def alternate_frames_late(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
     """Stamp every other frame late by the dose (s): two buffers, of which one is read after the other."""
     odd = np.arange(sequence.frame_count) % 2 == 1
     return _with_frames_at(sequence, sequence.frames_t_ns + np.where(odd, _ns(dose), 0))
 
 
+@_injector("s")
 def frame_jitter(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequence:
     """Shift each stamp uniformly by up to the dose (s), less than half a step: a busy computer."""
     off_s = np.random.default_rng(seed).uniform(-dose, dose, sequence.frame_count)
     return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(1e9 * off_s).astype(np.int64))
 
 
+@_injector("share")
 def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
     """Let the camera's clock run fast by a share of the time: a cheap quartz, frames counted and not stamped."""
     since_ns = sequence.frames_t_ns - sequence.frames_t_ns[0]
     return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(dose * since_ns).astype(np.int64))
 
 
+@_injector("s")
 def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
     """Shift all stamps of frames and samples by the dose (s) from some time on: a daemon sets the clock."""
     at_ns = sequence.frames_t_ns[0] + _ns(_span_s(sequence, 0.0, seed)[0])
@@ -460,16 +559,16 @@ def _with_frames_at(sequence: Sequence, frames_t_ns: IntArray) -> Sequence:
     """Return the sequence with other stamps of its frames (K,), without those outside the motion samples."""
     moved, motion_t_ns = replace(sequence, frames_t_ns=frames_t_ns), sequence.motion.t_ns
     inside = (frames_t_ns >= motion_t_ns[0]) & (frames_t_ns <= motion_t_ns[-1])
-    return moved if inside.all() else _with_first_frames_cut(moved, inside)
+    return moved if inside.all() else _with_frames(moved, inside)
 
 
-def _with_first_frames_cut(sequence: Sequence, inside: BoolArray) -> Sequence:
-    """Return the sequence with the frames of a mask (K,) that is one stretch; the prior goes with the first one."""
-    seen, first = sequence.observations, int(np.argmax(inside))
-    rows = inside[seen.frame]
-    kept = Observations(seen.frame[rows] - first, seen.track_id[rows], seen.uv_px[rows])
-    prior = sequence.prior if first == 0 else None
-    return replace(sequence, frames_t_ns=sequence.frames_t_ns[inside], observations=kept, prior=prior)
+def _with_frames(sequence: Sequence, kept: BoolArray) -> Sequence:
+    """Return the sequence with the frames of a mask (K,) alone; the prior goes with the first one."""
+    seen, index = sequence.observations, np.cumsum(kept) - 1
+    rows = kept[seen.frame]
+    left = Observations(index[seen.frame[rows]], seen.track_id[rows], seen.uv_px[rows])
+    prior = sequence.prior if kept[0] else None
+    return replace(sequence, frames_t_ns=sequence.frames_t_ns[kept], observations=left, prior=prior)
 
 
 # Calibration ----------------------------------------------------------------------------------------------------------
@@ -490,21 +589,25 @@ def transposed_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) 
     return _with_rig(sequence, cx_px=dose, cy_px=dose)
 
 
+@_injector("factor", clean=1.0)
 def negative_focal(sequence: Sequence, dose: float = -1.0, seed: int = 0) -> Sequence:
     """Multiply the focal lengths by the dose: axes of a camera that looks backwards."""
     return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
 
 
+@_injector("factor", clean=1.0)
 def wrong_focal_length(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
     """Multiply both focal lengths by the dose: a data sheet instead of a calibration, another zoom."""
     return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
 
 
+@_injector("factor", clean=1.0)
 def wrong_aspect(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
     """Multiply fx alone by the dose: images that were resized in one direction."""
     return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px)
 
 
+@_injector("px")
 def shifted_centre(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
     """Shift the stated principal point by the dose (px) in a random direction: the middle of the image used instead."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
@@ -512,6 +615,7 @@ def shifted_centre(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Seq
     return _with_rig(sequence, cx_px=float(cx_px), cy_px=float(cy_px))
 
 
+@_injector("px")
 def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequence:
     """Give the images a skew of the dose (px), which a K may state but no rectified pair has."""
     rig, uv_px = sequence.rig, sequence.observations.uv_px
@@ -519,11 +623,13 @@ def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequ
     return _with_pixels(sequence, uv_px + shift_px * np.array([1.0, 1.0, 0.0]))
 
 
+@_injector("factor", clean=1.0)
 def baseline_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
     """Multiply the baseline by the dose: 1000 for millimetres."""
     return _with_rig(sequence, baseline_m=dose * sequence.rig.baseline_m)
 
 
+@_injector("factor", clean=1.0)
 def extrinsic_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
     """Multiply the camera's position in the IMU frame by the dose: 1000 for millimetres, -1 for a sign mixed up."""
     T_imu_cam = sequence.rig.T_imu_cam
@@ -535,6 +641,7 @@ def inverted_extrinsic(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> 
     return _with_rig(sequence, T_imu_cam=se3_inverse(sequence.rig.T_imu_cam)) if dose else sequence
 
 
+@_injector("rad")
 def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
     """Rotate the camera in its mount by the dose (rad) about a random axis: a knock, a calibration of another day."""
     axis = np.random.default_rng(seed).standard_normal(3)
@@ -542,11 +649,27 @@ def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequ
     return _with_rig(sequence, T_imu_cam=T_imu_cam @ se3(so3_exp(dose * axis / np.linalg.norm(axis)), np.zeros(3)))
 
 
+@_injector("m")
 def displaced_camera(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequence:
     """State the camera's position wrong by the dose (m) in a random direction: a tape measure, a bracket moved."""
     axis, T_imu_cam = np.random.default_rng(seed).standard_normal(3), sequence.rig.T_imu_cam
     displaced = se3(T_imu_cam[:3, :3], T_imu_cam[:3, 3] + dose * axis / np.linalg.norm(axis))
     return _with_rig(sequence, T_imu_cam=displaced)
+
+
+@_injector("rad")
+def wrong_start(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
+    """Tilt the stated start by the dose (rad) about a random level axis, as certain as before: a guessed attitude.
+
+    Raises DataError where none is stated: one that is found on the measurements is not wrong by a dose.
+    """
+    prior, angle = sequence.prior, np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    if prior is None:
+        raise DataError(f"{sequence.name}: it states no start that could be wrong; simulated sequences do")
+    T_world_imu = prior.T_world_imu
+    tilt = so3_exp(dose * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    tilted = se3(tilt @ T_world_imu[:3, :3], T_world_imu[:3, 3])
+    return replace(sequence, prior=replace(prior, T_world_imu=tilted))
 
 
 # Truth ----------------------------------------------------------------------------------------------------------------

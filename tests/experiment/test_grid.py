@@ -1,0 +1,146 @@
+"""A grid of experiments: what each is, that they are paired, kept, and found again whoever asks. 4 s."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.errors import DataError, EstimatorError
+from toolkit.experiment import pipeline
+from toolkit.experiment.grid import Grid, Trial, run_grid
+from toolkit.experiment.pipeline import Plan
+from toolkit.experiment.pipeline import run as run_plan
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.experiment.units import Outcome, Unit, run_unit
+from toolkit.progress import Progress
+from toolkit.settings import SettingsError
+from toolkit.settings.reading import settings_of
+from toolkit.simulation.faults import dropped_frames
+
+CLEAN, LOST = Trial("dead-reckoning"), Trial.of("dead-reckoning", faults={"dropped_frames": 0.3})
+SCALED = Trial.of("dead-reckoning", {"noise.motion_scale": 4.0})
+
+
+@pytest.fixture
+def plan(monkeypatch: pytest.MonkeyPatch) -> Plan:
+    whole = Plan.recording
+    # Two seconds are drawn and audited at once.
+    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
+    settings = settings_of({"seeds": 2}, "here")
+    return Plan(("drive",), ("dead-reckoning",), settings=settings, max_frames=12, workers=1)
+
+
+def ates(grid: Grid, trial: Trial) -> list[float | None]:
+    return grid.row(trial, "final").good_values("ate_none_m")
+
+
+def test_an_experiment_is_what_a_comparison_with_its_settings_is(plan: Plan) -> None:
+    grid = run_grid(plan, [CLEAN, SCALED])
+    for trial, scale in ((CLEAN, "auto"), (SCALED, 4.0)):
+        settings = settings_of({"seeds": 2, "noise": {"motion_scale": scale}}, "here")
+        (compared,) = run_plan(replace(plan, settings=settings))
+        expected = [one.outputs["final"].scores.values["nees_pose_mean"] for one in compared.outcomes]
+        assert grid.row(trial, "final").values("nees_pose_mean") == expected
+
+
+def test_faults_are_planted_in_the_part_that_is_run_and_pairs_are_drawn_alike(plan: Plan) -> None:
+    grid = run_grid(plan, [CLEAN, LOST, Trial.of("ekf", faults={"dropped_frames": 0.3})])
+    clean, lost, beside = ([one.sequence_hash for one in outcomes] for outcomes in grid.outcomes.values())
+    assert lost == beside
+    assert not set(lost) & set(clean)
+    recording = replace(plan.recording("drive", 1), faults=LOST.faults)
+    assert 3 <= prepare(recording).sequence.frame_count < 12
+
+
+def test_a_fault_at_its_clean_dose_is_none() -> None:
+    assert Trial.of("ekf", faults={"dropped_frames": 0.0, "wrong_noise": 1.0}) == Trial("ekf")
+
+
+def test_killed_and_started_again_nothing_runs_twice_and_the_result_is_the_same(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[int, object]] = []
+    most = 3
+
+    def counted(unit: Unit, progress: Progress) -> Outcome:
+        if len(ran) == most:
+            raise KeyboardInterrupt
+        ran.append((unit.seed, unit.requested.faults or unit.settings.noise.motion_scale))
+        return run_unit(unit, progress)
+
+    monkeypatch.setattr(pipeline, "run_unit", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_grid(plan, [CLEAN, LOST, SCALED], tmp_path)
+    most = 100
+    continued = run_grid(plan, [CLEAN, LOST, SCALED], tmp_path)
+    assert len(ran) == len(set(ran)) == 6
+    other = run_grid(plan, [SCALED, LOST], tmp_path)  # the same trials of another grid
+    assert len(ran) == 6
+    uninterrupted = run_grid(plan, [CLEAN, LOST, SCALED])
+    for trial in (CLEAN, LOST, SCALED):
+        assert ates(continued, trial) == ates(uninterrupted, trial)
+    assert ates(other, LOST) == ates(uninterrupted, LOST)
+    for kept, fresh in zip(continued.outcomes[LOST], uninterrupted.outcomes[LOST], strict=True):
+        np.testing.assert_array_equal(kept.outputs["final"].drift_m, fresh.outputs["final"].drift_m)
+        np.testing.assert_array_equal(kept.outputs["final"].heldout_px, fresh.outputs["final"].heldout_px)
+
+
+def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan: Plan) -> None:
+    grid = run_grid(plan, [CLEAN, Trial.of("dead-reckoning", faults={"nan_span": 0.5})])
+    clean, broken = grid.outcomes.values()
+    assert {one.status for one in clean} == {"ok"}
+    assert {one.status for one in broken} == {"failed"}
+    assert "not finite" in broken[0].why
+    assert [record.status for record in grid.records() if record.trial and record.seed == 1] == ["failed"]
+
+
+@pytest.mark.parametrize(
+    ("trial", "error", "what"),
+    [
+        (lambda: Trial.of("dead-reckoning", faults={"fog": 1.0}), SettingsError, "fault"),
+        (lambda: Trial.of("dead-reckoning", {"window.lag": 1.0}), SettingsError, "window.lag"),
+        (
+            lambda: Trial.of("dead-reckoning", {"estimators.dead-reckoning.fast": 1}),
+            EstimatorError,
+            "no option fast",
+        ),
+        (lambda: Trial("no-such"), EstimatorError, "no-such"),
+    ],
+)
+def test_what_cannot_be_run_is_told_before_anything_runs(
+    plan: Plan, trial: Callable[[], Trial], error: type[Exception], what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "run_unit", lambda *_: pytest.fail("a unit was run"))
+    with pytest.raises(error, match=what):
+        run_grid(plan, [CLEAN, trial()])
+
+
+def test_a_fault_that_a_recording_cannot_have_is_told_before_anything_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pipeline, "run_unit", lambda *_: pytest.fail("a unit was run"))
+    flight = Plan(("flight",), ("dead-reckoning",), max_frames=10, workers=1)
+    with pytest.raises(DataError, match="a standstill can be planted between twists only"):
+        run_grid(flight, [Trial.of("dead-reckoning", faults={"standstill": 1.0})])
+
+
+def test_stretches_of_two_runs_that_lack_frames_are_of_the_same_times() -> None:
+    from toolkit.experiment.stretches import drift_over_stretches
+    from toolkit.experiment.units import run_estimator
+    from toolkit.metrics import Evaluation
+    from toolkit.progress import SILENT
+
+    prepared = prepare(Recording("drive", 0, duration_s=12.0))
+    thinned = replace(prepared, sequence=dropped_frames(prepared.sequence, 0.2, 1))
+    whole, lacking = (
+        drift_over_stretches(
+            Evaluation(run_estimator(Unit(one, 0, "dead-reckoning"), one, SILENT), "final", one.sequence)
+        )
+        for one in (prepared, thinned)
+    )
+    assert np.isfinite(whole).all()
+    both = np.isfinite(lacking)
+    assert both.mean() > 0.8
+    assert np.corrcoef(whole[both], lacking[both])[0, 1] > 0.8  # the ends are up to a frame apart

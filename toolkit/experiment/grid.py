@@ -1,0 +1,153 @@
+"""A grid of experiments on one recording: estimators under changed settings and planted faults, paired by their seeds.
+
+Whoever asks what a change costs or brings lists the trials; what is not kept from before is run, side by side.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from toolkit.answers import Output, Status
+from toolkit.errors import no_such
+from toolkit.experiment.comparison import Row
+from toolkit.experiment.outcome_store import NOWHERE
+from toolkit.experiment.pipeline import Job, Plan, located, outcomes_of, prepared_cases, store_of, workers_of
+from toolkit.experiment.recording import WHOLE, Prepared
+from toolkit.experiment.units import Outcome, Unit
+from toolkit.progress import ProgressFor, silent
+from toolkit.registry import EstimatorEntry, check_options, find
+from toolkit.settings import Scalar, SettingsError, as_values
+from toolkit.settings.reading import settings_of, with_changes
+from toolkit.simulation.faults import INJECTORS, Doses, planted
+
+
+class Trial(NamedTuple):
+    """What is run under every seed: an estimator, and what differs from the plan.
+
+    ``changes`` are settings by key, an estimator's options among them (``estimators.NAME.option``); ``faults`` are
+    planted, by name and dose; ``keep`` are faults that are not repaired.
+    """
+
+    estimator: str
+    changes: tuple[tuple[str, Scalar | None], ...] = ()
+    faults: Doses = ()
+    keep: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(
+        cls,
+        estimator: str,
+        changes: Mapping[str, Scalar | None] | None = None,
+        faults: Mapping[str, float] | None = None,
+        keep: Iterable[str] = (),
+    ) -> "Trial":
+        """Return a trial; a fault at its clean dose is none. Raises SettingsError for a fault there is not."""
+        doses = dict(sorted((faults or {}).items()))
+        for name in doses:
+            if name not in INJECTORS:
+                raise SettingsError(no_such("fault", name, INJECTORS))
+        struck = tuple((name, float(dose)) for name, dose in doses.items() if dose != INJECTORS[name].clean)
+        return cls(estimator, tuple(sorted((changes or {}).items())), struck, frozenset(keep))
+
+    def __str__(self) -> str:
+        """Return what differs from the plan, apart from the estimator."""
+        settings = [f"{key}={value}" for key, value in self.changes]
+        faults = [f"fault:{name}={dose:g}" for name, dose in self.faults]
+        return " ".join([*settings, *faults, *(f"keep:{name}" for name in sorted(self.keep))])
+
+
+class GridRecord(NamedTuple):
+    """One value of one metric of one run, as a long table has it; ``trial`` is what differs from the plan."""
+
+    sequence: str
+    trial: str
+    seed: int
+    estimator: str
+    output: Output
+    metric: str
+    value: float | None
+    status: Status
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The outcomes of every trial, in the order of the plan's seeds; ``case`` is the recording under the first one."""
+
+    plan: Plan
+    case: Prepared
+    outcomes: Mapping[Trial, tuple[Outcome, ...]]
+
+    def row(self, trial: Trial, output: Output) -> Row:
+        """Return one kind of output of a trial over the seeds."""
+        return Row(output, self.outcomes[trial])
+
+    def records(self) -> Iterator[GridRecord]:
+        """Yield every value of every metric; a run that gave no output has one row, without metric and value."""
+        for trial, outcomes in self.outcomes.items():
+            for one in outcomes:
+                about = (self.case.name, str(trial), one.seed, one.estimator)
+                for output, scored in one.outputs.items():
+                    for key, value in scored.scores.values.items():
+                        yield GridRecord(*about, output, key, value, one.status)
+                if not one.outputs:
+                    yield GridRecord(*about, "final", "", None, one.status)
+
+
+def run_grid(
+    plan: Plan, trials: Iterable[Trial], directory: Path | None = None, progress_for: ProgressFor = silent
+) -> Grid:
+    """Run trials on the plan's one source under its seeds; outcomes are kept in a directory and found there again.
+
+    Raises SettingsError, EstimatorError or DataError where a trial or the recording cannot be used, before any run.
+    """
+    if len(plan.sources) != 1:
+        raise SettingsError(f"{len(plan.sources)} sequences are given; a grid of experiments is on one")
+    plans = {trial: _plan_of(plan, trial) for trial in trials}
+    with workers_of(plan) as workers:
+        (case,) = prepared_cases(plan, workers, progress_for)
+        for faults in dict.fromkeys(trial.faults for trial in plans):
+            planted(case.sequence, faults, plan.seeds[0])
+        with closing(NOWHERE if directory is None else store_of(plan, case, directory)) as store:
+            jobs = {(trial, unit.seed): Job(unit, store) for trial, unit in _units(plans, case)}
+            found = dict(outcomes_of(list(jobs.values()), workers, case.name, progress_for))
+    by_job = {job: found[place] for place, job in enumerate(jobs)}
+    return Grid(plan, case, {trial: tuple(by_job[trial, seed] for seed in plan.seeds) for trial in plans})
+
+
+def _plan_of(plan: Plan, trial: Trial) -> Plan:
+    """Return the plan of one trial; raises SettingsError or EstimatorError where it cannot be run."""
+    values = with_changes(as_values(plan.settings), dict(trial.changes))
+    settings = settings_of(values, f"{trial.estimator} {trial}")
+    entry = _entry(plan, trial)
+    check_options(settings, {*plan.own, *([] if entry is None else [entry.name])})
+    if entry is not None:
+        entry.check_usable(settings)
+    return replace(plan, estimators=(trial.estimator,), settings=settings, keep=plan.keep | trial.keep)
+
+
+def _entry(plan: Plan, trial: Trial) -> EstimatorEntry | None:
+    return None if trial.estimator in plan.own else find(trial.estimator)
+
+
+def _units(plans: Mapping[Trial, Plan], case: Prepared) -> Iterator[tuple[Trial, Unit]]:
+    """Yield the work: seed by seed and recording by recording, the estimators that take longest first."""
+    one = next(iter(plans.values()))
+    source = case.source if one.scheduler is None else located(case.source)
+    # Where faults are planted in a part of a recording, noise is measured on that part: then so it is without any.
+    is_part = (one.part, one.max_frames) != (WHOLE, None)
+    clean = () if is_part and any(trial.faults for trial in plans) else None
+    for seed in one.seeds:
+        units = []
+        for trial, plan in plans.items():
+            entry, build = _entry(plan, trial), plan.own.get(trial.estimator)
+            name = trial.estimator if entry is None else entry.name
+            recording = replace(plan.recording(source, seed), faults=trial.faults or clean)
+            units.append((trial, Unit(recording, seed, name, plan.settings, build, entry=entry)))
+        alike = {recording: i for i, recording in enumerate(dict.fromkeys(unit.recording for _, unit in units))}
+        yield from sorted(units, key=lambda pair: (alike[pair[1].recording], -_rung(pair[1])))
+
+
+def _rung(unit: Unit) -> int:
+    return 0 if unit.entry is None else unit.entry.rung() or 0
