@@ -18,21 +18,18 @@ import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
-    BACKWARDS,
-    INVERTED,
     Reference,
     check_axes,
+    check_body,
     check_clock,
     check_length_unit,
     check_mirrored,
-    check_turns,
-    in_other_order,
+    other_axes,
     range_s,
-    turned_body,
 )
 from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
+from toolkit.geometry import Array, IntArray, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
 from toolkit.metrics.parts.against_truth import (
@@ -103,9 +100,6 @@ _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 _DIGITS, _LENGTH = 9, 16
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
-_ALONG_AN_AXIS = 0.9
-# Number of poses, evenly spread, by which rotations are compared.
-_ENOUGH_TURNS = 1000
 _NONE = "the file states no covariance"
 
 
@@ -191,7 +185,7 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
     if turn is not None:
         scores = scores.without(
-            _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
+            _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {other_axes(turn)}"
         )
     if _changes(matched.estimate[:, :3, 3]) and not _changes(matched.truth[:, :3, 3]):
         scores = scores.remarked(_OF_POSITIONS, _STANDS)
@@ -234,7 +228,7 @@ def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
 
 def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None:
     """Check that a trajectory belongs to the truth; return the turn to its body's axes where these are others."""
-    what, rotations = str(file.path), estimate.poses[:, :3, :3]
+    what = str(file.path)
     if len(file) == 0:
         raise DataError(f"{what}: it holds no poses")
     reference = truth.reference
@@ -242,15 +236,7 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
     matched = matched_poses(estimate, truth)
     check_mirrored(what, matched.truth, matched.estimate)
-    readings = [INVERTED, BACKWARDS]
-    if file.other_order is not None:
-        readings.insert(0, in_other_order(file.other_order))
-    some = slice(None, None, 1 + len(rotations) // _ENOUGH_TURNS)
-    confirmed = check_turns(what, reference, estimate.t_ns[some], rotations[some], readings)
-    turn = None if confirmed else turned_body(reference, estimate.t_ns[some], rotations[some])
-    if file.other_order is not None and not confirmed and turn is None:
-        check_order(file.path, estimate.poses, file.other_order)
-    return turn
+    return check_body(file, reference, estimate.t_ns, (matched.truth, matched.estimate))
 
 
 def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:
@@ -343,19 +329,6 @@ def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> s
     if max_dt_s is None:
         return f"{int(off.sum())} of {few.size} stamps lie {typical} off the other's, and poses are interpolated there"
     return f"paired with the nearest pose, {typical} off, and not interpolated"
-
-
-def _axes(turn: Array) -> str:
-    """Describe a turn (3, 3) from a body's axes to the truth's."""
-    largest = np.abs(turn).argmax(axis=0)
-    if (np.abs(turn[largest, range(3)]) > _ALONG_AN_AXIS).all():
-        signed = ["xyz"[row] if turn[row, column] > 0.0 else f"-{'xyz'[row]}" for column, row in enumerate(largest)]
-        along = f"its x, y and z point along the truth's {signed[0]}, {signed[1]} and {signed[2]}"
-    else:
-        along = f"turned by {float(np.degrees(np.linalg.norm(so3_log(turn)))):.0f} deg"
-    x, y, z, w = quaternion_from_rotation(turn).tolist()
-    quaternion = f"x y z w {x:.3f} {y:.3f} {z:.3f} {w:.3f}"
-    return f"{along}; multiply each pose by the inverse of the extrinsic (about {quaternion}) from the right"
 
 
 def _lines_ns(count: int) -> IntArray:

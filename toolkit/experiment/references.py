@@ -5,18 +5,16 @@ from collections.abc import Iterable, Mapping
 from toolkit.answers import Output, Run
 from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
-    BACKWARDS,
-    INVERTED,
     Reference,
     check_axes,
+    check_body,
     check_clock,
     check_length_unit,
-    check_turns,
-    in_other_order,
     of_the_camera,
+    other_axes,
     range_s,
 )
-from toolkit.datasets.trajectories.formats import PosesFile, check_order
+from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import TRUTH, plain_name
@@ -71,15 +69,15 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
     reference = Reference.of_recording(recording)
     check_clock(what, reference, trajectory.t_ns)
     check_length_unit(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
-    readings = [INVERTED, BACKWARDS, of_the_camera(recording)]
-    if poses.other_order is not None:
-        readings.insert(0, in_other_order(poses.other_order))
-    confirmed = check_turns(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)
-    if poses.other_order is not None and not confirmed:
-        check_order(poses.path, trajectory.T_world_imu, poses.other_order)
+    matched = None
     if recording.truth is not None:
-        matched = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
-        check_axes(what, matched.truth, matched.estimate)
+        pairs = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
+        matched = pairs.truth, pairs.estimate
+    turn = check_body(poses, reference, trajectory.t_ns, matched, of_the_camera(recording))
+    if turn is not None:
+        raise DataError(f"{what}: its poses are of a body with other axes than the IMU's: {other_axes(turn)}")
+    if matched is not None:
+        check_axes(what, *matched)
     remarks = [] if recording.truth is not None else _of_another_scale(trajectory, sequence)
     read = f"read from {what} ({poses.format}, {len(poses)} poses)"
     return _run(name, trajectory, sequence, "final", read, *remarks, _AS_FINAL)

@@ -47,6 +47,7 @@ _USUAL = (
     *("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "rpe_100m_percent", "kitti_t_percent"),
     *("nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
 )
+_OF_ORIENTATION = "ate_se3_deg"
 # What a terminal shows of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
@@ -195,11 +196,13 @@ def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURE
 def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
-    scored = [metric.key for metric in evaluation.scored_metrics]
+    scored = {metric.key for metric in evaluation.scored_metrics}
     remarks: dict[str, _RemarkScope] = {}
     for run in evaluation.runs:
-        # Why a run failed is listed already.
-        for key in (key for key in scored if run.notes.get(key) and run.notes[key] not in run.log):
+        # Whatever the file's orientations lack is told, though nothing that needs them has a value. Why a run failed is
+        # listed already.
+        told = {run.notes.get(key) for key in (*scored, _OF_ORIENTATION)} - {None, *run.log}
+        for key in (metric.key for metric in METRICS if run.notes.get(metric.key) in told):
             text = run.notes[key] if run.metrics.get(key) is not None else f"no value: {run.notes[key]}"
             about = remarks.setdefault(text, _RemarkScope({}, {}))
             about.keys[key] = about.whose[f"{run.estimator} on {run.sequence}"] = None

@@ -15,9 +15,18 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from toolkit.datasets.trajectories.formats import OtherOrder
+from toolkit.datasets.trajectories.formats import OtherOrder, PosesFile, check_order
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, nearest_rotation, se3, se3_inverse, so3_log
+from toolkit.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    nearest_rotation,
+    quaternion_from_rotation,
+    se3,
+    se3_inverse,
+    so3_log,
+)
 from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import Sequence
@@ -45,15 +54,16 @@ _WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
 Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 # Largest errors of a fit: positions in shares of their extent, orientations by an angle. Estimates with more drift are
 # not judged.
-_FITTING_SHARE, _FITTING_RAD = 0.1, np.deg2rad(10.0)
+_FITTING_SHARE, _FITTING_RAD = 0.1, float(np.deg2rad(10.0))
 # As given, positions must have this many times the error under the exchange, and an error above this share of their
 # extent ...
 _TIMES, _LEAST_SHARE = 3.0, 0.01
 # ... or orientations an error above this angle. A path on a line determines neither.
 _WRONG_RAD, _LEAST_SIDEWAYS = np.deg2rad(30.0), 0.05
 _FEWEST = 10
-# Number of poses, evenly spread, that are compared.
-_ENOUGH = 500
+# Number of poses, evenly spread, that are compared, and by which rates of rotation are.
+_ENOUGH, _ENOUGH_TURNS = 500, 1000
+_ALONG_AN_AXIS = 0.9
 _NAMES = "xyz"
 
 
@@ -102,11 +112,15 @@ class Reference(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it."""
+    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it.
+
+    ``step`` is that through the positions (N, 3) then.
+    """
 
     only_if: str
     remedy: str
     reread: Callable[[Array], Array]
+    step: int = 1
 
 
 def in_other_order(order: OtherOrder) -> Reading:
@@ -125,6 +139,7 @@ BACKWARDS = Reading(
     "read backwards",
     "its poses run backwards: write them in the order of their stamps",
     lambda R_world_imu: R_world_imu[::-1],
+    -1,
 )
 
 
@@ -173,11 +188,64 @@ def check_turns(
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
     if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):
-        raise DataError(f"{reference.name}: {what} turns as {reference.turns} only if {best.only_if}; {best.remedy}")
+        raise DataError(_only_if(what, reference, best))
     return as_given > _FITTING_CORRELATION and as_given >= fit
 
 
-def turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
+def check_body(
+    file: PosesFile, reference: Reference, t_ns: IntArray, matched: tuple[Array, Array] | None, *readings: Reading
+) -> Array | None:
+    """Return R_reference_body (3, 3) where a file's poses are of a body with other axes than the truth's, else None.
+
+    ``matched`` are the truth's and the estimate's poses (n, 4, 4) of the same times, where there is a truth. Every
+    reading is judged by what it leaves of the orientations once the positions are laid over each other: at best one
+    turn of the body, however large. Where positions do not tell, the rates of rotation on the stamps (N,) do.
+    Raises DataError where another reading leaves far less than the given one, which is named with its remedy.
+    """
+    what, order = str(file.path), file.other_order
+    others = (*(() if order is None else (in_other_order(order),)), INVERTED, BACKWARDS, *readings)
+    fit = None if matched is None else _fit(*matched)
+    if fit is not None and fit.turns:
+        given, left = fit.body, {one: fit.reread(one).body for one in others}
+        most_rad = min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
+        fits = given.scatter_rad < most_rad
+        if fits and not given.is_other_body:
+            return None
+        # A reading that leaves no turn is likelier than one that leaves a turn, which a loop may make by chance.
+        best = min(left, key=lambda one: left[one].scatter_rad)
+        is_better = not left[best].is_other_body if fits else left[best].scatter_rad < given.scatter_rad / _TIMES
+        if is_better and left[best].scatter_rad < most_rad:
+            raise DataError(_only_if(what, reference, best))
+        if fits:
+            return given.R_truth_body
+    some = slice(None, None, 1 + len(file) // _ENOUGH_TURNS)
+    t_ns, poses = t_ns[some], file.T_world_imu[some]
+    confirmed = check_turns(what, reference, t_ns, poses[:, :3, :3], others)
+    turn = _turned_body(reference, t_ns, poses[:, :3, :3])
+    if order is not None and not confirmed and turn is None:
+        check_order(file.path, file.T_world_imu, order)
+    return turn
+
+
+def _only_if(what: str, reference: Reference, reading: Reading) -> str:
+    return f"{reference.name}: {what} turns as {reference.turns} only if {reading.only_if}; {reading.remedy}"
+
+
+def other_axes(R_reference_body: Array) -> str:
+    """Describe a turn (3, 3) from a body's axes to the truth's, and what to do about it."""
+    largest = np.abs(R_reference_body).argmax(axis=0)
+    if (np.abs(R_reference_body[largest, range(3)]) > _ALONG_AN_AXIS).all():
+        signs = ("" if R_reference_body[row, column] > 0.0 else "-" for column, row in enumerate(largest))
+        signed = [f"{sign}{_NAMES[row]}" for sign, row in zip(signs, largest, strict=True)]
+        along = f"its x, y and z point along the truth's {signed[0]}, {signed[1]} and {signed[2]}"
+    else:
+        along = f"turned by {float(np.degrees(np.linalg.norm(so3_log(R_reference_body)))):.0f} deg"
+    x, y, z, w = quaternion_from_rotation(R_reference_body).tolist()
+    quaternion = f"x y z w {x:.3f} {y:.3f} {z:.3f} {w:.3f}"
+    return f"{along}; multiply each pose by the inverse of the extrinsic (about {quaternion}) from the right"
+
+
+def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
     """Return R_reference_body (3, 3) where rotations (N, 3, 3) are those of a body with other axes, or None.
 
     Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
@@ -434,21 +502,38 @@ def _named(fit: "_Fit") -> str | None:
 _AS_GIVEN = Exchange(np.eye(3), "positions alone")
 
 
+class BodyTurn(NamedTuple):
+    """The turn R_truth_body (3, 3) that orientations have in common, how they scatter about it, and what hides it.
+
+    ``scatter_rad`` is the median angle from it; the fit of the positions leaves a turn of ``unknown_rad`` open.
+    """
+
+    R_truth_body: Array
+    scatter_rad: float
+    unknown_rad: float
+
+    @property
+    def is_other_body(self) -> bool:
+        """Say whether the body's axes are others: the turn is large, and more than the errors of both."""
+        angle = float(np.linalg.norm(so3_log(self.R_truth_body)))
+        return angle > max(_OTHER_AXES_RAD, _TIMES * self.scatter_rad, _TIMES * self.unknown_rad)
+
+
 class _Fit:
     """Poses (n, 4, 4) against the truth's, positions laid over each other under any exchange of their axes."""
 
     def __init__(self, truth: Array, estimate: Array) -> None:
         y, x = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (truth, estimate))
         self._truth, self._estimate = truth, estimate
-        self._variance = float((y**2).sum() + (x**2).sum()) / len(y)
-        self._extent = float(np.sqrt((y**2).sum() / len(y)))
-        self._covariance = y.T @ x / len(y)
+        # Each in its own extent: the scale of a single camera's estimate is free.
+        extents = float(np.linalg.norm(y) * np.linalg.norm(x))
+        self._covariance = y.T @ x / (extents or 1.0)
 
     @property
     def is_determined(self) -> bool:
         """Say whether the positions leave a line."""
         _, overlaps = nearest_rotation(self._covariance)
-        return bool(self._extent > 0.0 and overlaps[1] > _LEAST_SIDEWAYS**2 * overlaps[0])
+        return float(overlaps[1]) > _LEAST_SIDEWAYS**2 * float(overlaps[0])
 
     @property
     def is_near(self) -> bool:
@@ -467,19 +552,39 @@ class _Fit:
     @property
     def turns(self) -> bool:
         """Say whether both have orientations that change."""
-        return all(_spread_rad(poses[:, :3, :3]) > _FITTING_RAD for poses in (self._truth, self._estimate))
+        return self.turned_by_rad > _FITTING_RAD
+
+    @property
+    def turned_by_rad(self) -> float:
+        """How much the orientations of that which turns less change: the median angle from their mean."""
+        return min(_spread_rad(poses[:, :3, :3]) for poses in (self._truth, self._estimate))
 
     @property
     def is_other_body(self) -> bool:
         """Say whether the orientations differ by a constant turn of the body, as a camera's from an IMU's do."""
-        R_truth_estimate = self._rotation(np.eye(3)) @ self._estimate[:, :3, :3]
-        return bool(_spread_rad(np.swapaxes(self._truth[:, :3, :3], 1, 2) @ R_truth_estimate) < _FITTING_RAD)
+        return self.body.scatter_rad < _FITTING_RAD
+
+    @property
+    def body(self) -> BodyTurn:
+        """The turn of the body that is left of the orientations once the positions are laid over each other."""
+        if not self.is_near:
+            return BodyTurn(np.eye(3), np.inf, np.inf)
+        aligned = self._rotation(np.eye(3)) @ self._estimate[:, :3, :3]
+        left = np.swapaxes(self._truth[:, :3, :3], 1, 2) @ aligned
+        turn, _ = nearest_rotation(left.mean(axis=0))
+        _, overlaps = nearest_rotation(self._covariance)
+        unknown_rad = self.off_share(np.eye(3)) / max(float(np.sqrt(max(overlaps[1], 0.0))), 1e-9)
+        return BodyTurn(turn, float(np.median(np.linalg.norm(so3_log(turn.T @ left), axis=1))), unknown_rad)
+
+    def reread(self, reading: Reading) -> "_Fit":
+        """Return the fit of the poses read otherwise."""
+        rotations, positions = self._estimate[:, :3, :3], self._estimate[:, :3, 3]
+        return _Fit(self._truth, se3(reading.reread(rotations), positions[:: reading.step]))
 
     def off_share(self, matrix: Array) -> float:
-        """Return how far positions whose axes are exchanged are off the truth's, of the truth's extent."""
+        """Return how far positions whose axes are exchanged are off the truth's at best, of the truth's extent."""
         _, overlaps = nearest_rotation(self._covariance @ matrix.T)
-        squared = self._variance - 2.0 * float(overlaps.sum())
-        return float(np.sqrt(max(squared, 0.0))) / self._extent
+        return float(np.sqrt(max(1.0 - float(overlaps.sum()) ** 2, 0.0)))
 
     def turned_rad(self, exchange: Exchange) -> float:
         """Return the median angle between the truth's orientations and those under an exchange."""
