@@ -4,6 +4,9 @@ What it approximates: pose and landmarks are kept as if they were independent. A
 landmark, but the filter is overconfident: its covariance does not grow with the distance driven.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from filters.kalman.landmark_map import (
@@ -26,18 +29,25 @@ from toolkit.models.state import POSE, Belief
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the other's uncertainty as noise"
 DEFAULT = True
+OPTIONS = {"landmark_uncertainty": (True, False)}
+INGREDIENTS = ("landmark uncertainty", "biases", "long-lived landmarks")
+WITHOUT = {"landmark uncertainty": {"landmark_uncertainty": False}}
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(DecoupledEkf(setup))
+    known = setup.choice("landmark_uncertainty", {True: as_uncertain_as_stated, False: as_exact})
+    return OnlineOutput(DecoupledEkf(setup, known))
 
 
 class DecoupledEkf(Filter):
-    """Predict, correct the pose by the known landmarks, correct the landmarks, start new ones, drop lost ones."""
+    """Predict, correct the pose by the known landmarks, correct the landmarks, start new ones, drop lost ones.
 
-    def __init__(self, setup: Setup) -> None:
-        self._rig, self._outliers = setup.rig, setup.settings.outliers
+    ``known`` says as how uncertain the landmarks correct the pose.
+    """
+
+    def __init__(self, setup: Setup, known: Callable[[LandmarkMap], LandmarkMap]) -> None:
+        self._rig, self._outliers, self._known = setup.rig, setup.settings.outliers, known
         self._motion = setup.motion
         self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
@@ -50,7 +60,7 @@ class DecoupledEkf(Filter):
         seen, uvs_px = self._map.seen_again(packet.frame)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
-            self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate)
+            self._belief, accepted = correct_pose(self._belief, self._known(seen), uvs_px, self._rig, gate)
             # By the corrected pose, as uncertain as it is then and as if it were independent of the landmarks.
             pose_cov = self._belief.cov[POSE, POSE]
             bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
@@ -61,6 +71,16 @@ class DecoupledEkf(Filter):
     def landmarks(self) -> Landmarks:
         """Return every landmark the filter ever had, as it last knew it."""
         return self._map.landmarks()
+
+
+def as_uncertain_as_stated(landmarks: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks with their covariances."""
+    return landmarks
+
+
+def as_exact(landmarks: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks as if they had no error, as the report's filter takes them (Kang, eqs. 11-14)."""
+    return replace(landmarks, covs=np.zeros_like(landmarks.covs))
 
 
 def correct_pose(

@@ -27,7 +27,7 @@ import numpy as np
 
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InverseDepthBelief
-from filters.kalman.joint import AtFirstEstimates, JointBelief, Linearisation, propagate
+from filters.kalman.joint import AtFirstEstimates, JointBelief, Linearisation, linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.tracks import TrackSightings
 from toolkit.arrays import is_among
@@ -37,9 +37,20 @@ from toolkit.measurements import Packet, StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, FrameGate
 from toolkit.models.state import Belief
+from toolkit.settings.records import Scalar
 
 CITES = ("smith1990estimating", "huang2010observability")
 RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth"
+OPTIONS = {"linearisation": ("first", "latest"), "landmarks": ("inverse depth", "metres")}
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "inverse depth",
+    "long-lived landmarks",
+)
+WITHOUT = {"consistent linearisation": {"linearisation": "latest"}, "inverse depth": {"landmarks": "metres"}}
 
 # With an IMU a landmark may have moved from its first estimate by this share of its distance before it is restarted.
 MOST_MOVED = 0.3
@@ -47,9 +58,11 @@ MOST_MOVED = 0.3
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    belief = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam)
-    at = AtFirstEstimates(MOST_MOVED) if setup.motion_kind == "imu" else AtFirstEstimates()
-    return OnlineOutput(JointEkf(setup, at, belief))
+    first = AtFirstEstimates(MOST_MOVED) if setup.motion_kind == "imu" else AtFirstEstimates()
+    at = linearisation(setup, first)
+    in_inverse_depth = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam, at=at)
+    beliefs: dict[Scalar, Callable[[Belief], JointBelief]] = {"inverse depth": in_inverse_depth, "metres": JointBelief}
+    return OnlineOutput(JointEkf(setup, at, setup.choice("landmarks", beliefs)))
 
 
 class Correct(Protocol):

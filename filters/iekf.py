@@ -37,6 +37,15 @@ from toolkit.models.gating import FrameGate
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "inverse depth",
+    "long-lived landmarks",
+    "relinearisation",
+)
 # Length of a step in standard deviations of the updated state.
 NEGLIGIBLE_STEP = 1e-4
 MOST_STEPS, MOST_HALVINGS = 10, 6

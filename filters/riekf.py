@@ -22,6 +22,14 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
 RUNG, CHANGE = 40, "+ right-invariant error, Jacobians at latest estimates, anchors"
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "inverse depth",
+    "long-lived landmarks",
+)
 
 
 def build(setup: Setup) -> Estimator:

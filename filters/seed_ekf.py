@@ -27,6 +27,7 @@ RUNG, CHANGE = 10, "+ vision as in the report: map and pose updated in turn, bia
 RULES = {
     "outliers": "the report's filter has neither gate nor loss",
 }
+INGREDIENTS = ("long-lived landmarks",)
 
 
 def build(setup: Setup) -> Estimator:

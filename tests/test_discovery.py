@@ -132,7 +132,7 @@ def test_a_module_says_which_common_rules_it_treats_otherwise(package):
 )
 def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(package, rules):
     write(package, "odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
-    with pytest.raises(EstimatorError, match=r"odd: RULES in odd.py has to map some of outliers, .* to True"):
+    with pytest.raises(EstimatorError, match=r"odd: in odd.py RULES has to map some of outliers, .* to True"):
         find("odd").check_usable(DEFAULTS)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
@@ -10,6 +10,8 @@ from toolkit.measurements import MotionKind, MotionNoise, Packet, Prior, StereoR
 from toolkit.models.state import Predictor
 from toolkit.progress import SILENT, Progress
 from toolkit.settings.records import DEFAULTS, Scalar, Settings
+
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,10 @@ class Setup:
     settings: Settings = DEFAULTS
     options: Mapping[str, Scalar] = field(default_factory=dict)
     progress: Progress = SILENT
+
+    def choice(self, option: str, parts: Mapping[Scalar, Part]) -> Part:
+        """Return the part for the value that an option has, the first of them where it is not set."""
+        return parts[self.options.get(option, next(iter(parts)))]
 
 
 class Estimator(Protocol):

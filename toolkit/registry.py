@@ -4,10 +4,11 @@ An installed package announces, in the entry-point group ``toolkit.estimators``,
 a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its summary and its function
 ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the ladder, in which every
 rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared where no estimator is
-named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` lists the common rules below for which it differs
-from the default: True where it obeys a rule, the kinds of motion beside which it does, as ``("imu",)``, or the reason
-why it does not; ``CITES`` is what ``vislam cite`` prints for it, keys of toolkit/report/references.bib or BibTeX
-itself.
+named; ``OPTIONS`` names the settings that it alone reads, and may give the values that each takes, the default first;
+``INGREDIENTS`` says what it has of what estimators differ in, and ``WITHOUT`` which settings take that away;
+``RULES`` lists the common rules below for which it differs from the default: True where it obeys a rule, the kinds of
+motion beside which it does, as ``("imu",)``, or the reason why it does not; ``CITES`` is what ``vislam cite`` prints
+for it, keys of toolkit/report/references.bib or BibTeX itself.
 
 Where a name is expected, ``my_filter.py`` names a file of one's own, which no package needs to announce.
 """
@@ -22,12 +23,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import cast
 
+import msgspec
+
 from toolkit.discovery import FoundModule, MissingDependency, announced, shown_name
 from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimator import Build
 from toolkit.files.reading import read_input
 from toolkit.measurements import MOTION_KINDS, MotionKind
 from toolkit.settings import Settings
+from toolkit.settings.records import Scalar
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
@@ -120,10 +124,31 @@ class EstimatorEntry:
         change = self.found.constants().get("CHANGE")
         return change if isinstance(change, str) else ""
 
-    def options(self) -> frozenset[str]:
-        """Return the names of the settings that this estimator alone reads: its module's constant ``OPTIONS``."""
+    def options(self) -> Mapping[str, tuple[Scalar, ...]]:
+        """Return the settings that this estimator alone reads, each with the values it takes: ``OPTIONS``.
+
+        The first value is the default; there is none where the module names no values, and any may be set.
+        """
         options = self.found.constants().get("OPTIONS", ())
-        return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
+        if isinstance(options, dict):
+            return {str(name): tuple(values) for name, values in options.items()}
+        return dict.fromkeys(map(str, options), ()) if isinstance(options, tuple) else {}
+
+    def ingredients(self) -> Mapping[str, Mapping[str, Scalar]]:
+        """Return what the estimator has of what estimators differ in, each with the settings that take it away.
+
+        These are its constants ``INGREDIENTS`` and ``WITHOUT``. A key without a dot is an option of its own, ``output``
+        the kind of output. Raises EstimatorError where they are not so.
+        """
+        constants = self.found.constants()
+        try:
+            names = msgspec.convert(constants.get("INGREDIENTS", ()), tuple[str, ...])
+            without = msgspec.convert(constants.get("WITHOUT", {}), dict[str, dict[str, Scalar]])
+        except msgspec.ValidationError as error:
+            raise self._refused("INGREDIENTS has to be a tuple of names, WITHOUT to map some to settings") from error
+        if strange := without.keys() - set(names):
+            raise self._refused(f"WITHOUT takes away {min(strange)}, which INGREDIENTS does not have")
+        return {name: without.get(name, {}) for name in names}
 
     def obeys(self, rule: str, motion_kind: MotionKind | None = None) -> bool:
         """Say whether the estimator obeys a common rule, one of :data:`RULES`, beside a kind of motion or any."""
@@ -138,11 +163,14 @@ class EstimatorEntry:
         rules = self.found.constants().get("RULES", {})
         declared = rules if isinstance(rules, dict) else {"": False}
         if not all(rule in RULES and _is_rule_value(what) for rule, what in declared.items()):
-            raise EstimatorError(
-                f"estimator {self.name}: RULES in {self.found.path.name} has to map some of {', '.join(RULES)} to "
-                f"True, to kinds of motion ({', '.join(MOTION_KINDS)}), or to the reason why it does not obey the rule"
+            raise self._refused(
+                f"RULES has to map some of {', '.join(RULES)} to True, to kinds of motion ({', '.join(MOTION_KINDS)}), "
+                "or to the reason why it does not obey the rule"
             )
         return declared
+
+    def _refused(self, what: str) -> EstimatorError:
+        return EstimatorError(f"estimator {self.name}: in {self.found.path.name} {what}")
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""
@@ -152,10 +180,14 @@ class EstimatorEntry:
 
     def check_options(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator names every option that is set for it."""
-        for option in settings.options_of(self.name):
-            if option not in self.options():
-                known = ", ".join(sorted(self.options())) or "none"
-                raise EstimatorError(f"estimator {self.name} has no option {option}; it has {known}")
+        known = self.options()
+        for option, value in settings.options_of(self.name).items():
+            if option not in known:
+                names = ", ".join(sorted(known)) or "none"
+                raise EstimatorError(f"estimator {self.name} has no option {option}; it has {names}")
+            if known[option] and value not in known[option]:
+                values = " or ".join(str(one).lower() if isinstance(one, bool) else str(one) for one in known[option])
+                raise EstimatorError(f"estimator {self.name}: option {option} is {value!r}; it takes {values}")
 
     def load(self) -> Build:
         """Import the estimator and return its ``build``.

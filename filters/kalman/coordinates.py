@@ -22,7 +22,7 @@ from copy import copy
 import numpy as np
 from scipy.sparse import csr_array
 
-from filters.kalman.joint import JointBelief
+from filters.kalman.joint import JointBelief, Linearisation
 from toolkit.geometry import (
     Array,
     BoolArray,
@@ -63,14 +63,18 @@ class InverseDepthBelief(LandmarkAnchors):
     The anchor camera is fixed at its first estimate, so that the triple is a function of the landmark alone. With
     Jacobians at first estimates, the error in the triple is a constant matrix times the error in metres. The covariance
     can therefore be kept in metres, and unobservable directions stay unobservable. Only the path of the estimate
-    differs.
+    differs. A correction, which is in metres, is converted where ``at`` has Jacobians evaluated.
     """
+
+    def __init__(self, core: Belief, T_imu_cam: Array, at: Linearisation) -> None:
+        super().__init__(core, T_imu_cam)
+        self._at = at
 
     def _displace(self, delta: Array) -> None:
         to_anchor = se3_inverse(self.anchors)
-        first, now = transform(to_anchor, self.first_points), transform(to_anchor, self.points)
+        linearised, now = transform(to_anchor, self._at.points(self)), transform(to_anchor, self.points)
         own = to_anchor[:, :3, :3] @ delta[self.landmark_columns].reshape(-1, 3, 1)
-        change = (inverse_depth_jacobian(first) @ own)[..., 0]
+        change = (inverse_depth_jacobian(linearised) @ own)[..., 0]
         super()._displace(delta)
         self.points = transform(self.anchors, inverse_depth(inverse_depth(now) + change))
 

@@ -18,9 +18,11 @@ from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csr_array
 
+from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.measurements import Motion
 from toolkit.models.state import POSE, Belief, Increment, Prediction, Predictor
+from toolkit.settings.records import Scalar
 
 # At least this share of each variance is assumed independent of all other errors. A smaller share is lost in rounding,
 # and without it the covariance of two clones of one pose, equal to sixteen digits, has no Cholesky root.
@@ -249,6 +251,12 @@ class AtFirstEstimates:
         moved_m = np.linalg.norm(joint.points - joint.first_points, axis=1)
         distance_m = np.linalg.norm(joint.points - joint.clones[-1, :3, 3], axis=1)
         return np.asarray(moved_m > self._most_moved * distance_m)
+
+
+def linearisation(setup: Setup, first: AtFirstEstimates) -> Linearisation:
+    """Return what an estimator's option ``linearisation`` says: at ``first`` estimates, or at the latest."""
+    points: dict[Scalar, Linearisation] = {"first": first, "latest": AtLatestEstimates()}
+    return setup.choice("linearisation", points)
 
 
 def propagate(joint: JointBelief, model: Predictor, at: Linearisation, motion: Motion | None) -> None:

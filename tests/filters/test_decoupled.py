@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.ekf import DecoupledEkf
+from filters.ekf import DecoupledEkf, as_uncertain_as_stated
 from toolkit import runner
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -13,7 +13,7 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 def filter_of(sequence: Sequence) -> DecoupledEkf:
     prior = sequence.prior
-    return DecoupledEkf(runner.setup_of(sequence, prior))
+    return DecoupledEkf(runner.setup_of(sequence, prior), as_uncertain_as_stated)
 
 
 def accepted_share(sequence: Sequence) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters.kalman.coordinates import InverseDepthBelief
-from filters.kalman.joint import JointBelief
+from filters.kalman.joint import AtFirstEstimates, JointBelief
 from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
@@ -24,7 +24,7 @@ def sequence():
 def belief(sequence) -> InverseDepthBelief:
     """Return a belief of one clone and two landmarks first seen from it."""
     core = motion_model(sequence.noise, sequence.gravity_world).initial_belief(sequence.prior)
-    joint = InverseDepthBelief(core, sequence.rig.T_imu_cam)
+    joint = InverseDepthBelief(core, sequence.rig.T_imu_cam, AtFirstEstimates())
     joint.clone()
     points = transform(core.T_world_imu @ sequence.rig.T_imu_cam, POINTS_CAM)
     joint.add_landmarks(IDS, points, np.zeros((6, joint.cov.shape[0])), np.eye(6))
