@@ -34,6 +34,15 @@ def test_a_sound_recording_warns_of_nothing(scenario: str, seed: int) -> None:
     assert [finding.fault for finding in findings] == ["correlated-tracks"] * ("realistic" in scenario)
 
 
+@pytest.mark.parametrize("seed", [0, 1])  # the two sides of the image
+def test_a_narrow_view_of_a_sound_flight_is_no_disagreement_and_a_gyro_in_other_axes_is(seed: int) -> None:
+    # Beside the camera's velocity, whose errors the camera's rotation compensates, the gyro's leaves up to 5 px.
+    narrow, narrower = (faults.one_sided_view(recording("flight", 0), share, seed) for share in (0.75, 0.85))
+    assert not any(finding.blocking for view in (narrow, narrower) for finding in audit(view).findings)
+    exchanged = narrow.motion.of(narrow.motion.t_ns, narrow.motion.values[:, [0, 1, 2, 4, 3, 5]])
+    assert any(finding.blocking for finding in audit(replace(narrow, motion=exchanged)).findings)
+
+
 def test_a_conflict_is_reported_at_its_time_and_of_its_size() -> None:
     sound = recording("drive", 3)
     disturbed = faults.disturbed_motion(sound, 3.0, 3)

@@ -130,7 +130,8 @@ class Evidence:
     @cached_property
     def agreement(self) -> Agreement:
         """How well the tracks follow the measured motion; needs ``intervals``."""
-        return agreement(self.sequence, self.camera_motion)
+        assert self.intervals is not None
+        return agreement(self.sequence, self.camera_motion, self.intervals)
 
     @cached_property
     def velocity_fit(self) -> VelocityFit | None:

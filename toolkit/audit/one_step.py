@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import moved_as_measured, moved_by
+from toolkit.audit.intervals import Intervals, moved_as_measured, moved_by, usual_step_s
 from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.jackknife import jackknife_error
-from toolkit.measurements import NS_PER_S, TwistChangeNoise, TwistNoise
+from toolkit.measurements import ImuNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.camera_motion import CameraMotion, triangulation_jacobian, usable_pairs
 from toolkit.models.gating import LEAST_DEPTH_M, MAD_TO_SIGMA
+from toolkit.models.noise import white_sigma
 from toolkit.models.stereo import project, projection_jacobian, triangulate
 from toolkit.sequence import Sequence
 
@@ -41,15 +42,14 @@ class OneStep(NamedTuple):
     """P pairs of successive sightings of a track: their rows (P,), the second's residual (P, 3) px, and its covariance.
 
     The point is triangulated from the first sighting, of covariance R, and projected into the second's frame. If the
-    errors of both are independent, the residual has the covariance ``cov_px2`` (P, 3, 3) = J R J^T + R. ``jacobian``
-    (P, 3, 3) is J, the derivative of the second's prediction by the first sighting.
+    errors of both are independent, the residual has the covariance ``cov_px2`` (P, 3, 3) = J R J^T + R, where J is the
+    derivative of the second's prediction by the first sighting.
     """
 
     before: IntArray
     after: IntArray
     residual_px: Array
     cov_px2: Array
-    jacobian: Array
 
 
 def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
@@ -64,7 +64,7 @@ def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
     d_after_d_before = T_after_before[:, :3, :3] @ d_point_d_uv
     jacobian = projection_jacobian(after, rig) @ d_after_d_before
     cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
-    return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2, jacobian)
+    return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2)
 
 
 def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
@@ -112,25 +112,33 @@ class Agreement(NamedTuple):
     limit_px: float
 
 
-def agreement(sequence: Sequence, camera: CameraMotion) -> Agreement:
+def agreement(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Agreement:
     """Measure how well the tracks follow the measured motion of a sequence that can be compared."""
     own_px = own_one_step_px(sequence, camera)
-    limit_px = max(MOST_PX, TIMES_EXPLAINED * _explained_px(sequence, own_px))
+    limit_px = max(MOST_PX, TIMES_EXPLAINED * _explained_px(sequence, intervals, own_px))
     return Agreement(median_one_step_px(sequence, camera, sequence.rig.T_imu_cam), own_px, limit_px)
 
 
-def _explained_px(sequence: Sequence, own_px: float) -> float:
-    """Return the residual (px) that the tracks' scatter and the stated noise over a usual interval explain."""
+def _explained_px(sequence: Sequence, intervals: Intervals, own_px: float) -> float:
+    """Return the residual (px) that the tracks' scatter and noise over a usual interval explain.
+
+    That is the stated noise of the samples and, with an IMU, the scatter of the camera's rotation about the gyro's: in
+    a narrow view its errors and those of the camera's velocity are large and compensate, until the gyro's rotation
+    takes its place beside that velocity.
+    """
     noise, focal_px = sequence.noise, sequence.rig.fx_px
-    root_dt = np.sqrt(np.median(np.diff(sequence.frames_t_ns)) / NS_PER_S)
-    turned_px = moved_px = 0.0
+    step_s = usual_step_s(sequence.frames_t_ns)
+    turned_px = moved_px = mixed_px = 0.0
     if not isinstance(noise, TwistChangeNoise):
-        turned_px = focal_px * root_dt * float(np.max(noise.gyro_noise_density))
+        turned_px = focal_px * np.sqrt(step_s) * float(np.max(noise.gyro_noise_density))
     if isinstance(noise, TwistNoise):
         uv_px = sequence.observations.uv_px[usable_pairs(sequence).before]
         depth_m = float(np.median(triangulate(uv_px, sequence.rig)[:, 2])) if len(uv_px) else np.inf
-        moved_px = focal_px / depth_m * root_dt * float(np.max(noise.velocity_noise_density))
-    return float(np.sqrt(own_px**2 + turned_px**2 + moved_px**2))
+        moved_px = focal_px / depth_m * np.sqrt(step_s) * float(np.max(noise.velocity_noise_density))
+    if isinstance(noise, ImuNoise):
+        scatter_radps = white_sigma(intervals.w_radps - intervals.w_seen_radps)
+        mixed_px = focal_px * step_s * float(np.sqrt(np.mean(scatter_radps**2)))
+    return float(np.sqrt(own_px**2 + turned_px**2 + moved_px**2 + mixed_px**2))
 
 
 def step_correlation(sequence: Sequence, steps: OneStep) -> Scalar | None:
