@@ -6,8 +6,7 @@ a filter learns its heading or a bias after a long drive, and then a large jump 
 this covariance are rare in a filter that works and common in one that has diverged.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import chdtri
@@ -134,45 +133,29 @@ def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
     return min(LEAST_ACCEPTED, float((1.0 - _MOST_OUTLIERS) ** sightings))
 
 
-class _Step(NamedTuple):
-    """A step between neighbouring frames: its rows, and the prediction by the measured motion from its start."""
-
-    start: int
-    end: int
-    T_world_imu: Array
-    transition: Array
-    noise: Array
-
-
 def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
     """Return the squared Mahalanobis distances (S,) of steps between neighbouring frames from the measured motion."""
-    steps = list(_steps(trajectory, sequence))
-    if not steps:
+    steps = predicted_steps(trajectory, sequence)
+    if steps is None:
         return np.empty(0)
-    start, end, T_world_imu, transition, noise = map(np.array, zip(*steps, strict=True))
+    transition, noise = steps.predictions.transition[:, POSE], steps.predictions.noise[:, POSE, POSE]
+    if steps.beliefs.layout.velocity is not None:
+        noise = noise + _slack(trajectory, steps.dt_s)
     # In the tangent of the step's end.
-    deviation = se3_log(se3_inverse(T_world_imu) @ trajectory.T_world_imu[end])
+    deviation = se3_log(se3_inverse(steps.predictions.T_world_imu) @ trajectory.T_world_imu[steps.end])
     cov = _LUMP_FRAMES * noise
     if trajectory.cov is not None:
-        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], transition, noise)
-        cov = cov + _RESOLUTION**2 * _finite(trajectory.cov[end][:, POSE, POSE])
+        cov = cov + _taken_away(trajectory.cov[steps.start], trajectory.cov[steps.end], transition, noise)
+        cov = cov + _RESOLUTION**2 * _finite(trajectory.cov[steps.end][:, POSE, POSE])
     return mahalanobis_squared(deviation, cov)
 
 
-def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
-    for start, end, belief, dt_s, prediction in predicted_steps(trajectory, sequence):
-        noise = prediction.noise[POSE, POSE]
-        if belief.layout.velocity is not None:
-            noise = noise + np.diag(_slack(trajectory, dt_s))
-        yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
-
-
-def _slack(trajectory: Trajectory, dt_s: float) -> Array:
-    """Return the variance (6,) that corrections of velocity and biases may add to a step of the pose."""
-    slack = (_VELOCITY_SLACK * dt_s) ** 2
+def _slack(trajectory: Trajectory, dt_s: Array) -> Array:
+    """Return the covariance (S, 6, 6) that corrections of velocity and biases may add to steps of the pose (S,)."""
+    slack = (_VELOCITY_SLACK * dt_s[:, None]) ** 2
     if trajectory.v_world is None:  # without a velocity only the rotation can be compared
-        slack[3:] = 1e12
-    return slack
+        slack[:, 3:] = 1e12
+    return slack[:, None] * np.eye(6)
 
 
 def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Array) -> Array:

@@ -39,9 +39,7 @@ def test_a_consistent_correction_has_a_chi_square_length(belief, corrected):
 
 def summed(corrections):
     """Return the test of a sum of corrections."""
-    total = corrections[0]
-    for each in corrections[1:]:
-        total = total + each
+    total = Correction(sum(each.moved for each in corrections), sum(each.taken for each in corrections))
     return total.test(np.sqrt(np.diag(total.taken)))
 
 

@@ -106,6 +106,30 @@ def test_the_transition_between_a_prediction_and_its_own_start_is_the_prediction
 
 
 @each_motion
+def test_states_predicted_at_once_are_those_predicted_one_by_one(scenario):
+    """Over intervals of one sample, of two and of three, in any order."""
+    sequence, _ = recorded(scenario)
+    model, packets = motion_model(sequence.noise, sequence.gravity_world), list(sequence.packets())[1:7]
+    whole = [replace(packet.motion, **_first(packet.motion, 1 + k % 3)) for k, packet in enumerate(packets)]
+    starts = [some_belief(sequence, seed) for seed in range(len(whole))]
+    stacked = Belief(model.layout, *(np.stack([getattr(s, name) for s in starts]) for name in _ARRAYS))
+    together = stacked.predicted(model.predict_each(whole, stacked))
+    for k, (motion, start) in enumerate(zip(whole, starts, strict=True)):
+        alone = predicted(start, model, motion)
+        np.testing.assert_allclose(alone.error_to(together[k]), 0.0, atol=1e-14)
+        np.testing.assert_allclose(together[k].cov, alone.cov, rtol=1e-12, atol=1e-15)
+
+
+_ARRAYS = "T_world_imu", "v_world", "bias", "cov"
+
+
+def _first(motion, count):
+    """Return the first samples of a motion by the names of its arrays, repeated where it has fewer."""
+    names = [name for name, value in vars(motion).items() if value is not None]
+    return {name: np.resize(getattr(motion, name), (count, *getattr(motion, name).shape[1:])) for name in names}
+
+
+@each_motion
 def test_a_turn_and_a_shift_of_the_world_pass_through_first_estimates(scenario):
     """Between any two states the transition takes the gauge's error at one to the gauge's error at the other."""
     sequence, packet = recorded(scenario)

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
-from toolkit.models.corrections import Correction, CorrectionTest, PredictedStep, predicted_steps
+from toolkit.models.corrections import Correction, CorrectionTest, PredictedSteps, predicted_steps
 from toolkit.models.state import Belief
 
 ORDER = 73
@@ -66,36 +66,42 @@ def score(evaluation: Evaluation) -> Scores:
 
 def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
     """Yield the test of the summed corrections of each whole stretch."""
-    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence))
-    cov = _stated_cov(evaluation.estimate, steps)
-    total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
-    for step in steps:
-        before = replace(step.belief, cov=cov[step.start]).predicted(step.prediction)
-        correction = Correction.of(before, _answer(before, evaluation.estimate, cov, step.end))
-        total = correction if total is None else total + correction
-        taken = np.diag(correction.taken)
-        sigma2 = sigma2 + np.where(taken > _ROUNDING * np.diag(before.cov), taken, 0.0)
-        since_s += step.dt_s
-        if since_s > _STRETCH_S - 1e-6:
-            yield total.test(np.sqrt(sigma2))
-            total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
-
-
-def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:
-    """Return the covariances (N, d, d) of the whole state; raise Unavailable where they are not stated."""
-    if not steps:
+    steps = predicted_steps(evaluation.estimate, evaluation.sequence)
+    if steps is None:
         raise Unavailable("there is no measured motion between two frames with a pose")
-    layout, cov = steps[0].belief.layout, trajectory.cov
+    cov = _stated_cov(evaluation.estimate, steps)
+    before = replace(steps.beliefs, cov=cov[steps.start]).predicted(steps.predictions)
+    corrections = Correction.of(before, _answers(before, evaluation.estimate, cov, steps.end))
+    taken, variance = (np.diagonal(each, axis1=1, axis2=2) for each in (corrections.taken, before.cov))
+    sigma2 = np.where(taken > _ROUNDING * variance, taken, 0.0)
+    for rows in _stretches(steps.dt_s):
+        total = Correction(corrections.moved[rows].sum(axis=0), corrections.taken[rows].sum(axis=0))
+        yield total.test(np.sqrt(sigma2[rows].sum(axis=0)))
+
+
+def _stretches(dt_s: Array) -> Iterator[slice]:
+    """Yield the steps of each whole stretch, given their lengths (S,)."""
+    first, since_s = 0, 0.0
+    for k, each_s in enumerate(dt_s.tolist()):
+        since_s += each_s
+        if since_s > _STRETCH_S - 1e-6:
+            yield slice(first, k + 1)
+            first, since_s = k + 1, 0.0
+
+
+def _stated_cov(trajectory: Trajectory, steps: PredictedSteps) -> Array:
+    """Return the covariances (N, d, d) of the whole state; raise Unavailable where they are not stated."""
+    layout, cov = steps.beliefs.layout, trajectory.cov
     if cov is None or cov.shape[-1] != layout.size or not np.isfinite(cov).all():
         raise Unavailable("the estimator states no covariance of its whole state")
-    walked = np.mean([np.diag(step.prediction.noise) for step in steps], axis=0)[layout.biases]
+    walked = np.diagonal(steps.predictions.noise, axis1=1, axis2=2).mean(axis=0)[layout.biases]
     if (np.median(np.diagonal(cov, axis1=1, axis2=2)[:, layout.biases], axis=0) < walked).any():
         raise Unavailable("the estimator does not estimate biases, and their effect on its state has one direction")
     return cov
 
 
-def _answer(before: Belief, trajectory: Trajectory, cov: Array, row: int) -> Belief:
-    """Return a state of the trajectory as a belief; parts that it lacks are taken from the prediction."""
-    v_world = before.v_world if trajectory.v_world is None else trajectory.v_world[row]
-    bias = before.bias if trajectory.bias is None else trajectory.bias[row]
-    return Belief(before.layout, trajectory.T_world_imu[row], v_world, bias, cov[row])
+def _answers(before: Belief, trajectory: Trajectory, cov: Array, rows: IntArray) -> Belief:
+    """Return states of the trajectory as stacked beliefs; parts that it lacks are taken from the prediction."""
+    v_world = before.v_world if trajectory.v_world is None else trajectory.v_world[rows]
+    bias = before.bias if trajectory.bias is None else trajectory.bias[rows]
+    return Belief(before.layout, trajectory.T_world_imu[rows], v_world, bias, cov[rows])

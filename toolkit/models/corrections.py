@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Motion
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
@@ -46,9 +46,6 @@ class Correction:
         """Return the correction from the belief before the measurements to the one after."""
         return cls(before.error_to(after), before.cov - after.cov)
 
-    def __add__(self, other: "Correction") -> "Correction":
-        return Correction(self.moved + other.moved, self.taken + other.taken)
-
     def test(self, sigma: Array) -> CorrectionTest:
         """Test the correction, its entries in units of ``sigma`` (d,); an entry whose sigma is zero is left out."""
         per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
@@ -59,34 +56,43 @@ class Correction:
         return CorrectionTest(float((length**2 / shares[observed]).sum()), int(observed.sum()))
 
 
-def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
-    """Return a state of the trajectory as a belief; missing velocity and biases are zero, and so is the covariance."""
-    d = model.layout.size
-    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
-    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
+def belief_at(trajectory: Trajectory, rows: int | IntArray, model: MotionModel) -> Belief:
+    """Return a state of the trajectory as a belief, or several, stacked; a missing velocity or bias is zero.
+
+    The covariance is zero, because that of the trajectory may have another layout.
+    """
+    many, d = np.shape(rows), model.layout.size
+    v_world = np.zeros((*many, 3)) if trajectory.v_world is None else trajectory.v_world[rows]
+    bias = np.zeros((*many, 6)) if trajectory.bias is None else trajectory.bias[rows]
+    return Belief(model.layout, trajectory.T_world_imu[rows], v_world, bias, np.zeros((*many, d, d)))
 
 
-class PredictedStep(NamedTuple):
-    """A step between the rows ``start`` and ``end``: the state at its start, its length and the predicted motion.
+class PredictedSteps(NamedTuple):
+    """Steps between the rows ``start`` (S,) and ``end`` (S,): their lengths (S,) and, stacked, the predicted motions.
 
-    The belief has no covariance, because that of the trajectory may have another layout.
+    ``beliefs`` are the states at their starts, without covariances.
     """
 
-    start: int
-    end: int
-    belief: Belief
-    dt_s: float
-    prediction: Prediction
+    start: IntArray
+    end: IntArray
+    dt_s: Array
+    beliefs: Belief
+    predictions: Prediction
 
 
-def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
-    """Yield the steps between neighbouring frames if the trajectory has both. Its stamps must be those of frames."""
+def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> PredictedSteps | None:
+    """Return the steps between neighbouring frames of which the trajectory has both, None where there are none.
+
+    Its stamps must be those of frames.
+    """
+    intervals = list(_intervals(trajectory, sequence))
+    if not intervals:
+        return None
     model = motion_model(sequence.noise, sequence.gravity_world)
-    for start, end, motion in _intervals(trajectory, sequence):
-        belief = belief_at(trajectory, start, model)
-        prediction = model.integrate(motion, belief.bias).predict(belief)
-        yield PredictedStep(start, end, belief, float(np.sum(motion.dt_s)), prediction)
+    starts, ends, motions = zip(*intervals, strict=True)
+    start, beliefs = np.array(starts), belief_at(trajectory, np.array(starts), model)
+    dt_s = np.array([np.sum(motion.dt_s) for motion in motions])
+    return PredictedSteps(start, np.array(ends), dt_s, beliefs, model.predict_each(list(motions), beliefs))
 
 
 def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:

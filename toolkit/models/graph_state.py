@@ -11,7 +11,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.measurements import Motion, Prior
 from toolkit.models.factors import B, EliminatedGraph, V, X, constant_bias, joint_cov, joint_prior, kind_of
-from toolkit.models.state import Belief, Increment, Layout, with_velocity_turned
+from toolkit.models.state import Belief, Increment, Layout, Prediction, with_velocity_turned
 
 
 class GraphIncrement(Increment, Protocol):
@@ -33,6 +33,11 @@ class MotionModel(ABC):
     @abstractmethod
     def integrate(self, motion: Motion, bias: Array) -> GraphIncrement:
         """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
+
+    def predict_each(self, motions: list[Motion], starts: Belief) -> Prediction:
+        """Predict S >= 1 states, stacked in a belief, over an interval each; the prediction is stacked likewise."""
+        each = [self.integrate(motion, starts.bias[k]).predict(starts[k]) for k, motion in enumerate(motions)]
+        return Prediction(*(np.stack(part) for part in zip(*each, strict=True)))
 
     def initial_belief(self, prior: Prior) -> Belief:
         """Return the belief at the first frame: the prior, reduced to the blocks of the layout."""

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from toolkit.estimate import Estimate
-from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
+from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, se3_log
 from toolkit.measurements import Motion, Prior
 
 ROTATION, POSITION, POSE = slice(0, 3), slice(3, 6), slice(0, 6)
@@ -51,7 +51,7 @@ class Prediction(NamedTuple):
 
     ``T_world_imu`` (4, 4) and ``v_world`` (3,) m/s at its end; ``transition`` F (d, d) propagates an error over the
     interval and ``noise`` Q (d, d) is the covariance that the interval adds, both in the layout of the state. The
-    biases stay.
+    biases stay. Several predictions are stacked in one.
     """
 
     T_world_imu: Array
@@ -62,7 +62,10 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Pose (4, 4), velocity (3,) m/s and bias (6,) [accel, gyro] with the covariance (d, d) of the layout's error."""
+    """Pose (4, 4), velocity (3,) m/s and bias (6,) [accel, gyro] with the covariance (d, d) of the layout's error.
+
+    Several beliefs are stacked in one whose arrays have one axis more in front.
+    """
 
     layout: Layout
     T_world_imu: Array
@@ -77,6 +80,10 @@ class Belief:
         accel_bias = [] if layout.accel_bias is None else [slice(9, 12)]
         kept = np.r_[(slice(0, 6), *velocity, *accel_bias, slice(12, 15))]
         return cls(layout, prior.T_world_imu, prior.v_world, prior.bias, prior.cov[np.ix_(kept, kept)])
+
+    def __getitem__(self, rows: int | IntArray | slice) -> "Belief":
+        """Return some of stacked beliefs."""
+        return Belief(self.layout, self.T_world_imu[rows], self.v_world[rows], self.bias[rows], self.cov[rows])
 
     def moved(self, delta: Array, cov: Array) -> "Belief":
         """Return the belief moved by an error (d,), with a new covariance made exactly symmetric."""
@@ -94,21 +101,24 @@ class Belief:
         return Belief(self.layout, self.T_world_imu @ step, v_world, bias, self.cov)
 
     def error_to(self, other: "Belief") -> Array:
-        """Return the error (d,) that moves the belief's mean to another's: what :meth:`moved` takes."""
-        error, layout = np.zeros(self.layout.size), self.layout
-        error[POSE] = se3_log(se3_inverse(self.T_world_imu) @ other.T_world_imu)
+        """Return the error (..., d) that moves the belief's mean to another's: what :meth:`moved` takes."""
+        error, layout = np.zeros((*self.bias.shape[:-1], self.layout.size)), self.layout
+        error[..., POSE] = se3_log(se3_inverse(self.T_world_imu) @ other.T_world_imu)
         if layout.velocity is not None:
-            error[layout.velocity] = self.T_world_imu[:3, :3].T @ (other.v_world - self.v_world)
+            error[..., layout.velocity] = self._in_body(other.v_world - self.v_world)
         if layout.accel_bias is not None:
-            error[layout.accel_bias] = other.bias[:3] - self.bias[:3]
-        error[layout.gyro_bias] = other.bias[3:] - self.bias[3:]
+            error[..., layout.accel_bias] = other.bias[..., :3] - self.bias[..., :3]
+        error[..., layout.gyro_bias] = other.bias[..., 3:] - self.bias[..., 3:]
         return error
+
+    def _in_body(self, v_world: Array) -> Array:
+        return np.asarray((self.T_world_imu[..., :3, :3].mT @ v_world[..., None])[..., 0])
 
     def predicted(self, prediction: Prediction) -> "Belief":
         """Return the belief at the end of an interval: its mean as predicted, its covariance F P F^T + Q."""
         F, Q = prediction.transition, prediction.noise
-        cov = F @ self.cov @ F.T + Q
-        return replace(self, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world, cov=0.5 * (cov + cov.T))
+        cov = F @ self.cov @ F.mT + Q
+        return replace(self, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world, cov=0.5 * (cov + cov.mT))
 
     def at(self, estimate: Estimate) -> "Belief":
         """Return the belief at the values of an estimate; values that the estimate lacks stay."""

@@ -27,7 +27,14 @@ from toolkit.geometry import (
     se3_right_jacobian,
     skew,
 )
-from toolkit.measurements import Motion, TwistChangeNoise, TwistMotion, TwistNoise, UnmeasuredMotion
+from toolkit.measurements import (
+    Motion,
+    TwistChangeNoise,
+    TwistMotion,
+    TwistNoise,
+    UnmeasuredMotion,
+    noise_scale_of,
+)
 from toolkit.models.factors import B, V, X
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, Prediction
@@ -38,38 +45,43 @@ class TwistStep(NamedTuple):
 
     ``T_start_end`` (4, 4); ``d_step_d_bias`` (6, 3), the Jacobian of the step's end (right perturbation) to the gyro
     bias; ``cov`` (6, 6), the covariance of the step in the tangent of its end, from the noise of the twist alone;
-    ``dt_s``, the interval's length.
+    ``dt_s``, the interval's length. Of several intervals, each has one axis more in front.
     """
 
     T_start_end: Array
     d_step_d_bias: Array
     cov: Array
-    dt_s: float
+    dt_s: float | Array
 
 
 def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
-    """Integrate the twists of one interval, piece by piece, with a gyro bias (3,) rad/s subtracted."""
+    """Integrate the twists of one interval, piece by piece, with a gyro bias (3,) rad/s subtracted.
+
+    Several intervals of equally many twists are integrated at once, where all arrays have one axis more in front.
+    """
     density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
     if motion.noise_scale is not None:
-        density_squared = density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
-    dt_s = motion.dt_s[:, None]
+        density_squared = density_squared * np.repeat(motion.noise_scale[..., ::-1] ** 2, 3, axis=-1)
+    dt_s = motion.dt_s[..., None]
     pieces, d_end_d_xi = se3_exp_and_right_jacobian(
-        dt_s * np.concatenate([motion.w_radps - gyro_bias, motion.v_mps], axis=1)
+        dt_s * np.concatenate([motion.w_radps - gyro_bias[..., None, :], motion.v_mps], axis=-1)
     )
-    by_bias = -dt_s[..., None] * d_end_d_xi[:, :, :3]
-    covs = (d_end_d_xi * (dt_s * density_squared)[:, None]) @ np.swapaxes(d_end_d_xi, 1, 2)
-    T_start_end, d_step_d_bias, cov = pieces[0], by_bias[0], covs[0]
-    for piece, own_by_bias, own_cov in zip(pieces[1:], by_bias[1:], covs[1:], strict=True):
+    by_bias = -dt_s[..., None] * d_end_d_xi[..., :3]
+    covs = (d_end_d_xi * (dt_s * density_squared)[..., None, :]) @ d_end_d_xi.mT
+    (T_start_end, d_step_d_bias, cov), *others = zip(
+        *(np.moveaxis(a, -3, 0) for a in (pieces, by_bias, covs)), strict=True
+    )
+    for piece, own_by_bias, own_cov in others:
         carry = se3_adjoint(se3_inverse(piece))
         T_start_end = T_start_end @ piece
         d_step_d_bias = carry @ d_step_d_bias + own_by_bias
-        cov = carry @ cov @ carry.T + own_cov
-    return TwistStep(T_start_end, d_step_d_bias, cov, float(motion.dt_s.sum()))
+        cov = carry @ cov @ carry.mT + own_cov
+    return TwistStep(T_start_end, d_step_d_bias, cov, motion.dt_s.sum(axis=-1))
 
 
-def bias_walk_cov(noise: TwistNoise, dt_s: float) -> Array:
-    """Return the covariance (3, 3) of the gyro bias' walk over an interval."""
-    return np.diag(noise.gyro_random_walk**2 * dt_s)
+def bias_walk_cov(noise: TwistNoise, dt_s: float | Array) -> Array:
+    """Return the covariance (..., 3, 3) of the gyro bias' walk over intervals (...) s."""
+    return np.asarray(dt_s)[..., None, None] * np.diag(noise.gyro_random_walk**2)
 
 
 def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFactor:
@@ -100,7 +112,7 @@ def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFa
     return gtsam.CustomFactor(noise, [X(k - 1), X(k), B(k - 1)], residual)
 
 
-def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float, k: int) -> gtsam.NonlinearFactor:
+def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float | Array, k: int) -> gtsam.NonlinearFactor:
     """Return the random walk of the gyro bias from B(k - 1) to B(k), both (3,)."""
     covariance = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(noise, dt_s))
     return gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), covariance)
@@ -108,20 +120,21 @@ def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float, k: int) -> gtsam.Nonli
 
 @dataclass(frozen=True, eq=False)
 class TwistIncrement:
-    """The step between two frames and the gyro bias (3,) it was integrated about."""
+    """The step between two frames, or several, and the gyro bias (..., 3) it was integrated about."""
 
     step: TwistStep
     gyro_bias: Array
     noise: TwistNoise
 
     def predict(self, start: Belief) -> Prediction:
-        """Predict a state over the interval."""
+        """Predict a state over the interval, or one over each."""
         size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
-        transition, noise = np.eye(size), np.zeros((size, size))
-        transition[POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
-        transition[POSE, gyro_bias] = self.step.d_step_d_bias
-        noise[POSE, POSE] = self.step.cov
-        noise[gyro_bias, gyro_bias] = bias_walk_cov(self.noise, self.step.dt_s)
+        transition, noise = np.zeros((2, *self.step.cov.shape[:-2], size, size))
+        transition[..., POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
+        transition[..., POSE, gyro_bias] = self.step.d_step_d_bias
+        transition[..., gyro_bias, gyro_bias] = np.eye(3)
+        noise[..., POSE, POSE] = self.step.cov
+        noise[..., gyro_bias, gyro_bias] = bias_walk_cov(self.noise, self.step.dt_s)
         return Prediction(start.T_world_imu @ self.step.T_start_end, start.v_world, transition, noise)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
@@ -149,7 +162,25 @@ class TwistModel(MotionModel):
     def integrate(self, motion: Motion, bias: Array) -> TwistIncrement:
         """Integrate the twists between two frames about a bias (6,), of which only the gyro's part is used."""
         assert isinstance(motion, TwistMotion)
-        return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
+        return TwistIncrement(integrate(motion, bias[..., 3:], self._noise), bias[..., 3:], self._noise)
+
+    def predict_each(self, motions: list[Motion], starts: Belief) -> Prediction:
+        """Predict S stacked states over an interval each, at once over those of equally many twists."""
+        counts = np.array([motion.dt_s.size for motion in motions])
+        order = np.argsort(counts, kind="stable")
+        alike = np.split(order, np.flatnonzero(np.diff(counts[order])) + 1)
+        parts = [
+            self.integrate(_stacked([motions[k] for k in rows]), starts.bias[rows]).predict(starts[rows])
+            for rows in alike
+        ]
+        return Prediction(*(np.concatenate(part)[np.argsort(order)] for part in zip(*parts, strict=True)))
+
+
+def _stacked(motions: list[Motion]) -> TwistMotion:
+    """Return intervals of equally many twists as one, with the axis of the intervals in front."""
+    twists = [motion for motion in motions if isinstance(motion, TwistMotion)]
+    each = [(motion.dt_s, motion.v_mps, motion.w_radps, noise_scale_of(motion)) for motion in twists]
+    return TwistMotion(*(np.stack(part) for part in zip(*each, strict=True)))
 
 
 _VELOCITY, _TURN = slice(6, 9), slice(9, 12)
