@@ -98,7 +98,7 @@ def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_checked(scene, visla
 def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
     Path("results/lap\x1b[31m.tum").write_text("spoilt")
     Path("results/maze/\x1b]0;0.tum").write_text("spoilt")
-    assert failures(vislam) == [("maze", "sequence", "missing")]
+    assert failures(vislam) == [("maze", "run", "regressed")]
     assert "\x1b" not in capsys.readouterr().out
 
 

@@ -1,12 +1,18 @@
 """Trajectories as people have them: a table of what is given and what must come of it (2 s)."""
 
+import gzip
+import json
+from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from toolkit.datasets.trajectories import kitti
+from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import read_evaluation
-from toolkit.geometry import Array, about_z, rotation_from_quaternion, se3, so3_exp
+from toolkit.geometry import Array, about_z, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp, so3_exp
 
 S = 10**9
 POINT = np.zeros(3)
@@ -50,3 +56,281 @@ def test_a_body_with_other_axes_is_named_and_only_its_positions_are_scored(scene
     scene.write("s.tum", t_ns, poses @ np.linalg.inv(T_truth_body))
     assert vislam("evaluate", "truth.tum", "s.tum", "--out", "again", "--quiet") == 0
     assert metrics_of("again")[0]["ate_se3_deg"] < 2.0
+
+
+def rows(t_ns: Array, poses: Array, row: str) -> str:
+    """Lines of poses as a format says: t, x y z, qx qy qz qw, i the number of the row, n the stamp in nanoseconds."""
+    quaternions = quaternion_from_rotation(poses[:, :3, :3])
+    lines = []
+    for i, (t, p, q) in enumerate(zip(t_ns.tolist(), poses[:, :3, 3].tolist(), quaternions.tolist(), strict=True)):
+        named = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*p, *q), strict=True))
+        lines.append(row.format(i=i, n=t, t=f"{t / S:.9f}", **named))
+    return "\n".join(lines) + "\n"
+
+
+TUM = "{t} {x:.9f} {y:.9f} {z:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}"
+COMMAS, QUATERNION = "{x:.9f},{y:.9f},{z:.9f}", "{qx:.9f},{qy:.9f},{qz:.9f},{qw:.9f}"
+W_FIRST = "{qw:.9f},{qx:.9f},{qy:.9f},{qz:.9f}"
+ROS = ",".join(f"field.pose.position.{axis}" for axis in "xyz")
+
+
+@pytest.mark.parametrize(
+    ("heading", "row"),
+    [
+        ("num, t, x, y, z, qx, qy, qz, qw", f"{{i}},{{t}},{COMMAS},{QUATERNION}"),
+        ("index, timestamp [ns], x, y, z, qx, qy, qz, qw", f"{{i}},{{n}},{COMMAS},{QUATERNION}"),
+        ("timestamp,tx,ty,tz,qw,qx,qy,qz", f"{{t}},{COMMAS},{W_FIRST}"),
+        ("#timestamp [s],p_x [m],p_y [m],p_z [m],q_x,q_y,q_z,q_w", f"{{t}},{COMMAS},{QUATERNION}"),
+        ("# time x y z qw qx qy qz", TUM.replace("{qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}", W_FIRST.replace(",", " "))),
+        ("timestamp tx ty tz qx qy qz qw", TUM),
+        ("t;qw;qx;qy;qz;px;py;pz", f"{{t}},{W_FIRST},{COMMAS}".replace(",", ";")),
+        (
+            f"%time,field.header.seq,{ROS},{ROS.replace('position', 'orientation')},field.pose.orientation.w",
+            f"{{n}},{{i}},{COMMAS},{QUATERNION}",
+        ),
+        ("# timestamp x y z qx qy qz qw", TUM),
+        ("", TUM),
+    ],
+)
+def test_columns_are_read_by_their_names(scene, vislam, heading: str, row: str) -> None:
+    t_ns = scene.stamps(10.0)
+    Path("s.csv").write_text(f"{heading}\n" * bool(heading) + rows(t_ns, scene.estimated(t_ns, 0.07), row))
+    assert vislam("evaluate", "truth.tum", "s.csv", "--out", "out", "--quiet") == 0
+    metrics = metrics_of()[0]
+    assert metrics["pairs"] == 600
+    assert metrics["ate_se3_m"] == pytest.approx(0.07 * np.sqrt(3.0), rel=0.1)
+    assert metrics["ate_se3_deg"] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("row", "heading"),
+    [
+        (TUM[: TUM.index("{qx")] + "0 0 0 1", ""),
+        (TUM[: TUM.index("{qx")] + "0 0 0 0", ""),
+        (TUM[: TUM.index("{qx")] + "nan nan nan nan", ""),
+        ("{t} {x:.9f} {y:.9f} {z:.9f}", ""),
+        (f"{{t}},{COMMAS}", ""),
+        (f"{{n}},{COMMAS}", "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]"),
+        (f"{{t}},{COMMAS},0.01,0.01,0.02,4", "t,x,y,z,sx,sy,sz,status"),
+    ],
+)
+def test_a_truth_of_positions_alone_scores_positions_and_nothing_else(scene, vislam, row: str, heading: str) -> None:
+    t_ns = scene.stamps(2.0)
+    Path("truth.tum").write_text(f"{heading}\n" * bool(heading) + rows(t_ns, scene.poses_at(t_ns), row))
+    for name in ("s", "results/truth"):
+        scene.write(f"{name}.tum", scene.stamps(10.0), scene.estimated(scene.stamps(10.0), 0.07))
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+    metrics, notes = metrics_of()
+    assert metrics["ate_se3_m"] == pytest.approx(0.07 * np.sqrt(3.0), rel=0.15)
+    assert all(metrics[key] is None for key in OF_ORIENTATION)
+    assert "the truth is of positions alone" in notes["ate_se3_deg"]
+    assert vislam("baseline", "--trajectories", "results", "--truth", "truth=truth.tum", "--out", "b.json") == 0
+    assert list(json.loads(Path("b.json").read_text())["bounds"]) == ["ate_se3_m"]
+    assert vislam("check", "--baseline", "b.json", "--trajectories", "results") == 0
+
+
+def test_the_point_of_an_antenna_is_named_where_it_explains_more_than_a_clock(scene, vislam) -> None:
+    """On a loop that is no circle: on one, an antenna ahead of the body is the body a little later."""
+    t_ns, point, time_s = scene.stamps(10.0), np.array([0.4, -0.3, 0.8]), np.arange(600) / 10.0
+    angles = np.stack([0.5 * np.sin(1.3 * time_s), 0.4 * np.cos(0.9 * time_s), 2.0 * np.sin(0.5 * time_s)], axis=1)
+    at = np.stack([9.0 * np.sin(0.2 * time_s), 6.0 * np.sin(0.31 * time_s), np.sin(0.7 * time_s)], axis=1)
+    body = se3(so3_exp(angles), at)
+    estimate = body @ se3_exp(0.005 * np.random.default_rng(0).standard_normal((600, 6)))
+    scene.write("s.tum", t_ns, scene.own_world @ estimate)
+    Path("truth.tum").write_text(rows(t_ns, body @ se3(np.eye(3), point), "{t} {x:.9f} {y:.9f} {z:.9f}"))
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+    note = metrics_of()[1]["ate_se3_m"]
+    found = np.array(note.partition("at the point (")[2].partition(")")[0].split(","), dtype=float)
+    np.testing.assert_allclose(found, point, atol=0.005)
+    # A late truth is the clock's.
+    scene.write("truth.tum", t_ns + 80_000_000, body)
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "late", "--quiet") == 0
+    assert "its stamps shifted by 79.9 +- 0.2 ms" in metrics_of("late")[1]["clock_offset_ms"]
+    assert "point" not in metrics_of("late")[1].get("ate_se3_m", "")
+
+
+def test_lines_of_a_truth_that_hold_no_pose_are_left_out_and_counted(scene, vislam, capsys) -> None:
+    lines = Path("truth.tum").read_text().splitlines()
+    for at, values in ((7, " nan" * 7), (8, " 1 2 3 0 0 0 0")):
+        lines[at] = lines[at].split()[0] + values
+    Path("truth.tum").write_text("\n".join(lines) + "\n")
+    scene.write("s.tum", scene.stamps(10.0), scene.estimated(scene.stamps(10.0), 0.07))
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out") == 0
+    assert "left out of the truth: 2 of 1200 lines hold a value that is not finite" in capsys.readouterr().out
+
+
+def test_control_points_are_few_and_far_apart(scene, vislam) -> None:
+    t_ns = scene.stamps(1.0 / 45.0, 5.0, 300.0)
+    Path("truth.tum").write_text(rows(t_ns, scene.poses_at(t_ns), "{t} {x:.9f} {y:.9f} {z:.9f}"))
+    scene.write("s.tum", scene.stamps(10.0, 0.0, 300.0), scene.estimated(scene.stamps(10.0, 0.0, 300.0), 0.05))
+    for start in (0, t_ns[0]):
+        Path("truth.tum").write_text(rows(t_ns - start, scene.poses_at(t_ns), "{t} {x:.9f} {y:.9f} {z:.9f}"))
+        ours = scene.stamps(10.0, 0.0, 300.0)
+        scene.write("s.tum", ours - start, scene.estimated(ours, 0.05))
+        assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+        assert metrics_of()[0]["pairs"] == 7
+
+
+def test_poses_of_kitti_have_the_stamps_beside_them(scene, vislam) -> None:
+    t_ns = scene.stamps(10.0)
+    Path("poses.txt").write_text(kitti.text(Trajectory(t_ns, scene.poses_at(t_ns))))
+    scene.write("s.tum", t_ns[::3] - t_ns[0], scene.estimated(t_ns[::3], 0.07))
+    assert vislam("evaluate", "poses.txt", "s.tum", "--quiet") == 3
+    Path("times.txt").write_text("".join(f"{(t - t_ns[0]) / S:e}\n" for t in t_ns.tolist()))
+    assert vislam("evaluate", "poses.txt", "s.tum", "--out", "out", "--quiet") == 0
+    assert metrics_of()[0]["pairs"] == 200
+
+
+def test_gzipped_trajectories_are_read(tree) -> None:
+    for path in (*Path("results").rglob("*.tum"), *Path("truths").iterdir()):
+        Path(f"{path}.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
+    runs = read_evaluation(Path("out/evaluation.json")).runs
+    assert {(run.sequence, run.run) for run in runs} == {(f"S{s}", str(r)) for s in range(7) for r in range(3)}
+
+
+def sorted_lines(lines: list[str]) -> list[str]:
+    return sorted(lines, key=lambda line: float(line.split()[0]))
+
+
+def without(lines: list[str], field: int) -> list[str]:
+    return [" ".join(cells[:field] + cells[field + 1 :]) for cells in (line.split() for line in lines)]
+
+
+def scaled(lines: list[str], factor: float) -> list[str]:
+    """Multiply the stamps, exactly."""
+    return [f"{Decimal(t) * Decimal(str(factor))} {rest}" for t, _, rest in (line.partition(" ") for line in lines)]
+
+
+def moved(lines: list[str], start: int, end: int) -> list[str]:
+    cells = [line.split() for line in lines]
+    for one in cells:
+        one.insert(end, one.pop(start))
+    return [" ".join(one) for one in cells]
+
+
+def poses_of(lines: list[str]) -> tuple[Array, Array]:
+    table = np.array([line.split()[1:8] for line in lines], dtype=float)
+    return table[:, :3], rotation_from_quaternion(table[:, 3:])
+
+
+def rewritten(lines: list[str], poses: Array) -> list[str]:
+    """Return the lines with other poses on their stamps."""
+    stamps_ns = np.array([int(Decimal(line.split()[0]) * S) for line in lines])
+    return rows(stamps_ns, poses, TUM).splitlines()
+
+
+def once(lines: list[str]) -> list[str]:
+    return list(dict.fromkeys(lines))
+
+
+def conjugated(lines: list[str]) -> list[str]:
+    positions, rotations = poses_of(lines)
+    return rewritten(lines, se3(np.swapaxes(rotations, 1, 2), positions))
+
+
+def backwards(lines: list[str]) -> list[str]:
+    positions, rotations = poses_of(lines)
+    return rewritten(lines, se3(rotations, positions)[::-1])
+
+
+# What spoils the lines of a sound file, the advice, and what somebody does who follows it, step by step.
+Lines = Callable[[list[str]], list[str]]
+ADVICE: list[tuple[Lines, list[tuple[str, Lines]]]] = [
+    (lambda lines: lines[:100] + lines[99:], [("remove what is there twice", once)]),
+    (
+        lambda lines: lines[:120] + lines[110:],
+        [("sort the file by time", sorted_lines), ("(and 9 more do); remove", once)],
+    ),
+    (lambda lines: lines[::-1], [("sort the file by time", sorted_lines)]),
+    (
+        lambda lines: [*lines[:50], lines[49].split()[0] + " " + lines[50].partition(" ")[2], *lines[50:]],
+        [("keep one of the two", lambda lines: lines[:50] + lines[51:])],
+    ),
+    (
+        lambda lines: [*lines[:50], lines[50].split()[0] + " nan" * 7, *lines[51:]],
+        [("line 51 holds a value that is not finite; remove the line", lambda lines: lines[:50] + lines[51:])],
+    ),
+    (
+        lambda lines: [f"{i} {line}" for i, line in enumerate(lines)],
+        [("the first column is the number of the row, and stamps come first; remove it", lambda x: without(x, 0))],
+    ),
+    (lambda lines: scaled(lines, 1e3), [("milliseconds: divide by 1e3", lambda lines: scaled(lines, 1e-3))]),
+    (lambda lines: scaled(lines, 1e6), [("microseconds: divide by 1e6", lambda lines: scaled(lines, 1e-6))]),
+    (lambda lines: scaled(lines, 1e9), [("nanoseconds: divide by 1e9", lambda lines: scaled(lines, 1e-9))]),
+    (lambda lines: moved(lines, 7, 4), [("move the fifth column to the end", lambda lines: moved(lines, 4, 7))]),
+    (
+        conjugated,
+        [("conjugate them", conjugated)],
+    ),
+    (
+        backwards,
+        [("write them in the order of their stamps", backwards)],
+    ),
+    (
+        lambda lines: rewritten(lines, se3(poses_of(lines)[1], 1e3 * poses_of(lines)[0])),
+        [("divide its positions by 1000", lambda x: rewritten(x, se3(poses_of(x)[1], 1e-3 * poses_of(x)[0])))],
+    ),
+    (
+        lambda lines: [f"{Decimal(line.split()[0]) - 1_700_000_000} {line.partition(' ')[2]}" for line in lines],
+        [(
+            "add 1700000000.000 s",
+            lambda x: [f"{Decimal(line.split()[0]) + 1_700_000_000} {line.partition(' ')[2]}" for line in x],
+        )],
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("of", range(len(ADVICE)))
+def test_who_follows_an_advice_has_a_file_that_is_read(scene, vislam, capsys, of: int) -> None:
+    spoil, steps = ADVICE[of]
+    t_ns = scene.stamps(10.0, 0.0, 40.0)
+    lines = spoil(rows(t_ns, scene.poses_at(t_ns) @ se3_exp(noise(t_ns.size)), TUM).splitlines())
+    for advice, follow in steps:
+        Path("s.tum").write_text("\n".join(lines) + "\n")
+        assert vislam("evaluate", "truth.tum", "s.tum", "--quiet") == 3
+        assert advice in capsys.readouterr().err
+        lines = follow(lines)
+    Path("s.tum").write_text("\n".join(lines) + "\n")
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+    assert metrics_of()[0]["ate_se3_deg"] < 1.0
+
+
+def noise(count: int) -> Array:
+    return np.random.default_rng(1).standard_normal((count, 6)) * np.repeat([0.001, 0.05], 3)
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda t: f"{int(t)}.000000", "40 different stamps, of no digits behind the point"),
+        (lambda t: f"{t:e}", "1 different stamps, of 7 significant digits"),
+        (lambda t: f"{int(t)}.5", "40 different stamps, of 1 digits behind the point"),
+    ],
+)
+def test_stamps_of_too_few_digits_are_told_to_be_and_not_to_be_sorted(scene, vislam, capsys, write, words) -> None:
+    t_ns = scene.stamps(10.0, 0.0, 40.0)
+    lines = rows(t_ns, scene.poses_at(t_ns), TUM).splitlines()
+    cut = [f"{write(float(t))} {rest}" for t, _, rest in (line.partition(" ") for line in lines)]
+    Path("s.tum").write_text("\n".join(cut) + "\n")
+    assert vislam("evaluate", "truth.tum", "s.tum", "--quiet") == 3
+    assert words in capsys.readouterr().err
+
+
+def test_a_run_that_ends_in_nan_is_one_that_failed_and_the_others_are_compared(scene, vislam, capsys) -> None:
+    t_ns = scene.stamps(10.0)
+    for run in range(6):
+        for folder in ("base", "now"):
+            scene.write(f"{folder}/truth/{run}.tum", t_ns, scene.estimated(t_ns, 0.1, run))
+    assert vislam("baseline", "--trajectories", "base", "--truth", "truth=truth.tum", "--out", "b.json") == 0
+    broken = Path("now/truth/3.tum")
+    lines = broken.read_text().splitlines()
+    broken.write_text("\n".join(line if i < 300 else line.split()[0] + " nan" * 7 for i, line in enumerate(lines)))
+    capsys.readouterr()
+    assert vislam("check", "--baseline", "b.json", "--trajectories", "now") == 1
+    printed = capsys.readouterr().out
+    assert "1 of 6 runs failed: now/truth/3.tum: 301 of 600 lines hold a value that is not finite" in printed
+    assert "(29.9 s after the first to the end)" in printed
+    assert "missing" not in printed
+    assert "the gate fails: of 5 comparisons" in printed

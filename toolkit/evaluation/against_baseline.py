@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct, to_builtins
+from msgspec import Meta, Struct, structs, to_builtins
 
 from toolkit.errors import DataError, no_such, one_line, printable
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
@@ -29,8 +29,12 @@ from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.geometry import Array
 
 Align = Literal["se3", "yaw", "sim3"]
+# The scores of a run by metric, or why it has none.
+Scored = Mapping[str, float | None] | str
 # Growth of an error that is no regression (percent), and loss of time coverage that is accepted (percentage points).
 BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
+# Failed runs whose reasons are told.
+_NAMED = 3
 # In the place of a sequence's name, where all of them are judged together.
 EVERYWHERE = "all sequences"
 
@@ -48,6 +52,12 @@ class SequenceRecord(Struct, frozen=True, kw_only=True):
         for key, values in self.scores.items():
             if len(values) != len(self.files):
                 raise ValueError(f"scores.{key} does not have an entry a file")
+
+
+class CheckedRuns(SequenceRecord, frozen=True, kw_only=True):
+    """The runs of a sequence in a check, where one that failed has no scores; ``failed`` says why, by its file."""
+
+    failed: dict[str, str]
 
 
 class TrajectoryBaselineRecord(Struct, frozen=True, kw_only=True):
@@ -141,7 +151,8 @@ class FolderOfRuns:
     def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
         """Score the files of a sequence; the truth is where it is given, or else where the baseline had it.
 
-        ``before`` is what the baseline has of it. Raises DataError where there is no file, or one cannot be used.
+        ``before`` is what the baseline has of it; beside it a file that cannot be used is a run that failed. Raises
+        DataError where there is no file, or none can be used, or one cannot of which a baseline is made.
         """
         files = self._files.get(sequence, ())
         if not files:
@@ -153,14 +164,13 @@ class FolderOfRuns:
             raise DataError(f"its truth is not at {path}, where the baseline had it; name another place with --truth")
         truth = read_truth(sequence, path)
         _check_truth(path.as_posix(), truth.digest, before)
-        by_file = [score_file(file, truth, Terms(gap_s=gap_s)).values for file in files]
-        return SequenceRecord(
-            sequence=sequence,
-            truth=path.as_posix(),
-            truth_hash=truth.digest,
-            files=tuple(str(file.relative_to(self.folder)) for file in files),
-            scores={key: tuple(one[key] for one in by_file) for key in scored_metrics(align)},
-        )
+        by_file: dict[str, Scored] = {}
+        for file in files:
+            try:
+                by_file[str(file.relative_to(self.folder))] = score_file(file, truth, Terms(gap_s=gap_s)).values
+            except DataError as error:
+                by_file[str(file.relative_to(self.folder))] = printable(one_line(str(error)))
+        return _record(sequence, (path.as_posix(), truth.digest), by_file, align, before)
 
     @cached_property
     def _files(self) -> dict[str, tuple[Path, ...]]:
@@ -182,7 +192,7 @@ class EvaluatedRuns:
         return tuple(self._runs)
 
     def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
-        """Return the scores of a sequence's runs; raises DataError where one failed, or they were scored otherwise."""
+        """Return the scores of a sequence's runs; raises DataError as a folder does, or where they have other terms."""
         terms = self._record.terms
         if terms.max_dt_s is not None:
             raise DataError(f"{self.path}: it pairs nearest poses; evaluate again without --max-dt")
@@ -192,18 +202,13 @@ class EvaluatedRuns:
         runs = self._runs.get(sequence, ())
         if not runs:
             raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
-        failed = next((run for run in runs if run.status != "ok"), None)
-        if failed is not None:
-            raise DataError(f"{failed.run} failed: {failed.log[0]}")
         truth = next(one for one in self._record.sequences if one.sequence == runs[0].sequence)
         _check_truth(truth.truth, truth.truth_hash, before)
-        return SequenceRecord(
-            sequence=sequence,
-            truth=truth.truth,
-            truth_hash=truth.truth_hash,
-            files=tuple(run.file or run.run for run in runs),
-            scores={key: tuple(run.metrics.get(key) for run in runs) for key in scored_metrics(align)},
-        )
+        by_file: dict[str, Scored] = {
+            run.file or run.run: run.metrics if run.status == "ok" else f"{run.run} failed: {run.log[0]}"
+            for run in runs
+        }
+        return _record(sequence, (truth.truth, truth.truth_hash), by_file, align, before)
 
     @cached_property
     def _record(self) -> EvaluationRecord:
@@ -216,6 +221,22 @@ class EvaluatedRuns:
         for run in self._record.runs:
             found.setdefault(f"{run.estimator}/{run.sequence}" if several else run.sequence, []).append(run)
         return found
+
+
+def _record(
+    sequence: str, truth: tuple[str, str], by_file: Mapping[str, Scored], align: Align, before: SequenceRecord | None
+) -> SequenceRecord:
+    """Return the scores of a sequence's runs, or why there are none, by file; ``truth`` is its place and its hash.
+
+    Raises DataError where all failed, or any where a baseline is made of them.
+    """
+    failed = {file: why for file, why in by_file.items() if isinstance(why, str)}
+    if failed and (before is None or len(failed) == len(by_file)):
+        raise DataError(next(iter(failed.values())))
+    keys = scored_metrics(align)
+    values = {key: tuple(None if isinstance(one, str) else one.get(key) for one in by_file.values()) for key in keys}
+    record = SequenceRecord(sequence=sequence, truth=truth[0], truth_hash=truth[1], files=tuple(by_file), scores=values)
+    return record if before is None else CheckedRuns(**structs.asdict(record), failed=failed)
 
 
 # Runs of a system on sequences, in a folder or scored before.
@@ -231,15 +252,18 @@ def new_trajectory_baseline(
     given: GivenRuns, align: Align, gap_s: float, made_by: Mapping[str, str], bound_percent: float = BOUND_PERCENT
 ) -> TrajectoryBaselineRecord:
     """Score every run there is; raises DataError for the first that cannot be used."""
+    sequences = tuple(given.scored(sequence, align, gap_s, None) for sequence in given.sequences)
+    # What has no value, as orientations beside a truth of positions, has no bound either.
+    valued = {key for one in sequences for key, values in one.scores.items() if any(v is not None for v in values)}
     return TrajectoryBaselineRecord(
         schema="vislam.trajectory-baseline/1",
         made_by=dict(made_by),
         align=align,
         gap_s=gap_s,
-        bounds={key: bound_percent for key in scored_metrics(align) if key != TIME_COVERAGE},
+        bounds={key: bound_percent for key in scored_metrics(align) if key in valued - {TIME_COVERAGE}},
         coverage_points=COVERAGE_POINTS,
         false_alarm_rate=FALSE_ALARM_RATE,
-        sequences=tuple(given.scored(sequence, align, gap_s, None) for sequence in given.sequences),
+        sequences=sequences,
     )
 
 
@@ -262,7 +286,11 @@ def check_trajectories(
         except DataError as error:
             verdicts.append(_verdict(before, "sequence", "missing", printable(one_line(str(error)))))
             continue
-        verdicts += _missing(before, now, (*baseline.bounds, TIME_COVERAGE))
+        failed = now.failed if isinstance(now, CheckedRuns) else {}
+        if failed:
+            words = f"{len(failed)} of {len(now.files)} runs failed: {'; '.join(list(failed.values())[:_NAMED])}"
+            verdicts.append(_verdict(before, "run", "regressed", words))
+        verdicts += _missing(before, now, (*baseline.bounds, TIME_COVERAGE), _names(failed))
         verdicts += _coverage(before, now, baseline.coverage_points)
         for key, percent in baseline.bounds.items():
             was, is_ = _known(before.scores[key]), _known(now.scores[key])
@@ -302,8 +330,13 @@ def _other_rule(sequence: str, was: Array, is_: Array) -> Iterator[str]:
         yield f"{sequence}: {left}, too few to test; they are held to the bound instead"
 
 
-def _missing(before: SequenceRecord, now: SequenceRecord, keys: Iterable[str]) -> Iterator[Verdict]:
-    """Fail where a run of the baseline is not there by its file's name, or has no value where it had one."""
+def _missing(
+    before: SequenceRecord, now: SequenceRecord, keys: Iterable[str], failed: "Counter[str]"
+) -> Iterator[Verdict]:
+    """Fail where a run of the baseline is not there by its file's name, or has no value where it had one.
+
+    Those that ``failed`` are told by themselves.
+    """
     had, has = _names(before.files), _names(now.files)
     missing, new = had - has, has - had
     if missing:
@@ -312,7 +345,7 @@ def _missing(before: SequenceRecord, now: SequenceRecord, keys: Iterable[str]) -
             words += f"; {_listed(new)} not in it: a run has the name of a file of the baseline"
         yield _verdict(before, "run", "missing", words)
     for key in keys:
-        lost = _with_value(before, key) - missing - _with_value(now, key)
+        lost = _with_value(before, key) - missing - failed - _with_value(now, key)
         if lost:
             words = f"{_listed(lost)} without a value any more, of {len(before.files)} runs in the baseline"
             yield _verdict(before, key, "missing", words)

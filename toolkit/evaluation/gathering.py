@@ -13,6 +13,7 @@ from toolkit.errors import DataError, printable
 from toolkit.files.reading import unreadable
 
 SUFFIXES = (".tum", ".txt", ".csv")
+_ZIPPED = ".gz"
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
 
 def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:
     """Return an item for each file, and for each that is missing of ``runs``."""
-    there = [Item(system, sequence, printable(file.stem), file) for file in files]
+    there = [Item(system, sequence, _name(file), file) for file in files]
     return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(runs - len(there))]
 
 
@@ -158,7 +159,12 @@ def _existing(path: Path) -> Path:
 
 
 def _name(path: Path) -> str:
-    return printable(path.stem)
+    return printable(_unzipped(path).stem)
+
+
+def _unzipped(path: Path) -> Path:
+    """Return what a gzipped file is called without that, or the path itself."""
+    return path.with_suffix("") if path.suffix == _ZIPPED else path
 
 
 def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
@@ -168,13 +174,15 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
     found: dict[str, tuple[Path, ...]] = {}
     for path in _entries(folder):
         files = trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
-        name = printable(path.name if path.is_dir() else path.stem)
+        name = printable(path.name) if path.is_dir() else _name(path)
         if files and name in found:
             raise DataError(f"{folder}: {name} is given twice, as {found[name][0].name} and {path.name}; keep one")
         if files:
             found[name] = files
     if not found:
-        raise DataError(f"{folder}: no SEQUENCE.tum and no SEQUENCE/RUN.tum in it ({', '.join(SUFFIXES)} are read)")
+        raise DataError(
+            f"{folder}: no SEQUENCE.tum and no SEQUENCE/RUN.tum in it ({', '.join(SUFFIXES)} are read, gzipped too)"
+        )
     return found
 
 
@@ -191,4 +199,4 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def _is_file(path: Path) -> bool:
-    return path.is_file() and path.suffix in SUFFIXES and not path.name.startswith(".")
+    return path.is_file() and _unzipped(path).suffix in SUFFIXES and not path.name.startswith(".")

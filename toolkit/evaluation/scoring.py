@@ -10,7 +10,7 @@ applications to tracking and navigation" (2001), section 5.4.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -27,8 +27,9 @@ from toolkit.datasets.trajectories.belonging import (
     other_axes,
     range_s,
 )
-from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order
+from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order, read_finite_poses, read_rows
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
@@ -37,6 +38,7 @@ from toolkit.metrics.parts.against_truth import (
     AgainstTruth,
     Matched,
     PairsAgainstTruth,
+    changes,
     distance_along,
     median_period_ns,
     place_first,
@@ -98,6 +100,8 @@ _LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s afte
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Of the hash of a truth: significant digits that are hashed, hexadecimal digits that are kept.
 _DIGITS, _LENGTH = 9, 16
+# Where KITTI has the stamps of poses.
+_TIMES = "times.txt"
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _NONE = "the file states no covariance"
@@ -131,10 +135,11 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class TruthFile(Poses):
-    """The truth of a sequence; its stamps are its lines where it has none."""
+    """The truth of a sequence; its stamps are its lines where it has none, ``left_out`` are lines without a pose."""
 
     name: str
     is_timed: bool
+    left_out: str = ""
 
     @property
     def digest(self) -> str:
@@ -158,14 +163,29 @@ class TruthFile(Poses):
 
 
 def read_truth(name: str, path: Path) -> TruthFile:
-    """Read the truth of a sequence; raises DataError where it is none, or holds fewer than two poses."""
-    file = read_poses(path)
+    """Read the truth of a sequence, without the lines that hold no finite pose.
+
+    Raises DataError where it is none, or holds fewer than two poses.
+    """
+    file = _with_times(read_finite_poses(path))
     if len(file) < 2:
         raise DataError(f"{path}: a truth of {len(file)} pose; give at least two")
-    if file.other_order is not None:
+    if file.other_order is not None and changes(file.T_world_imu[:, :3, :3]):
         check_order(path, file.T_world_imu, file.other_order)
     t_ns = _lines_ns(len(file)) if file.t_ns is None else file.t_ns
-    return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None)
+    return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None, file.not_finite)
+
+
+def _with_times(file: PosesFile) -> PosesFile:
+    """Return the poses with the stamps of KITTI's times.txt, where a file has none and it as many lines."""
+    folder = file.path.parent
+    places = (folder / _TIMES, folder.parent / "sequences" / file.path.stem / _TIMES)
+    times = next(filter(is_regular, places), None)
+    if file.t_ns is not None or times is None:
+        return file
+    rows = read_rows(times, "times.txt has a stamp in seconds for each pose")
+    as_many = len(rows.cells) == len(file) and rows.width == 1
+    return replace(file, t_ns=rows.stamps(NS_PER_S)) if as_many else file
 
 
 def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
@@ -175,6 +195,8 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     length, order of quaternions or number of lines is named.
     """
     file = read_poses(path)
+    if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
+        file = _with_times(file)
     estimate = _stamped(file, truth, terms.offset_s)
     turn = _checked(file, estimate, truth)
     matched = _matched(estimate, truth, terms.max_dt_s)
@@ -187,18 +209,22 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
         scores = scores.without(
             _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {other_axes(turn)}"
         )
-    if _changes(matched.estimate[:, :3, 3]) and not _changes(matched.truth[:, :3, 3]):
+    if changes(matched.estimate[:, :3, 3]) and not changes(matched.truth[:, :3, 3]):
         scores = scores.remarked(_OF_POSITIONS, _STANDS)
     scores = _with_the_estimates_own(scores, matched)
-    return scores.remarked([_PAIRS.key], _how_matched(estimate, truth, terms.max_dt_s))
+    paired = (
+        _how_matched(estimate, truth, terms.max_dt_s),
+        truth.left_out and f"left out of the truth: {truth.left_out}",
+    )
+    return scores.remarked([_PAIRS.key], "; ".join(filter(None, paired)))
 
 
 def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
     """Remark on an estimate that never moves or turns while the truth does, and on one that leaps."""
     truth, estimate = matched.truth, matched.estimate
-    if _changes(truth[:, :3, 3]) and not _changes(estimate[:, :3, 3]):
+    if changes(truth[:, :3, 3]) and not changes(estimate[:, :3, 3]):
         return scores.remarked(_OF_POSITIONS, _STAYS)
-    if _changes(truth[:, :3, :3]) and not _changes(estimate[:, :3, :3]):
+    if changes(truth[:, :3, :3]) and not changes(estimate[:, :3, :3]):
         scores = scores.remarked(_OF_ORIENTATIONS, _LOOKS_ONE_WAY)
     true_m, step_m = (np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (truth, estimate))
     leaps = (step_m > true_m + _LEAST_LEAP_M) & (step_m > _TIMES_USUAL * np.median(step_m))
@@ -209,17 +235,15 @@ def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
     return scores.remarked(_OF_POSITIONS, _LEAPS.format(int(leaps.sum()), step_m[row], at_s))
 
 
-def _changes(values: Array) -> bool:
-    """Say whether values (n, ...) change at all."""
-    return bool(np.ptp(values, axis=0).max() > 0.0)
-
-
 def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
     """Return the poses on their stamps, or on the truth's where the file has no stamps but as many lines."""
     if file.t_ns is not None and truth.is_timed:
         return Poses(file.path, file.t_ns + round(offset_s * NS_PER_S), file.T_world_imu)
     if file.t_ns is not None:
-        raise DataError(f"{truth.path}: it has no stamps, and {file.path} has; give both with stamps or both without")
+        raise DataError(
+            f"{truth.path}: it has no stamps, and {file.path} has; put {_TIMES} with a stamp in seconds for each pose "
+            "beside it, or give both without stamps"
+        )
     if len(file) != len(truth.poses):
         what = f"{file.path}: {len(file)} lines without stamps, and the truth has {len(truth.poses)} poses"
         raise DataError(f"{what}; write a pose for each, or a format with stamps")

@@ -4,12 +4,15 @@ Reading a pipe may wait forever, and a device may never end.
 """
 
 import errno
+import gzip
 import stat
+import zlib
 from pathlib import Path
 from typing import BinaryIO
 
 from toolkit.errors import DataError, printable
 
+GZIP_MAGIC = b"\x1f\x8b"
 _KINDS = (
     (stat.S_ISDIR, "it is a directory; name a file"),
     (stat.S_ISFIFO, "it is a pipe; write it to a regular file first"),
@@ -46,13 +49,24 @@ def read_input(path: Path) -> bytes:
             raise DataError(unreadable(path, error)) from error
 
 
+def read_unzipped(path: Path) -> bytes:
+    """Return the content of a regular file, plain or gzipped; raises DataError as :func:`open_input`, or of damage."""
+    content = read_input(path)
+    if not content.startswith(GZIP_MAGIC):
+        return content
+    try:
+        return gzip.decompress(content)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path}: damaged or truncated gzip ({error}); copy it again") from error
+
+
 def read_text_input(path: Path, kind: str) -> str:
-    """Return the text of a regular file in UTF-8, which ``kind`` describes in the error where it is something else.
+    """Return the text of a regular file in UTF-8, plain or gzipped; ``kind`` describes it in the error.
 
     Raises DataError as :func:`open_input` does, or where the bytes are no such text.
     """
     try:
-        return read_input(path).decode("utf-8-sig").replace("\r\n", "\n")
+        return read_unzipped(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not a text file; {kind}") from error
 

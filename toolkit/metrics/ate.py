@@ -3,6 +3,7 @@
 import numpy as np
 
 from toolkit.geometry import Array
+from toolkit.metrics.clock_offset import other_point
 from toolkit.metrics.parts.against_truth import (
     AgainstTruth,
     Alignment,
@@ -83,7 +84,7 @@ def score(evaluation: AgainstTruth) -> Scores:
             "ate_se3_m": lambda: position_rmse(evaluation.compared, evaluation.se3_alignment),
             "ate_yaw_m": lambda: position_rmse(evaluation.compared, fit_yaw(*evaluation.compared.positions)),
             "ate_sim3_m": lambda: position_rmse(evaluation.compared, fit_sim3(*evaluation.compared.positions)),
-            "ate_se3_deg": lambda: rotation_rmse_deg(evaluation.compared, evaluation.se3_alignment),
+            "ate_se3_deg": lambda: rotation_rmse_deg(evaluation.oriented, evaluation.se3_alignment),
         }
     )
     if scores.values["ate_se3_m"] is not None and not evaluation.se3_alignment.rotation_is_unique:
@@ -91,6 +92,8 @@ def score(evaluation: AgainstTruth) -> Scores:
     if (scale := _telling_scale(evaluation, scores)) is not None:
         unit = "".join(f", as if in {name}" for name, metres in _LENGTHS.items() if abs(scale / metres - 1.0) < 0.02)
         return scores.remarked(["ate_se3_m", "ate_yaw_m"], _SCALED.format(scores.values["ate_sim3_m"], scale, unit))
+    if scores.values["ate_se3_m"] is not None and (point := other_point(evaluation)) is not None:
+        return scores.remarked(["ate_se3_m", "ate_yaw_m"], point)
     tilt_deg = _telling_tilt_deg(evaluation, scores)
     if tilt_deg is None:
         return scores

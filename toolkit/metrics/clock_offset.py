@@ -3,7 +3,8 @@
 A constant offset of two clocks displaces each position along its velocity. It is fitted together with the alignment
 that ATE fits, as in Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems"
 (IROS 2013), section III, with the truth's positions in the place of a spline of them. A clock that runs fast displaces
-them increasingly; its rate is fitted in the same way, from the middle of the recording outwards.
+them increasingly; its rate is fitted in the same way, from the middle of the recording outwards. Positions of another
+point of the body, as of a prism or an antenna, are displaced along its axes, which is fitted likewise.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, skew
+from toolkit.geometry import Array, BoolArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics.parts.against_truth import AgainstTruth, Matched, fit_se3, lengths, rmse
@@ -57,6 +58,14 @@ _REMARK = (
 )
 
 
+# A point of the body is reported if with it positions fit this many times as well as without, and as with any offset.
+_TIMES_NEARER, _FEWEST_OF_A_POINT, _SETTLED_M = 2.0, 6, 1e-6
+_POINT_REMARK = (
+    "at the point ({2:.3f}, {3:.3f}, {4:.3f}) m of its body its positions fit the truth's to {0:.3g} m in place of "
+    "{1:.3g} m: the truth is of another point, as of a prism, an antenna or a camera"
+)
+
+
 class _Fit(NamedTuple):
     """An offset and its standard error (s), and the RMS distance of positions without it and with it (m)."""
 
@@ -96,7 +105,7 @@ def score(evaluation: AgainstTruth) -> Scores:
     scores = Scores({OFFSET: 1e3 * fit.offset_s, ERROR: 1e3 * fit.error_s})
     if (rate := _rate(evaluation, fit)) is not None:
         return scores.remarked([OFFSET], _RATE_REMARK.format(*rate))
-    if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s):
+    if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s) or other_point(evaluation) is not None:
         return scores
     remark = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
     return scores.remarked([OFFSET], remark)
@@ -135,6 +144,41 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
             error_s = jackknife_error(lambda *some: float(_clock_step(*some)[0]), *at, constant)
             return _Fit(offset_s, error_s, before_m, rmse(lengths(at.error_m)))
     raise Unavailable("the fit of the offset did not converge")
+
+
+def other_point(evaluation: AgainstTruth) -> str | None:
+    """Return the remark on a truth of another point of the body; None where that explains no more than a clock does.
+
+    Gauss-Newton over the turn of the world and the point, positions less their means.
+    """
+    pairs = evaluation.compared
+    if len(pairs) < _FEWEST_OF_A_POINT:
+        return None
+    true, estimated = (positions - positions.mean(axis=0) for positions in pairs.positions)
+    try:
+        alignment = evaluation.se3_alignment
+    except Unavailable:
+        return None
+    R_truth_body, point_m = alignment.rotation @ pairs.estimate[:, :3, :3], np.zeros(3)
+    moved, world = estimated @ alignment.rotation.T, np.eye(3)
+    before_m = rmse(lengths(true - moved))
+    for _ in range(_ITERATIONS):
+        arms = world @ (R_truth_body - R_truth_body.mean(axis=0))
+        at = moved @ world.T + arms @ point_m
+        jacobian = np.concatenate([-skew(at), arms], axis=2).reshape(-1, 6)
+        step = np.linalg.lstsq(jacobian, (true - at).ravel(), rcond=_LEAST_LEFT)[0]
+        world, point_m = so3_exp(step[:3]) @ world, point_m + step[3:]
+        if np.linalg.norm(step) < _SETTLED_M:
+            break
+    after_m = rmse(lengths(true - moved @ world.T - world @ (R_truth_body - R_truth_body.mean(axis=0)) @ point_m))
+    if not _TIMES_NEARER * after_m < before_m:
+        return None
+    try:
+        if _TIMES_NEARER * after_m > _fit(evaluation).after_m:
+            return None
+    except Unavailable:
+        pass
+    return _POINT_REMARK.format(after_m, before_m, *point_m)
 
 
 def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:

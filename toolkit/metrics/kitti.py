@@ -40,7 +40,7 @@ def score(evaluation: AgainstTruth) -> Scores:
 
 def _errors_per_m(evaluation: AgainstTruth) -> tuple[Array, Array]:
     """Return translation (s,) m/m and rotation (s,) deg/m of every segment."""
-    matched = evaluation.compared
+    matched = evaluation.oriented
     starts = np.arange(0, len(matched), START_EVERY)
     first, length_m = (grid.ravel() for grid in np.meshgrid(starts, SEGMENT_LENGTHS_M, indexing="ij"))
     last = np.searchsorted(matched.path_m, matched.path_m[first] + length_m, side="right")

@@ -63,7 +63,7 @@ def score(evaluation: AgainstTruth) -> Scores:
         {
             "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
             "rpe_1s_deg": lambda: rmse(angles_deg(errors_of_a_second()[:, :3, :3])),
-            "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.compared),
+            "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.oriented),
         }
     )
 
@@ -75,7 +75,7 @@ def hundred_metres_percent(matched: Matched) -> float:
 
 
 def _errors_of_a_second(evaluation: AgainstTruth) -> Array:
-    return relative_errors(evaluation.compared, *_one_second(evaluation.compared))
+    return relative_errors(evaluation.oriented, *_one_second(evaluation.oriented))
 
 
 def _one_second(matched: Matched) -> _Intervals:

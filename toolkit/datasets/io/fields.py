@@ -43,8 +43,10 @@ _MOST_DIGITS, _DECIMALS = 10, 9
 _USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 # Stamps are finer than this; single precision is not, from 10 000 s on.
 _COARSE_S = 9e-4
-# No recording has a sample only every half minute.
-_LONGEST_STEP_S = 30.0
+# Stamps are farther apart only where a few places are visited, and no such visits are hours apart.
+_LONGEST_STEP_S, _LONGEST_VISIT_S = 30.0, 3600.0
+# Seconds of the years 2005 to 2035, and a recording that would be shorter in another unit is of seconds.
+_TODAY_S, _SHORTEST_S = (1.1e9, 2.05e9), 1.0
 _UNITS = (
     (1e-9, "nanoseconds: divide by 1e9"),
     (1e-6, "microseconds: divide by 1e6"),
@@ -237,13 +239,22 @@ def probable_unit(stamps_s: Array) -> str | None:
 
 
 def _unit_of(stamps_s: Array) -> tuple[float, str] | None:
-    """Return the unit that stamps (N,) are probably in, in seconds, and its name; None where seconds are plausible."""
-    largest = float(np.abs(stamps_s).max(initial=0.0))
+    """Return the unit that stamps (N,) are probably in, in seconds, and its name; None where seconds are plausible.
+
+    Seconds of today are, however far apart: control points are visited every few minutes. So are stamps that span too
+    little for another unit: seven of them 45 apart are no recording of a quarter of a second.
+    """
+    largest, least = (float(np.abs(end(stamps_s))) if stamps_s.size else 0.0 for end in (np.max, np.min))
     step = float(np.median(np.abs(np.diff(stamps_s)))) if stamps_s.size > 1 else 0.0
     if largest < _LATEST_S and step < _LONGEST_STEP_S:
         return None
+    if _TODAY_S[0] < least <= largest < _TODAY_S[1] and step < _LONGEST_VISIT_S:
+        return None
     # The size of absolute stamps shows their unit (the epoch began 1.3e9 to 1.8e9 s ago), the step of relative ones.
-    return next((one for one in _UNITS if largest * one[0] > 1e8 or step * one[0] > 1e-3), _UNITS[-1])
+    unit = next((one for one in _UNITS if largest * one[0] > 1e8 or step * one[0] > 1e-3), _UNITS[-1])
+    spans_s = unit[0] * float(np.ptp(stamps_s)) if stamps_s.size else 0.0
+    is_short = stamps_s.size > 1 and largest < _LATEST_S and step < _LONGEST_VISIT_S and spans_s < _SHORTEST_S
+    return None if is_short else unit
 
 
 def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:

@@ -20,12 +20,11 @@ import numpy.typing as npt
 
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
 from toolkit.errors import DataError, nearest, printable
-from toolkit.files.reading import is_regular, open_input, read_input, read_text_input
+from toolkit.files.reading import GZIP_MAGIC, is_regular, open_input, read_text_input, read_unzipped
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 
 _LONGEST_LINE = 1 << 16
-_GZIP_MAGIC = b"\x1f\x8b"
 SECONDS, NANOSECONDS = "t", "t_ns"
 _SEPARATORS = (",", ";", "\t")
 _LARGEST = 2**63 - 1
@@ -41,7 +40,7 @@ def first_line(path: Path) -> bytes:
     """Return the first line of a table, or nothing where it cannot be read."""
     try:
         with open_input(path) as raw:
-            zipped = raw.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+            zipped = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
         with gzip.open(path) if zipped else path.open("rb") as stream:
             return stream.readline(_LONGEST_LINE)
     except (DataError, OSError, EOFError, zlib.error):
@@ -70,11 +69,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
 
 def _read_whole(path: Path) -> bytes:
     """Return the content of a table, plain or gzipped; raises DataError where it cannot be read or is damaged."""
-    content = read_input(path).removeprefix(codecs.BOM_UTF8)
-    try:
-        return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise DataError(f"{path}: damaged or truncated gzip ({error}); copy it again") from error
+    return read_unzipped(path).removeprefix(codecs.BOM_UTF8)
 
 
 def _first_sentence(error: ValueError) -> str:

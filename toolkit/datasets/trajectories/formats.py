@@ -11,14 +11,15 @@ to the world.
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from toolkit.datasets.io.fields import exact_ns, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.trajectories.headings import Named, named_columns
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.files.reading import read_text_input
@@ -30,6 +31,8 @@ _UNIT_TOLERANCE = 1e-2
 _TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
 # A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
 _IDENTITY_TOLERANCE = 1e-2
+# Share of the rows that have the stamp of the one before, from which on stamps have too few digits.
+_MOST_OF_ONE_STAMP = 0.2
 # Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
 _VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.9, 0.1
 
@@ -42,7 +45,8 @@ class Rows:
     """What a table in a text file holds: the number and the cells of each line that is not empty or a comment.
 
     There is at least one line; ``commas`` is True where commas separate the cells, and not blanks; ``underscored``
-    where a cell has an underscore, for Python takes 1_0 for ten and no other program does.
+    where a cell has an underscore, for Python takes 1_0 for ten and no other program does. ``heading`` are the names of
+    the columns, where a line above the first row has as many words as that has cells.
     """
 
     path: Path
@@ -50,6 +54,7 @@ class Rows:
     cells: list[list[str]]
     commas: bool
     underscored: bool = False
+    heading: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:
@@ -95,19 +100,25 @@ def read_rows(path: Path, kind: str) -> Rows:
     """
     text = read_text_input(path, kind)
     lines = text.splitlines()
+    comments = [line.lstrip("#% ") for line in lines if line.startswith(("#", "%"))]
     if "#" in text:
         lines = [line.partition("#")[0] for line in lines]
+    lines = ["" if line.startswith("%") else line for line in lines]
     last = next((line for line in reversed(lines) if line and not line.isspace()), "")
-    commas = "," in last
-    cells = [_between_commas(line) for line in lines] if commas else [line.split() for line in lines]
+    separator = next((mark for mark in ",;" if mark in last), None)
+    cells = [_between(line, separator) for line in lines] if separator else [line.split() for line in lines]
     line_numbers = [n for n, of_line in enumerate(cells, start=1) if of_line]
     cells = [of_line for of_line in cells if of_line]
-    if commas and not _is_number(cells[0][0]):
+    headings = [_between(line, separator) if separator else line.split() for line in comments]
+    if cells and not _is_number(cells[0][0]) and (separator or named_columns(cells[0]) is not None):
+        headings.append(cells[0])
         line_numbers, cells = line_numbers[1:], cells[1:]
     if not cells:
         raise DataError(f"{path}: the file holds no poses; {kind}")
+    headings = [one for one in headings if len(one) == len(cells[0]) and named_columns(one) is not None]
+    heading = tuple(headings[-1]) if headings else ()
     underscored = "_" in text and any("_" in line for line in lines)
-    return Rows(path, line_numbers, cells, commas, underscored)
+    return Rows(path, line_numbers, cells, separator is not None, underscored, heading)
 
 
 def stamp_text(t_ns: int) -> str:
@@ -116,10 +127,10 @@ def stamp_text(t_ns: int) -> str:
     return f"{sign}{seconds}.{rest_ns:09d}"
 
 
-def _between_commas(line: str) -> list[str]:
-    """Split a line, which has no cells where it is empty; some programs end theirs with a comma."""
+def _between(line: str, separator: str) -> list[str]:
+    """Split a line, which has no cells where it is empty; some programs end theirs with a separator."""
     stripped = line.strip()
-    return [cell.strip() for cell in stripped.removesuffix(",").split(",")] if stripped else []
+    return [cell.strip() for cell in stripped.removesuffix(separator).split(separator)] if stripped else []
 
 
 def _number(cell: str) -> float:
@@ -172,7 +183,8 @@ class PosesFile:
     """The poses (N, 4, 4) of a trajectory file, their stamps (N,) ns, and how its quaternions might be misread.
 
     Stamps are None where the format has none, and the order where it has no quaternions. ``covariances`` are those of
-    the orientation and of the position, where the file has them.
+    the orientation and of the position, where the file has them. Orientations are all the identity where it has none.
+    ``not_finite`` says which lines are left out, because they hold no finite pose.
     """
 
     path: Path
@@ -181,9 +193,16 @@ class PosesFile:
     T_world_imu: Array
     other_order: OtherOrder | None
     covariances: StatedApart | None = None
+    not_finite: str = ""
 
     def __len__(self) -> int:
         return len(self.T_world_imu)
+
+    def whole(self) -> "PosesFile":
+        """Return the file; raises DataError where a line of it holds no finite pose."""
+        if self.not_finite:
+            raise DataError(f"{self.path}: {self.not_finite}")
+        return self
 
 
 class TrajectoryFormat(Protocol):
@@ -241,19 +260,23 @@ class Stamped:
                 f"{rows.path}: in a {self.name} file the columns ({self.columns}) are separated by {separators}"
             )
         table = rows.numbers(max(rows.width, self._width) if self.may_go_on else self._width, self.columns)
-        t_ns = self._stamps(rows, table[:, 0])
         pose = [1 + self.order.index(column) for column in range(7)]
         # A view where nothing is moved: a copy lies in another order, in which sums may differ in the last bit.
         values = table[:, 1:8] if pose == [*range(1, 8)] else table[:, pose]
-        T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, values)
-        stated = StatedApart(_symmetric(table[:, 8:14]), _symmetric(table[:, 14:20])) if self.has_covariances else None
-        return PosesFile(rows.path, self.name, t_ns, T_world_imu, self.other_order, stated)
+        file = _stamped_poses(rows, self._stamps(rows, table), values, self.name)
+        kept = ... if len(file) == len(table) else np.isfinite(values).all(axis=1)
+        stated = (
+            StatedApart(_symmetric(table[kept, 8:14]), _symmetric(table[kept, 14:20])) if self.has_covariances else None
+        )
+        return replace(file, other_order=self.other_order, covariances=stated)
 
-    def _stamps(self, rows: Rows, stamps: Array) -> IntArray:
+    def _stamps(self, rows: Rows, table: Array) -> IntArray:
+        """Return the stamps of rows (N,) ns; raises DataError naming a wrong unit, or stamps of too few digits."""
+        _check_digits(rows, table)
         if self.unit_ns == NS_PER_S:
-            stamps_ns(rows.path, "time", stamps)  # names a wrong unit
+            stamps_ns(rows.path, "time", table[:, 0])  # names a wrong unit
             return rows.stamps(self.unit_ns)
-        t_ns, unit = rows.stamps(self.unit_ns), probable_unit_of_ns(stamps)
+        t_ns, unit = rows.stamps(self.unit_ns), probable_unit_of_ns(table[:, 0])
         if unit is not None:
             is_tum = unit.startswith("seconds") and rows.width == self._width
             hint = "; a TUM file has blanks between its columns" if is_tum else ""
@@ -262,7 +285,7 @@ class Stamped:
 
     def read(self, path: Path, kind: str | None = None) -> Trajectory:
         """Read a file; ``kind`` describes it in the error where that fails. Raises DataError as :meth:`parse` does."""
-        poses = self.parse(read_rows(path, kind or f"a {self.name} file is text, one pose a line"))
+        poses = self.parse(read_rows(path, kind or f"a {self.name} file is text, one pose a line")).whole()
         assert poses.t_ns is not None
         return Trajectory(poses.t_ns, poses.T_world_imu)
 
@@ -366,8 +389,13 @@ _OPENVINS_RECORDED = Stamped(
     other_order=openvins.other_order,
     has_covariances=True,
 )
+_POSITIONS_ALONE = "t x y z"
+_MISNAMED = OtherOrder(-1, "w first", f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
 FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
-_KIND = f"there are {', '.join(f'{name} ({one.columns})' for name, one in FORMATS.items())}"
+_KIND = (
+    f"there are {', '.join(f'{name} ({one.columns})' for name, one in FORMATS.items())}, positions "
+    f"({_POSITIONS_ALONE}), and tables whose heading names their columns"
+)
 
 
 def read_poses(path: Path) -> PosesFile:
@@ -377,38 +405,162 @@ def read_poses(path: Path) -> PosesFile:
     not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
     only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
     """
+    return read_finite_poses(path).whole()
+
+
+def read_finite_poses(path: Path) -> PosesFile:
+    """Read a file as :func:`read_poses`, and leave lines out that hold no finite pose, as of a truth with gaps."""
     rows = read_rows(path, _KIND)
-    for one in (_OPENVINS_RECORDED, *FORMATS.values()):
-        if one.recognises(rows):
-            with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
+    named = named_columns(rows.heading) if rows.heading else None
+    with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
+        if named is not None and not _is_usual(named, rows):
+            return _by_name(rows, named)
+        if rows.width == len(_POSITIONS_ALONE.split()):
+            return _by_name(rows, Named(0, None, (1, 2, 3), ()))
+        if _begins_with_row_numbers(rows):
+            raise DataError(f"{path}: the first column is the number of the row, and stamps come first; remove it")
+        for one in (_OPENVINS_RECORDED, *FORMATS.values()):
+            if one.recognises(rows):
                 return one.parse(rows)
     kind = "separated by commas" if rows.commas else "separated by blanks"
     raise DataError(f"{path}: {rows.width} columns {kind} are no format that is known; {_KIND}")
 
 
-def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: Array) -> Array:
+def _is_usual(named: Named, rows: Rows) -> bool:
+    """Say whether columns that have names are where a format has them that needs no names."""
+    begin = (named.stamp, *named.position)
+    if begin == (0, 1, 2, 3) and rows.commas and named.quaternion == (5, 6, 7, 4):
+        return named.unit_ns == 1 or (named.unit_ns is None and _unit_ns(rows.numbers(rows.width, "t")[:, 0]) == 1)
+    if begin == (0, 1, 2, 3) and not rows.commas and named.quaternion == (4, 5, 6, 7):
+        return rows.width == 1 + len(tum.order)
+    if named.quaternion or rows.width < 1 + len(tum.order):
+        return False
+    # Names that are not known may be those of a quaternion.
+    unknown = rows.numbers(rows.width, ", ".join(rows.heading))[0, 4:8]
+    return bool(np.abs(np.linalg.norm(unknown) - 1.0) < _UNIT_TOLERANCE)
+
+
+def _by_name(rows: Rows, named: Named) -> PosesFile:
+    """Return the poses in columns that names say, or the positions alone; raises DataError as a format does."""
+    table = rows.numbers(rows.width, ", ".join(rows.heading) or _POSITIONS_ALONE)
+    _check_digits(rows, table, named.stamp)
+    stamps, unit_ns = table[:, named.stamp], named.unit_ns
+    if unit_ns is None:
+        unit_ns = _unit_ns(stamps)
+    if unit_ns == NS_PER_S:
+        stamps_ns(rows.path, "time", stamps)
+    t_ns = replace(rows, cells=[[cells[named.stamp]] for cells in rows.cells]).stamps(unit_ns)
+    turns = table[:, named.quaternion] if named.quaternion else np.tile([0.0, 0.0, 0.0, 1.0], (len(table), 1))
+    kind = "columns by name" if named.quaternion else "positions alone"
+    file = _stamped_poses(rows, t_ns, np.hstack([table[:, named.position], turns]), kind)
+    return replace(file, other_order=_MISNAMED) if named.quaternion else file
+
+
+def _unit_ns(stamps: Array) -> int:
+    """Return the unit of stamps (N,) whose name says none: seconds, as TUM has them, or nanoseconds, as ROS does."""
+    return 1 if (probable_unit(stamps) or "").startswith("nanoseconds") else NS_PER_S
+
+
+def _begins_with_row_numbers(rows: Rows) -> bool:
+    """Say whether the first column counts the rows, and the second increases as stamps do."""
+    try:
+        first, second = np.array([[float(cell) for cell in cells[:2]] for cells in rows.cells]).T
+    except ValueError:
+        return False
+    return bool(len(first) > 1 and first[0] in (0.0, 1.0) and (np.diff(first) == 1.0).all() and second.min() > 1e8)
+
+
+def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> PosesFile:
+    """Return checked poses of rows (N, 7), those left out that are not known."""
+    kept = _known(values)
+    numbers = [n for n, is_kept in zip(rows.line_numbers, kept.tolist(), strict=True) if is_kept]
+    if not numbers:
+        raise DataError(f"{rows.path}: no line holds a position that is finite; write it again")
+    not_finite = "" if kept.all() else _lines_unknown(rows.line_numbers, t_ns, values)
+    T_world_imu = checked_poses(rows.path, numbers, t_ns[kept], values[kept])
+    return PosesFile(rows.path, kind, t_ns[kept], T_world_imu, None, None, not_finite)
+
+
+def _lines_unknown(numbers: list[int], t_ns: IntArray, values: Array) -> str:
+    """Say which lines hold no pose that is known, and when that is."""
+    bad = np.flatnonzero(~_known(values))
+    what = "a quaternion of zeros" if np.isfinite(values[bad]).all() else "a value that is not finite"
+    if bad.size == 1:
+        return f"line {numbers[bad[0]]} holds {what}; remove the line"
+    first_s, last_s = ((t_ns[row] - t_ns[0]) / NS_PER_S for row in (bad[0], bad[-1]))
+    end = "the end" if bad[-1] == len(numbers) - 1 else f"{last_s:.1f} s"
+    lines = f"{bad.size} of {len(numbers)} lines hold {what}, from line {numbers[bad[0]]} to {numbers[bad[-1]]}"
+    return f"{lines} ({first_s:.1f} s after the first to {end})"
+
+
+def _known(values: Array) -> BoolArray:
+    """Say which rows (N, 7) hold a pose: a finite position, and a quaternion where any row states one."""
+    stated = _states_a_turn(values)
+    known = np.isfinite(values[:, :3]).all(axis=1)
+    return np.asarray(known & stated if stated.any() else known)
+
+
+def _states_a_turn(values: Array) -> BoolArray:
+    return np.asarray(np.isfinite(values[:, 3:]).all(axis=1) & values[:, 3:].any(axis=1))
+
+
+def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: Array, row: str = "line") -> Array:
     """Return the poses (N, 4, 4) of rows (N, 7), x y z in metres and a Hamilton quaternion x y z w.
 
-    Raises DataError, naming the line, where a value is not finite, time does not increase or a quaternion is not
-    of unit length.
+    Where no row states a quaternion, because all are zero or NaN, the orientations are the identity. Raises DataError,
+    naming the ``row``, where a value is not finite, time does not increase or a quaternion is not of unit length.
     """
+    if not _states_a_turn(values).any():
+        values = np.hstack([values[:, :3], np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))])
     checks = (
-        (np.isfinite(values).all(axis=1), "holds a value that is not finite; remove the line"),
+        (np.isfinite(values).all(axis=1), f"holds a value that is not finite; remove the {row}"),
         (np.abs(values[:, :3]).max(axis=1, initial=0.0) < FARTHEST_M, _TOO_FAR),
-        (np.diff(t_ns, prepend=t_ns[:1] - 1) > 0, "is not later than the line before it; sort the file by time"),
+        *_increasing(t_ns, values),
         (
             np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < _UNIT_TOLERANCE,
             "has a quaternion that is not of unit length; check the order of the columns",
         ),
     )
-    _check_lines(path, line_numbers, checks)
+    _check_lines(path, line_numbers, checks, row)
     return se3(rotation_from_quaternion(values[:, 3:]), values[:, :3])
 
 
-def _check_lines(path: Path, line_numbers: list[int], checks: Iterable[tuple[BoolArray | np.bool, str]]) -> None:
+def _increasing(t_ns: IntArray, values: Array) -> Iterator[tuple[BoolArray, str]]:
+    """Yield the checks of time: stamps that fall, poses that are there twice, and poses of one stamp."""
+    step_ns = np.diff(t_ns, prepend=t_ns[:1] - 1)
+    again = np.append(False, (values[1:] == values[:-1]).all(axis=1)) & (step_ns == 0)
+    yield step_ns >= 0, "is earlier than the one before it; sort the file by time"
+    repeated = f" (and {int(again.sum()) - 1} more do)" if again.sum() > 1 else ""
+    yield ~again, f"repeats the one before it{repeated}; remove what is there twice"
+    yield step_ns != 0, "has the stamp of the one before it, and another pose; keep one of the two"
+
+
+def _check_digits(rows: Rows, table: Array, stamp: int = 0) -> None:
+    """Raise DataError where many rows have the stamp of the one before and another pose: it has too few digits."""
+    cells = [of_line[stamp] for of_line in rows.cells]
+    same = np.diff(table[:, stamp]) == 0.0
+    if not (same & (np.diff(table, axis=0) != 0.0).any(axis=1)).sum() > _MOST_OF_ONE_STAMP * len(cells):
+        return
+    if any("e" in cell.lower() for cell in cells):
+        digits = max(len(cell.lower().partition("e")[0].replace(".", "").lstrip("-")) for cell in cells)
+        few = f"{digits} significant digits"
+    elif (table[:, stamp] % 1.0 == 0.0).all():
+        few = f"no digits behind the point that differ from 0 ({cells[0]})"
+    else:
+        few = f"{max(len(cell.partition('.')[2].rstrip('0')) for cell in cells)} digits behind the point"
+    distinct = np.unique(table[:, stamp]).size
+    raise DataError(
+        f"{rows.path}: its {len(cells)} lines have {distinct} different stamps, of {few}; write all digits of them, as "
+        "%.9f does for seconds"
+    )
+
+
+def _check_lines(
+    path: Path, numbers: list[int], checks: Iterable[tuple[BoolArray | np.bool, str]], row: str = "line"
+) -> None:
     for passed, complaint in checks:
         if not passed.all():
-            raise DataError(f"{path}: line {line_numbers[int(np.argmin(passed))]} {complaint}")
+            raise DataError(f"{path}: {row} {numbers[int(np.argmin(passed))]} {complaint}")
 
 
 def _symmetric(upper: Array) -> Array:

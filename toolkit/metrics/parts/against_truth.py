@@ -232,13 +232,25 @@ class AgainstTruth:
         return self.matched
 
     @cached_property
+    def oriented(self) -> Matched:
+        """The matched pairs, where the true orientations are known.
+
+        Raises Unavailable where they are all one and the estimated ones are not, as of a truth that is of positions
+        alone: a prism's, an antenna's. A measured orientation does not repeat itself exactly.
+        """
+        pairs = self.compared
+        if len(pairs) > 2 and not changes(pairs.truth[:, :3, :3]) and changes(pairs.estimate[:, :3, :3]):
+            raise Unavailable("the truth is of positions alone: its orientations are all one")
+        return pairs
+
+    @cached_property
     def placed(self) -> Array:
         """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
 
         Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
         and position of the first pose are aligned; without one, the whole first pose is.
         """
-        pairs = self.compared
+        pairs = self.oriented
         return place_first(pairs.truth[0], pairs.estimate[0], self.level).apply(pairs.estimate)
 
     @cached_property
@@ -263,6 +275,11 @@ class PairsAgainstTruth(AgainstTruth):
     def level(self) -> bool:
         """Whether the vertical is measured."""
         return self.is_level
+
+
+def changes(values: Array) -> bool:
+    """Say whether values (n, ...) change at all."""
+    return bool(np.ptp(values, axis=0).max() > 0.0)
 
 
 def relative_errors(matched: Matched, first: IntArray, last: IntArray) -> Array:

@@ -179,6 +179,8 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
     rows = usable[reached]
     if not rows.size:
         raise Unavailable(NOT_MET)
+    if len(evaluation.matched) > 1:
+        evaluation.oriented  # noqa: B018 - raises where the truth is of positions alone
     poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
     if placed:
         if rows[0] != 0:

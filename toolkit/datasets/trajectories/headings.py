@@ -1,0 +1,77 @@
+"""Which columns of a table are its stamps, positions and quaternions, by the names that its heading gives them.
+
+Programs name them alike but for words around the axis: ``qx``, ``q_RS_x``, ``quat_x``, ``field.pose.orientation.x``.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+_UNITS_NS = {
+    "ns": 1, "nsec": 1, "nsecs": 1, "nanosec": 1, "nanoseconds": 1, "us": 1_000, "usec": 1_000, "microseconds": 1_000,
+    "ms": 1_000_000, "msec": 1_000_000, "milliseconds": 1_000_000, "s": 10**9, "sec": 10**9, "secs": 10**9,
+    "seconds": 10**9,
+}  # fmt: skip
+# The last word of a name but for its unit.
+_STAMPS = ("t", "time", "timestamp", "stamp", "ts", "sec", "secs", "seconds", "nsec", "ns")
+_POSITIONS = ("", "p", "pos", "position", "t", "trans", "translation", "location", "xyz")
+_QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rot", "rotation")
+_IN_BRACKETS, _BETWEEN_WORDS = re.compile(r"[\[(](.*?)[\])]"), re.compile(r"[^a-z0-9]+")
+
+
+class Named(NamedTuple):
+    """The columns of a table from 0, quaternions x y z w; ``unit_ns`` is that of the stamps where their name says it.
+
+    A table of positions alone has no quaternions.
+    """
+
+    stamp: int
+    unit_ns: int | None
+    position: tuple[int, ...]
+    quaternion: tuple[int, ...]
+
+
+def named_columns(names: Sequence[str]) -> Named | None:
+    """Return the columns that names say; None where they name no stamp, or not each axis of a position once."""
+    words = [_words(name) for name in names]
+    stamps = [
+        at for at, of_name in enumerate(words) if of_name and _stem(of_name)[-1:] and _stem(of_name)[-1] in _STAMPS
+    ]
+    position = _axes(words, "xyz", _POSITIONS)
+    if not stamps or len(position) != 3:
+        return None
+    at = stamps[0]
+    in_brackets = _IN_BRACKETS.search(names[at])
+    unit = (in_brackets[1].strip().lower() if in_brackets else "") or words[at][-1]
+    return Named(at, _UNITS_NS.get(unit), position, _axes(words, "xyzw", _QUATERNIONS))
+
+
+def _words(name: str) -> list[str]:
+    """Return the words of a name, without units in brackets, in small letters; the axis is a word of its own."""
+    plain = _IN_BRACKETS.sub("", name).strip().strip("#%").lower()
+    return [word for word in _BETWEEN_WORDS.split(plain) if word]
+
+
+def _stem(words: list[str]) -> list[str]:
+    """Return the words but for a unit behind the name of a stamp."""
+    return words[:-1] if len(words) > 1 and words[-1] in _UNITS_NS else words
+
+
+def _axes(words: list[list[str]], axes: str, kinds: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the columns of the axes of a quantity called one of several names; nothing where one is missing."""
+    for kind in kinds:
+        found = [[at for at, of_name in enumerate(words) if _is_axis(of_name, axis, kind)] for axis in axes]
+        if all(found):
+            return tuple(columns[0] for columns in found)
+    return ()
+
+
+def _is_axis(words: list[str], axis: str, kind: str) -> bool:
+    """Say whether a name is that of an axis: ``x``, ``px``, ``p_x``, ``p_RS_R_x``, ``pose.position.x``, ``x_m``."""
+    if words[-1:] == ["m"] and len(words) > 1:
+        words = words[:-1]
+    if not words or not words[-1].endswith(axis):
+        return False
+    if len(words) == 1 or words[-1] != axis:
+        return words[-1] == f"{kind}{axis}"
+    return bool(kind) and (kind in words[:-1])
