@@ -8,10 +8,10 @@ al. (2017), as in `strides`.
 
 The measured motion integrated over strides of several frames, its residuals at states at their ends, and its noise.
 
-The samples of an IMU are preintegrated; twists are chained, with an unknown rotation of their velocities. The
-derivatives by the biases are difference quotients; for biases of usual size the integrals are linear in them. Source:
-Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry" (2017),
-section VI.
+The samples of an IMU are preintegrated as for the estimators (`models.imu`). Twists are chained, with an unknown
+rotation of their velocities, and their derivatives by it and by the gyro's bias are difference quotients. For biases of
+usual size the integrals are linear in them. Source: Forster, Carlone, Dellaert & Scaramuzza, "On-manifold
+preintegration for real-time visual-inertial odometry" (2017), section VI.
 """
 
 import functools
@@ -21,15 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.intervals import interval_means, subdivided, usual_step_s
+from toolkit.audit.intervals import usual_step_s
 from toolkit.geometry import Array, IntArray, se3, se3_exp, skew, so3_exp, so3_log
-from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistMotion, TwistNoise
+from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise, StereoRig, TwistMotion, TwistNoise
 from toolkit.models.gating import CHI2_3_MEDIAN
+from toolkit.models.imu import predict, preintegrate, preintegration_params
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.motion_samples import motions_between
 from toolkit.sequence import Sequence
 
-# Difference of a bias (rad/s, and m/s^2 or rad) for the difference quotients.
+# Difference of a bias (rad/s) and of a rotation (rad) for the difference quotients.
 _DIFFERENCE = 1e-4
 # Error of a gyro in addition to its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s),
 # because real gyros filter vibration. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
@@ -141,46 +142,24 @@ class TwistStrides(NamedTuple):
 
 
 def imu_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> ImuStrides:
-    """Integrate an IMU's samples, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
-    part_t_ns, frame_at = subdivided(t_ns)
-    count, parts = len(t_ns) - 1, int(frame_at[1])
-    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, part_t_ns).reshape(count, parts, 6)
-    h_s = (np.diff(part_t_ns) / NS_PER_S).reshape(count, parts, 1)
-    gyro_first = np.eye(6)[[3, 4, 5, 0, 1, 2]]
-    off = np.concatenate([np.zeros((1, 6)), _DIFFERENCE * gyro_first])[:, None] + np.append(np.zeros(3), w_bias_radps)
-    R_a_now = np.tile(np.eye(3), (7, count, 1, 1))
-    faster, moved = np.zeros((7, count, 3)), np.zeros((7, count, 3))
-    for k in range(parts):
-        sample, step_s = mean[None, :, k] - off, h_s[None, :, k]
-        half = so3_exp(0.5 * step_s * sample[..., 3:])
-        middle = R_a_now @ half
-        force = (middle @ sample[..., :3, None])[..., 0]
-        moved = moved + step_s * faster + 0.5 * step_s**2 * force
-        faster = faster + step_s * force
-        R_a_now = middle @ half
-    turned = so3_log(R_a_now[0].swapaxes(1, 2) @ R_a_now[1:])
-    changed = (turned, faster[1:] - faster[0], moved[1:] - moved[0])
-    d_turn, d_faster, d_moved = (np.moveaxis(x / _DIFFERENCE, 0, -1) for x in changed)
-    dt_s = np.diff(t_ns) / NS_PER_S
-    whitener = _imu_whitener(sequence, dt_s)
-    return ImuStrides(dt_s, R_a_now[0], faster[0], moved[0], d_turn, d_faster, d_moved, whitener)
-
-
-def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
-    """Return the whitener (m, 9, 9) of the errors of an IMU's strides: the samples' noise, integrated twice.
-
-    The part of a position's error that is independent of the velocity's has the variance density^2 dt^3 / 12.
-    """
-    noise = sequence.noise
+    """Preintegrate an IMU's samples about a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
+    noise, bias, gyro_first = sequence.noise, np.append(np.zeros(3), w_bias_radps), [3, 4, 5, 0, 1, 2]
     assert isinstance(noise, ImuNoise)
-    sample_s = usual_step_s(sequence.motion.t_ns)
-    gyro, accel = float(np.hypot(noise.gyro_noise_density, GYRO_ERROR * sample_s)), noise.accel_noise_density
-    whitener, one = np.zeros((len(dt_s), 9, 9)), np.eye(3)
-    rest = (np.sqrt(12.0 / dt_s**3) / accel)[:, None, None]
-    whitener[:, :3, :3] = (1.0 / np.sqrt(dt_s) / gyro)[:, None, None] * one
-    whitener[:, 3:6, 3:6] = (1.0 / np.sqrt(dt_s) / accel)[:, None, None] * one
-    whitener[:, 6:, 6:], whitener[:, 6:, 3:6] = rest * one, -0.5 * dt_s[:, None, None] * rest * one
-    return whitener
+    gyro = float(np.hypot(noise.gyro_noise_density, GYRO_ERROR * usual_step_s(sequence.motion.t_ns)))
+    params = preintegration_params(replace(noise, gyro_noise_density=gyro), gravity_world=np.zeros(3))
+    motions = [motion for motion in motions_between(sequence.motion, t_ns, None) if isinstance(motion, ImuMotion)]
+    ends = [predict(preintegrate(motion, bias, params), np.eye(4), np.zeros(3), bias) for motion in motions]
+    T_a_b, faster = np.array([end.T_world_imu for end in ends]), np.array([end.v_world for end in ends])
+    # In the tangent of the end: its rotation, then position and velocity in its axes.
+    d_end = np.array([end.transition[:9, 9:] for end in ends])[:, :, gyro_first]
+    whitener = np.linalg.inv(np.linalg.cholesky(np.array([end.noise[:9, :9] for end in ends])))
+    R_a_b = T_a_b[:, :3, :3]
+    to_turn, to_moved, to_faster = np.split(whitener, 3, axis=2)
+    R_b_a = R_a_b.swapaxes(1, 2)
+    whitener = np.concatenate([to_turn, to_faster @ R_b_a, to_moved @ R_b_a], axis=2)
+    d_moved, d_faster = R_a_b @ d_end[:, 3:6], R_a_b @ d_end[:, 6:]
+    dt_s = np.diff(t_ns) / NS_PER_S
+    return ImuStrides(dt_s, R_a_b, faster, T_a_b[:, :3, 3], d_end[:, :3], d_faster, d_moved, whitener)
 
 
 def twist_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> TwistStrides:
