@@ -16,7 +16,6 @@ preintegration for real-time visual-inertial odometry" (2017), section VI.
 
 import functools
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +26,7 @@ from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise, StereoRig, Twist
 from toolkit.models.gating import CHI2_3_MEDIAN
 from toolkit.models.imu import predict, preintegrate, preintegration_params
 from toolkit.models.stereo import project, projection_jacobian
+from toolkit.models.stereo_adjustment import ReducedVision, Sightings, eliminated
 from toolkit.motion_samples import motions_between
 from toolkit.sequence import Sequence
 
@@ -301,12 +301,11 @@ class _Back(NamedTuple):
     own: Array
     per_common: Array
     seen: IntArray
-    tracks: "_Tracks"
+    vision: ReducedVision
 
     def steps(self, common: Array) -> tuple[Array, Array]:
-        own, tracks = self.own - self.per_common @ common, self.tracks
-        rest = tracks.point_rest - tracks.point_cross @ np.append(own, common)[self.seen]
-        return own, (tracks.point_root.swapaxes(1, 2) @ rest[:, :, None])[..., 0]
+        own = self.own - self.per_common @ common
+        return own, self.vision.point_steps(np.append(own, common)[self.seen])
 
 
 def moved(window: KeyFrameWindow, reduced: Reduced, step: Array) -> KeyFrameWindow:
@@ -316,12 +315,11 @@ def moved(window: KeyFrameWindow, reduced: Reduced, step: Array) -> KeyFrameWind
 
 def reduce(window: KeyFrameWindow, calibration: Calibration) -> Reduced:
     """Linearise the window and eliminate its own unknowns and its points."""
-    tracks, by_stride = _tracks(window, calibration), _strides(window, calibration)
+    (vision, of_tracks), by_stride = _tracks(window, calibration), _strides(window, calibration)
     own, seen, information = window.unknowns, _seen(window), by_stride.information
-    information[seen[:, None], seen] += tracks.information
-    gradients = np.zeros((len(tracks.gradients) + len(by_stride.gradients), own + COMMON))
-    gradients[: len(tracks.gradients), seen] = tracks.gradients
-    gradients[len(tracks.gradients) :] = by_stride.gradients
+    information[seen[:, None], seen] += vision.information
+    gradients = np.zeros((len(of_tracks) + len(by_stride.gradients), own + COMMON))
+    gradients[: len(of_tracks), seen], gradients[len(of_tracks) :] = of_tracks, by_stride.gradients
     gradient = gradients.sum(axis=0)
     information[np.arange(6), np.arange(6)] += _GAUGE
     information[np.arange(own), np.arange(own)] += _RIDGE
@@ -331,7 +329,7 @@ def reduce(window: KeyFrameWindow, calibration: Calibration) -> Reduced:
     return Reduced(
         information[own:, own:] - cross.T @ per_common,
         gradients[:, own:] - gradients[:, :own] @ per_common,
-        _Back(solution[:, -1], per_common, seen, tracks),
+        _Back(solution[:, -1], per_common, seen, vision),
     )
 
 
@@ -344,19 +342,6 @@ def _seen(window: KeyFrameWindow) -> IntArray:
 class _Normal(NamedTuple):
     information: Array
     gradients: Array
-
-
-class _Tracks(NamedTuple):
-    """Information (E, E) and gradients (T, E) of the tracks, and what of their points was eliminated.
-
-    Its columns are the poses, 6 each, and the 15 of the common unknowns on which sightings depend.
-    """
-
-    information: Array
-    gradients: Array
-    point_root: Array
-    point_cross: Array
-    point_rest: Array
 
 
 class Predicted(NamedTuple):
@@ -412,40 +397,19 @@ def _weighted(residual_px: Array, rig: StereoRig) -> Array:
     return np.asarray(rig.whitener / np.sqrt(scale2 + chi2 / CAUCHY_SIGMAS**2)[:, None, None])
 
 
-def _tracks(window: KeyFrameWindow, calibration: Calibration) -> _Tracks:
-    """Return the tracks' normal equations in the poses and the camera, without the points."""
-    seen, key, track = predicted(window, calibration), window.key, window.track
-    weight = _weighted(window.uv_px - seen.uv_px, calibration.rig)
-    residual, d_point = _applied(weight, window.uv_px - seen.uv_px), weight @ seen.d_point
-    n, points = len(window.position), len(window.points)
-    first, poses = np.searchsorted(track, np.arange(points)), POSE * n
-    d_both = weight @ seen.d_seen
-    information, gradients = np.zeros((poses + _CAMERA, poses + _CAMERA)), np.zeros((points, poses + _CAMERA))
-    by_key = np.argsort(key, kind="stable")
-    in_order = d_both[by_key].reshape(-1, POSE + _CAMERA)
-    edges = 3 * np.searchsorted(key[by_key], np.arange(n + 1))
-    for k, (begin, end) in enumerate(pairwise(edges.tolist())):
-        rows, pose = in_order[begin:end], slice(POSE * k, POSE * (k + 1))
-        squared = rows.T @ rows
-        information[pose, pose], information[pose, poses:] = squared[:POSE, :POSE], squared[:POSE, POSE:]
-        information[poses:, pose] = squared[POSE:, :POSE]
-        information[poses:, poses:] += squared[POSE:, POSE:]
-    pulled = _applied(d_both.swapaxes(1, 2), residual)
-    by_pose = np.zeros((points, n, POSE))
-    by_pose[track, key] = pulled[:, :POSE]
-    gradients[:, :poses], gradients[:, poses:] = by_pose.reshape(points, -1), np.add.reduceat(pulled[:, POSE:], first)
-    to_point = d_point.swapaxes(1, 2)
-    of_point, cross = np.add.reduceat(to_point @ d_point, first), to_point @ d_both
-    ridge = _RIDGE * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    root = np.linalg.inv(np.linalg.cholesky(of_point + ridge))
-    crossed = np.zeros((points, 3, n, POSE))
-    crossed[track, :, key] = root[track] @ cross[:, :, :POSE]
-    of_camera = root @ np.add.reduceat(cross[:, :, POSE:], first)
-    point_cross = np.concatenate([crossed.reshape(points, 3, -1), of_camera], axis=2)
-    rest = _applied(root, np.add.reduceat(_applied(to_point, residual), first))
-    flat = point_cross.reshape(3 * points, -1)
-    gradients -= _applied(point_cross.swapaxes(1, 2), rest)
-    return _Tracks(information - flat.T @ flat, gradients, root, point_cross, rest)
+def _tracks(window: KeyFrameWindow, calibration: Calibration) -> tuple[ReducedVision, Array]:
+    """Eliminate the points of all tracks; return what is left on poses and camera, and each track's gradient (T, E)."""
+    seen, counts = predicted(window, calibration), (len(window.position), len(window.points))
+    off_px = window.uv_px - seen.uv_px
+    weight = _weighted(off_px, calibration.rig)
+    residual, d_seen = _applied(weight, off_px), weight @ seen.d_seen
+    sightings = Sightings(window.key, window.track, window.uv_px)
+    vision = eliminated(residual, d_seen[..., :POSE], weight @ seen.d_point, sightings, counts, d_seen[..., POSE:])
+    pulled, by_pose = _applied(d_seen.swapaxes(1, 2), residual), np.zeros((counts[1], counts[0], POSE))
+    by_pose[window.track, window.key] = pulled[:, :POSE]
+    of_camera = np.add.reduceat(pulled[:, POSE:], np.searchsorted(window.track, np.arange(counts[1])))
+    of_points = np.einsum("emd,md->me", vision.coupling.reshape(-1, counts[1], 3), vision.point_vector)
+    return vision, np.concatenate([by_pose.reshape(counts[1], -1), of_camera], axis=1) - of_points
 
 
 def _strides(window: KeyFrameWindow, calibration: Calibration) -> _Normal:

@@ -66,7 +66,10 @@ class Sightings:
 
 
 class ReducedVision(NamedTuple):
-    """Information matrix (6K, 6K) and vector (6K,) on the poses, and the matrices for back-substitution of points."""
+    """Information matrix (D, D) and vector (D,) on the poses, and the matrices for back-substitution of points.
+
+    D is 6K, or 6K + C where the sightings share C more unknowns.
+    """
 
     information: Array
     vector: Array
@@ -75,7 +78,7 @@ class ReducedVision(NamedTuple):
     point_vector: Array
 
     def point_steps(self, pose_steps: Array) -> Array:
-        """Return the steps (M, 3) of the points for steps (6K,) of the poses."""
+        """Return the steps (M, 3) of the points for steps (D,) of the others."""
         whitened = self.point_vector - (self.coupling.T @ pose_steps).reshape(-1, 3)
         return (self.root @ whitened[..., None])[..., 0]
 
@@ -153,12 +156,18 @@ class Vision:
 
 
 def eliminated(
-    residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]
+    residual: Array,
+    J_pose: Array,
+    J_point: Array,
+    seen: Sightings,
+    counts: tuple[int, int],
+    J_common: Array | None = None,
 ) -> ReducedVision:
     """Eliminate M points of N sightings from K poses by Schur complements.
 
     ``residual`` (N, 3) is measured less predicted, ``J_pose`` (N, 3, 6) and ``J_point`` (N, 3, 3) the Jacobians of the
-    prediction, all whitened and weighted; ``counts`` are K and M.
+    prediction, and ``J_common`` (N, 3, C) those by unknowns that all sightings share, which come behind the poses'; all
+    whitened and weighted. ``counts`` are K and M.
     """
     (pose_count, point_count), point, pose = counts, seen.point, seen.pose
     # Small matrix products are several times as fast on contiguous arrays.
@@ -169,15 +178,25 @@ def eliminated(
     vector_point = per_point @ (to_point @ residual[..., None])[..., 0]
     root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
     whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
-    coupling, vector = np.zeros((pose_count, 6, point_count, 3)), np.zeros((pose_count, 6))
+    coupling = np.zeros((pose_count, 6, point_count, 3))
     to_pose, per_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2)), _summation(pose, pose_count)
-    coupling[pose, :, point, :] += to_pose @ (J_point @ root[point])
-    vector += per_pose @ (to_pose @ residual[..., None])[..., 0]
+    J_root = J_point @ root[point]
+    coupling[pose, :, point, :] += to_pose @ J_root
+    vector = (per_pose @ (to_pose @ residual[..., None])[..., 0]).ravel()
     across = coupling.reshape(6 * pose_count, 3 * point_count)
-    information = -(across @ across.T)
-    own = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(pose_count, 6, 6)
-    information.reshape(pose_count, 6, pose_count, 6)[np.arange(pose_count), :, np.arange(pose_count)] += own
-    return ReducedVision(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
+    own, here = np.zeros((pose_count, 6, pose_count, 6)), np.arange(pose_count)
+    own[here, :, here] = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(-1, 6, 6)
+    information = own.reshape(6 * pose_count, 6 * pose_count)
+    if J_common is not None:
+        to_common, shared = np.swapaxes(J_common, 1, 2), J_common.shape[2]
+        of_points = (per_point @ (to_common @ J_root).reshape(len(pose), -1)).reshape(point_count, shared, 3)
+        across = np.concatenate([across, np.swapaxes(of_points, 0, 1).reshape(shared, -1)])
+        of_poses = (per_pose @ (to_pose @ J_common).reshape(len(pose), -1)).reshape(-1, shared)
+        rows = J_common.reshape(-1, shared)
+        information = np.block([[information, of_poses], [of_poses.T, rows.T @ rows]])
+        vector = np.concatenate([vector, rows.T @ residual.ravel()])
+    information -= across @ across.T
+    return ReducedVision(information, vector - across @ whitened_vector.ravel(), across, root, whitened_vector)
 
 
 def _summation(groups: IntArray, count: int) -> csc_array:
