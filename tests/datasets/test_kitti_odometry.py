@@ -11,7 +11,7 @@ import pytest
 
 import toolkit
 from tests.datasets.conftest import edit
-from toolkit.datasets import kitti_odometry, load_sequence
+from toolkit.datasets import kitti, load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.experiment.recording import Recording, prepare
@@ -28,10 +28,10 @@ def drive(kitti_drive: Path, tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_recognised_by_its_images(drive: Path) -> None:
-    assert kitti_odometry.recognises(drive)
-    assert not kitti_odometry.recognises(drive / "image_0")
+    assert kitti.recognises(drive)
+    assert not kitti.recognises(drive / "image_0")
     (drive / "calib.txt").unlink()
-    assert kitti_odometry.recognises(drive)
+    assert kitti.recognises(drive)
 
 
 def test_no_motion_is_measured_and_that_is_reported(drive: Path) -> None:

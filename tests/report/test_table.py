@@ -82,7 +82,7 @@ def test_a_real_drive_leads_with_drift_and_the_error_that_keeps_the_vertical(
     comparison: Comparison, rescored: Rescored
 ) -> None:
     driven = rescored(comparison, lambda row: Scores(dict(row.scores.values) | {"kitti_t_percent": 1.0}))
-    real = replace(driven, sequence=replace(driven.sequence, provenance=Provenance("kitti-raw", "a drive")))
+    real = replace(driven, sequence=replace(driven.sequence, provenance=Provenance("kitti", "a drive")))
     usual, of_real = ([metric.key for metric in shown_metrics(one)] for one in (driven, real))
     # Before them stand only pairs and coverage, in which these rows differ.
     assert [key for key in of_real if key not in ("pairs", "coverage_percent")][:3] == [

@@ -1,0 +1,562 @@
+"""KITTI: stereo images, rectified or raw, of an odometry sequence, or of a raw drive with its packets (oxts).
+
+An odometry sequence has ``image_0`` and ``image_1`` (or ``image_2`` and ``image_3``, or ``image_l`` and ``image_r``),
+calib.txt, and times.txt and poses where they are there, these in the folder or, as the download has it, in
+``../../poses/<name>.txt``. No motion is measured, and a smooth one is assumed (:mod:`toolkit.models.twist`), which
+every report says. The body, called IMU everywhere, is camera 0, whose poses these are, with the axes forward, left, up.
+Source: Geiger, Lenz & Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite" (CVPR 2012).
+
+A raw drive has ``image_00/data`` and ``image_01/data`` (or ``image_02`` and ``image_03``), the calib_*.txt of its day
+in it or beside it, and ``oxts/data``. Packets at 50 Hz or more are read as an IMU, slower ones as body twists. Whether
+images are rectified shows in their size. Truth and motion are of one instrument. Axes of the IMU: forward, left, up.
+Source: Geiger, Lenz, Stiller & Urtasun, "Vision meets robotics: the KITTI dataset" (IJRR 2013), and the readme of its
+development kit for the 30 values of a packet; positions are projected as that kit does, by Mercator's projection scaled
+at the first latitude.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.datasets.io.fields import Fields, rigid, stamps_ns
+from toolkit.datasets.io.image_pairs import (
+    UNPACK_IMAGES,
+    Listed,
+    check_both_cameras,
+    check_one_clock,
+    check_several_stamps,
+    first_with_images,
+    has_folders,
+    image_folder,
+    image_size,
+    images_in,
+    images_only,
+    pairs_by_name,
+    pairs_by_stamps,
+    pinhole_of,
+    seen_in,
+)
+from toolkit.datasets.trajectories import read_poses
+from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, read_text_input
+from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
+from toolkit.measurements import NS_PER_S, ImuNoise, MotionNoise
+from toolkit.models.noise import twist_noise, unmeasured_motion
+from toolkit.motion_samples import ImuSamples, MotionSamples, NoSamples, TwistSamples
+from toolkit.progress import SILENT, Progress
+from toolkit.sequence import Provenance, Sequence, Truth
+from toolkit.settings import DEFAULTS, Frontend
+
+CITES = ("geiger2012kitti", "geiger2013kitti")
+# The folders of both cameras, grey or colour, of an odometry sequence and of a raw drive.
+_FOLDERS = (
+    *(("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r")),
+    *(("image_00", "image_01"), ("image_02", "image_03")),
+)
+
+
+class _Layout(NamedTuple):
+    """The folder of a recording, and those of the images of its left and right camera."""
+
+    root: Path
+    left: Path
+    right: Path
+    is_raw: bool
+
+    @classmethod
+    def of(cls, root: Path, left: str, right: str) -> _Layout:
+        if len(left) == len("image_0"):
+            return cls(root, root / left, root / right, is_raw=False)
+        return cls(root, image_folder(root / left), image_folder(root / right), is_raw=True)
+
+
+class _Mounted(NamedTuple):
+    """A pair for the front end, where its left camera is mounted, before it is rectified, and what to know of it."""
+
+    pair: RectifiedPair
+    T_imu_left: Array
+    facts: tuple[str, ...]
+
+
+class _Moved(NamedTuple):
+    """The motion samples, their noise, the truth, and what to know of them."""
+
+    samples: MotionSamples
+    noise: MotionNoise
+    truth: Truth | None
+    facts: tuple[str, ...]
+
+
+uses_images = images_only
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path has the folders of a pair, as KITTI names them, or one with images."""
+    return _layout(path) is not None or any(has_folders(path, *folders) for folders in _FOLDERS)
+
+
+def load(path: Path) -> Sequence:
+    """Read a recording with the front end's default settings; see :func:`load_from_images`."""
+    return load_from_images(path, DEFAULTS.frontend, SILENT)
+
+
+def images_of(path: Path, frontend: Frontend) -> ImageRecording:
+    """Return the image pairs and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    return ImageRecording(_listed(layout).pairs, _mounted(layout).pair)
+
+
+def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
+    """Read calibration, stamps, and poses or packets, and make the tracks of the images.
+
+    Raises DataError where a part is missing or damaged, or the images cannot be used.
+    """
+    layout = _whole(path)
+    mounted, listed = _mounted(layout), _listed(layout)
+    seen = seen_in(layout.root, ImageRecording(listed.pairs, mounted.pair), mounted.T_imu_left, frontend, progress)
+    moved = (_packets_motion if layout.is_raw else _assumed_motion)(layout, seen.frames_t_ns)
+    facts = (*moved.facts, *seen.facts, *listed.remarks, *mounted.facts)
+    return Sequence(
+        name=layout.root.name,
+        rig=seen.rig,
+        noise=moved.noise,
+        frames_t_ns=seen.frames_t_ns,
+        observations=seen.observations,
+        motion=moved.samples,
+        provenance=Provenance("kitti", f"{path}: stereo tracks from the images", facts),
+        truth=moved.truth,
+    )
+
+
+def _layout(path: Path) -> _Layout | None:
+    """Return the first pair of cameras that both have images, else the first of which one has."""
+    layouts = [_Layout.of(path.resolve(), *folders) for folders in _FOLDERS]
+    place = first_with_images([(one.left, one.right) for one in layouts])
+    return None if place is None else layouts[place]
+
+
+def _whole(path: Path) -> _Layout:
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(
+            f"{path}: no image_0 and image_1, image_2 and image_3, image_l and image_r, or image_00/data and "
+            f"image_01/data, or image_02 and image_03, with images; {UNPACK_IMAGES}"
+        )
+    check_both_cameras(layout.root, layout.left, layout.right)
+    return layout
+
+
+def _mounted(layout: _Layout) -> _Mounted:
+    size_px = image_size(layout.left, layout.right)
+    return _of_the_day(layout, size_px) if layout.is_raw else _of_calib(layout, size_px)
+
+
+def _listed(layout: _Layout) -> Listed:
+    return _listed_by_stamps(layout) if layout.is_raw else _listed_by_number(layout)
+
+
+def _rectified_pair(file: Path, names: list[str], P: tuple[Array, Array], size_px: tuple[int, int]) -> RectifiedPair:
+    """Return the pair of two projections (3, 4), by these names in a file; raises DataError where they are none."""
+    left, right = P
+    for name, projection in zip(names, P, strict=True):
+        if not (np.isfinite(projection).all() and projection[0, 0] > 0.0 and projection[1, 1] > 0.0):
+            raise DataError(f"{file}: {name} is no projection: its focal lengths must be positive")
+    if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6):
+        raise DataError(f"{file}: {names[0]} and {names[1]} differ in more than the baseline; they are not rectified")
+    baseline_m = float((left[0, 3] - right[0, 3]) / left[0, 0])
+    if baseline_m == 0.0:
+        raise DataError(f"{file}: {names[0]} and {names[1]} are the same, so there is no baseline; give each its own")
+    if not baseline_m > 0.0:
+        raise DataError(
+            f"{file}: by {names[0]} and {names[1]} the right camera is not to the right of the left; exchange them"
+        )
+    return already_rectified(pinhole_of(left), baseline_m, size_px)
+
+
+# Odometry sequences: calib.txt, times.txt, poses ---------------------------------------------------------------------
+
+_PERIOD_S = 0.1
+# No camera's axis meets its image this near the border: calib.txt is of larger images than these.
+_BORDER = 0.1
+# Few do so far from the middle both ways (shares of width and height); that of images half as large is 0.25 off.
+_ASIDE = 0.15
+# Axes right, down, forward of a camera, from forward, left, up.
+T_FLU_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+
+
+def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
+    """Return the pair as calib.txt has it; the principal point must be one of images of this size.
+
+    Images without motion samples have nothing else that would contradict a calibration of images half as large.
+    """
+    file, names = layout.root / "calib.txt", [f"P{row}" for row in _rows(layout)]
+    left, right = _projections(file, names)
+    pair = _rectified_pair(file, names, (left, right), size_px)
+    centre, size = f"{pair.cx_px:g} {pair.cy_px:g}", f"{size_px[0]}x{size_px[1]} px"
+    places = [c / length for c, length in zip((pair.cx_px, pair.cy_px), size_px, strict=True)]
+    if not all(_BORDER < place < 1.0 - _BORDER for place in places):
+        raise DataError(
+            f"{file}: its principal point, {centre}, is not that of images of {size}; where these were scaled or cut, "
+            "do the same to P0 to P3"
+        )
+    facts = (
+        f"the principal point, {centre}, is far from the middle of images of {size}: check that calib.txt is of images "
+        "of this size",
+    )
+    T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
+    is_aside = all(abs(place - 0.5) > _ASIDE for place in places)
+    return _Mounted(pair, T_FLU_CAM @ T_cam0_left, facts if is_aside else ())
+
+
+def _rows(layout: _Layout) -> tuple[int, int]:
+    """Return the rows of calib.txt of both cameras."""
+    return (2, 3) if layout.left.name == "image_2" else (0, 1)
+
+
+def _projections(file: Path, wanted: list[str]) -> tuple[Array, Array]:
+    """Return two projections (3, 4) from calib.txt, whose rows may or may not be named P0, P1, ..."""
+    if not file.exists():
+        raise DataError(f"{file}: is missing; put the calib.txt of this sequence there, with the rows P0: to P3:")
+    rows: dict[str, Array] = {}
+    for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
+        name, colon, rest = line.partition(":")
+        columns = (rest if colon else line).split()
+        try:
+            values = np.array([float(word) for word in columns])
+        except ValueError as error:
+            raise DataError(
+                f"{file}: line {number}: {error}; KITTI odometry's calib.txt has P0: to P3:, twelve numbers each"
+            ) from error
+        if values.size == 12:
+            rows[name.strip() if colon else f"P{len(rows)}"] = values.reshape(3, 4)
+    missing = [name for name in wanted if name not in rows]
+    if missing:
+        raise DataError(
+            f"{file}: missing {', '.join(missing)}, twelve numbers each; it has {', '.join(rows) or 'none'}"
+        )
+    return rows[wanted[0]], rows[wanted[1]]
+
+
+def _listed_by_number(layout: _Layout) -> Listed:
+    stamps = _times(layout)[0]
+    listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
+    if not listed.pairs:
+        numbers = _numbers(layout)
+        if not numbers:
+            name = images_in(layout.left)[0].name
+            raise DataError(f"{layout.left}: {name} is no number; name the images of an instant alike, as 000000.png")
+        raise DataError(
+            f"{layout.root}: no image has a stamp: they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has "
+            f"{stamps.size}, from number 0 on; cut both or neither"
+        )
+    check_several_stamps(layout.root / "times.txt", listed)
+    return listed
+
+
+def _times(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the stamp (N,) of each image number, and what must be known of them."""
+    file = layout.root / "times.txt"
+    if not is_regular(file):
+        period_ns = round(_PERIOD_S * NS_PER_S)
+        return period_ns * np.arange(_count(layout)), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
+    lines = read_text_input(file, "times.txt is text").splitlines()
+    seconds = [_seconds(file, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    return stamps_ns(file, "stamp", np.array(seconds, dtype=np.float64)), ()
+
+
+def _seconds(file: Path, number: int, line: str) -> float:
+    try:
+        return float(line)
+    except ValueError as error:
+        raise DataError(f"{file}: line {number} is {line.strip()!r}; expected one number a line, in seconds") from error
+
+
+def _numbers(layout: _Layout) -> list[int]:
+    """Return the numbers of the left images, in order."""
+    return sorted(int(path.stem) for path in images_in(layout.left) if path.stem.isdecimal())
+
+
+def _count(layout: _Layout) -> int:
+    """Return how many images the sequence has, by the last number, for some may be missing."""
+    return max(_numbers(layout), default=-1) + 1
+
+
+def _assumed_motion(layout: _Layout, t_ns: IntArray) -> _Moved:
+    stamps, how = _times(layout)
+    facts = ("no motion input: all estimators assume smooth motion", *how)
+    return _Moved(NoSamples(t_ns), unmeasured_motion(), _poses(layout, stamps, t_ns), facts)
+
+
+def _poses(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
+    """Return the poses of the frames used, as those of the body; None where there are no poses."""
+    beside = layout.root.parent.parent / "poses" / f"{layout.root.name}.txt"
+    file = next((path for path in (layout.root / "poses.txt", beside) if is_regular(path)), None)
+    if file is None:
+        return None
+    poses = read_poses(file)
+    if poses.t_ns is not None:
+        raise DataError(
+            f"{file}: is a trajectory with stamps ({poses.format}), and KITTI's poses have twelve numbers a line and "
+            "none; move it away, and give poses of the body (forward, left, up) in TUM format with --truth"
+        )
+    T_world_cam = poses.T_world_imu
+    if len(T_world_cam) not in (stamps.size, _count(layout)):
+        raise DataError(
+            f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence, or not cut "
+            "as the images are"
+        )
+    T_cam_flu = np.linalg.inv(T_FLU_CAM)
+    posed = stamps[: len(T_world_cam)]
+    used = np.flatnonzero(np.isin(posed, t_ns))
+    used = used[np.unique(posed[used], return_index=True)[1]]
+    return Truth(stamps[used], T_FLU_CAM @ T_world_cam[used] @ T_cam_flu)
+
+
+# Raw drives: the day's calibration, stamps, packets ------------------------------------------------------------------
+
+# Between slower packets a car's specific force is not what its samples say.
+_IMU_FROM_HZ = 50.0
+# The same unit's, as GTSAM's example of drive 2011_10_03_drive_0027 states it.
+_IMU_NOISE = ImuNoise(
+    accel_noise_density=0.01, gyro_noise_density=1.75e-4, accel_random_walk=1.67e-4, gyro_random_walk=2.91e-6
+)
+_CAMERAS, _VELO, _IMU = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
+_LARGEST_ANGLE_RAD = 2.0 * np.pi
+_VALUES = 30
+# Where in a packet stand: latitude, longitude (deg), altitude (m); roll, pitch, yaw (rad); north, east, up (m/s).
+_PLACE, _ANGLES, _NORTH_EAST_UP = slice(0, 3), slice(3, 6), [6, 7, 10]
+# Of the body: specific force (m/s^2) and rates (rad/s).
+_ACCEL, _RATES = slice(11, 14), slice(17, 20)
+_EARTH_RADIUS_M = 6378137.0
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
+
+
+def _listed_by_stamps(layout: _Layout) -> Listed:
+    left, right = (camera / "timestamps.txt" for camera in _cameras(layout))
+    stamps = _read_stamps(left)
+    right_stamps = _read_stamps(right) if is_regular(right) else stamps
+    listed = pairs_by_stamps(layout.left, layout.right, stamps, right_stamps)
+    check_several_stamps(left, listed)
+    return listed
+
+
+def _cameras(layout: _Layout) -> tuple[Path, ...]:
+    """Return the folders of both cameras, whose images may be in a folder inside."""
+    return tuple(layout.root / images.relative_to(layout.root).parts[0] for images in (layout.left, layout.right))
+
+
+def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
+    """Return what the packets say; without packets a smooth motion is assumed."""
+    packets = _read_packets(layout.root / "oxts")
+    if packets is None:
+        how = "no oxts: no motion input, all estimators assume smooth motion"
+        return _Moved(NoSamples(frames_t_ns), unmeasured_motion(), None, (how,))
+    check_one_clock(layout.root, frames_t_ns, packets.t_ns, "the oxts packets")
+    alone = (f"{packets.alone} oxts packets lack their file or their stamp and are left out",) if packets.alone else ()
+    t_ns, first = np.unique(packets.t_ns, return_index=True)
+    truth = Truth(t_ns, packets.T_world_imu[first], packets.v_world[first], independent=False)
+    rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(packets.t_ns))))
+    if rate_hz >= _IMU_FROM_HZ:
+        how = f"the oxts packets, {rate_hz:.0f} a second, are read as an IMU"
+        samples = ImuSamples(packets.t_ns, packets.accel_mps2, packets.w_radps)
+        return _Moved(samples, _IMU_NOISE, truth, (how, *alone))
+    how = f"the oxts packets, {rate_hz:.0f} a second, are too few for an IMU and read as body twists"
+    v_mps, w_radps = packets.v_body_mps, packets.w_radps
+    noise = twist_noise(packets.t_ns, v_mps, w_radps)
+    return _Moved(TwistSamples(packets.t_ns, v_mps, w_radps), noise, truth, (how, *alone))
+
+
+@dataclass(frozen=True, eq=False)
+class _Day:
+    """The three files of a drive's day: all cameras, the laser scanner in camera 0, and the IMU in the scanner."""
+
+    cameras: Fields
+    velo: Fields
+    imu: Fields
+
+
+def _day_of(root: Path) -> _Day:
+    """Read the three files of a drive's day, in its folder or the one above it.
+
+    Raises DataError where one is missing or no text.
+    """
+    folder = next((f for f in (root, root.parent) if is_regular(f / _CAMERAS)), root.parent)
+    return _Day(*(_calibration(folder / name) for name in (_CAMERAS, _VELO, _IMU)))
+
+
+def _calibration(file: Path) -> Fields:
+    """Read a file of names and numbers; entries that are no numbers, such as dates, are left out."""
+    if not file.exists():
+        raise DataError(
+            f"{file}: is missing; the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} "
+            "into the folder of the day or of the drive"
+        )
+    arrays: dict[str, np.ndarray] = {}
+    for line in read_text_input(file, "KITTI's calibration is text").splitlines():
+        key, colon, rest = line.partition(":")
+        with suppress(ValueError):
+            if colon:
+                arrays[key.strip()] = np.array([float(word) for word in rest.split()])
+    return Fields(file, arrays)
+
+
+def _of_the_day(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
+    """Return the pair of two cameras whose images have a size: the rectified one, or the sensor's.
+
+    Raises DataError where a value is missing or impossible, or images have neither size.
+    """
+    day, sides = _day_of(layout.root), tuple(camera.name.removeprefix("image_") for camera in _cameras(layout))
+    names = [f"{what}_{side}" for side in sides for what in ("S", "K", "D", "R", "T", "S_rect", "P_rect")]
+    day.cameras.require(*names, "R_rect_00")
+    for other in (day.velo, day.imu):
+        other.require("R", "T")
+    T_cam0_imu = _rigid_motion(day.velo) @ _rigid_motion(day.imu)
+    rectified_px, raw_px = (_size(day.cameras, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
+    if size_px == rectified_px:
+        T_rect_cam0 = se3(day.cameras.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
+        rigid(day.cameras.path, "R_rect_00", T_rect_cam0)
+        return _already(day.cameras, sides, size_px, T_rect_cam0 @ T_cam0_imu)
+    if size_px != raw_px:
+        size, *both = (f"{width}x{height}" for width, height in (size_px, rectified_px, raw_px))
+        raise DataError(
+            f"{day.cameras.path}: images of {size} px are neither rectified ones of that day, {both[0]}, nor raw ones, "
+            f"{both[1]}; take the calibration of the images' day, or images that were not scaled or cut"
+        )
+    cameras = [_camera(day.cameras, side) for side in sides]
+    T_left_cam0, T_right_cam0 = (_rigid_motion(day.cameras, f"_{side}") for side in sides)
+    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0), str(day.cameras.path))
+    facts = ("raw images, rectified with the day's calibration",)
+    return _Mounted(pair, se3_inverse(T_left_cam0 @ T_cam0_imu), facts)
+
+
+def _already(cameras: Fields, sides: tuple[str, ...], size_px: tuple[int, int], T_rect_imu: Array) -> _Mounted:
+    names = [f"P_rect_{side}" for side in sides]
+    left, right = (cameras.constant(name, 12).reshape(3, 4) for name in names)
+    pair = _rectified_pair(cameras.path, names, (left, right), size_px)
+    T_left_rect = se3(np.eye(3), np.linalg.inv(left[:, :3]) @ left[:, 3])
+    return _Mounted(pair, se3_inverse(T_left_rect @ T_rect_imu), ("images rectified as the data set has them",))
+
+
+def _camera(cameras: Fields, side: str) -> Camera:
+    pinhole_px = pinhole_of(cameras.constant(f"K_{side}", 9).reshape(3, 3))
+    if not min(pinhole_px[:2]) > 0.0:
+        raise DataError(f"{cameras.path}: K_{side} has no positive focal lengths; copy the file again")
+    return Camera(pinhole_px, "radtan", cameras.constant(f"D_{side}", 5), _size(cameras, f"S_{side}"))
+
+
+def _size(cameras: Fields, key: str) -> tuple[int, int]:
+    width, height = cameras.constant(key, 2)
+    return int(width), int(height)
+
+
+def _rigid_motion(fields: Fields, suffix: str = "") -> Array:
+    """Return the rigid motion (4, 4) of an R and a T."""
+    rotation = fields.constant(f"R{suffix}", 9).reshape(3, 3)
+    return rigid(fields.path, f"R{suffix}", se3(rotation, fields.constant(f"T{suffix}", 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Packets:
+    """Packets (S,) in the order of their files: poses (S, 4, 4), velocities, specific force and rates (S, 3).
+
+    The world is east, north, up from the first place; the body forward, left, up. ``alone`` is how many packets have a
+    file and no stamp, or a stamp and no file.
+    """
+
+    t_ns: IntArray
+    T_world_imu: Array
+    v_world: Array
+    accel_mps2: Array
+    w_radps: Array
+    alone: int
+
+    @property
+    def v_body_mps(self) -> Array:
+        """Return the velocities (S, 3) in the body's axes."""
+        return np.asarray(np.einsum("nji,nj->ni", self.T_world_imu[:, :3, :3], self.v_world))
+
+
+def _read_packets(folder: Path) -> _Packets | None:
+    """Read the packets that have a stamp; None where there is no such folder.
+
+    Raises DataError, naming the file, where one does not hold thirty finite numbers.
+    """
+    if not folder.is_dir():
+        return None
+    stamps = _read_stamps(folder / "timestamps.txt")
+    files = {int(path.stem): path for path in (folder / "data").glob("*.txt") if path.stem.isdecimal()}
+    numbers = sorted(files.keys() & stamps.keys())
+    if len(numbers) < 2:
+        raise DataError(f"{folder}: {len(numbers)} packets with a stamp; copy oxts/data and oxts/timestamps.txt again")
+    rows = np.stack([_packet(files[number]) for number in numbers])
+    north, east, up = rows[:, _NORTH_EAST_UP].T
+    return _Packets(
+        np.array([stamps[number] for number in numbers], dtype=np.int64),
+        se3(_attitudes(rows[:, _ANGLES]), _positions(rows[:, _PLACE])),
+        np.stack([east, north, up], axis=1),
+        rows[:, _ACCEL],
+        rows[:, _RATES],
+        len(files.keys() ^ stamps.keys()),
+    )
+
+
+def _read_stamps(file: Path) -> dict[int, int]:
+    """Return the stamp (ns) of each row number of a timestamps.txt; blank rows, as unsynced drives have, have none.
+
+    Raises DataError, naming the line, where one is no date and time.
+    """
+    stamps = {}
+    for row, line in enumerate(read_text_input(file, "expected a date and time in each line").splitlines()):
+        if not line.strip():
+            continue
+        try:
+            stamps[row] = _stamp_ns(line.strip())
+        except ValueError as error:
+            raise DataError(
+                f"{file}: line {row + 1} is no date and time; write it as in 2011-09-26 13:02:25.96"
+            ) from error
+    if not stamps:
+        raise DataError(f"{file}: holds no stamps; copy it again")
+    return stamps
+
+
+def _stamp_ns(stamp_text: str) -> int:
+    """Return the nanoseconds since 1970 of a date and time; raises ValueError where it is none."""
+    if not _STAMP.fullmatch(stamp_text):
+        raise ValueError(stamp_text)
+    return int(np.datetime64(stamp_text.replace(" ", "T"), "ns").astype(np.int64))
+
+
+def _packet(file: Path) -> Array:
+    try:
+        values = np.array([float(word) for word in read_text_input(file, "a packet is text").split()])
+    except ValueError as error:
+        raise DataError(f"{file}: {error}; expected {_VALUES} numbers") from error
+    if values.size != _VALUES or not np.isfinite(values).all():
+        raise DataError(f"{file}: {values.size} numbers, expected {_VALUES} finite ones; copy it again")
+    if np.abs(values[_ANGLES]).max() > _LARGEST_ANGLE_RAD:
+        raise DataError(f"{file}: roll, pitch and yaw are {values[_ANGLES].tolist()}, and no radians; convert degrees")
+    return values
+
+
+def _positions(places: Array) -> Array:
+    """Return (S, 3) m east, north and up of the first of some places (S, 3) deg, deg, m."""
+    latitude, longitude = np.deg2rad(places[:, :2]).T
+    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    projected = np.stack(
+        [scale * longitude, scale * np.log(np.tan(np.pi / 4.0 + latitude / 2.0)), places[:, 2]], axis=1
+    )
+    return np.asarray(projected - projected[0])
+
+
+def _attitudes(angles: Array) -> Array:
+    """Return rotations (S, 3, 3) of roll, pitch and yaw (S, 3) rad: about z, then y, then x."""
+    about = [so3_exp(angles[:, i : i + 1] * np.eye(3)[i]) for i in range(3)]
+    return np.asarray(about[2] @ about[1] @ about[0])
