@@ -224,10 +224,7 @@ def test_lines_to_the_closer_look_end_at_the_corners_that_face_the_map(
     lines = [line for line in square.connectors or () if line.get_visible()]
     ends = np.array([line.get_path().vertices[0] for line in lines])
     box = panel.get_window_extent()
-    beside = box.y1 > the_map.get_window_extent().y0
-    assert beside == (turn_rad > 0.0)
-    facing = [(box.x0, box.y0), (box.x0, box.y1)] if beside else [(box.x0, box.y1), (box.x1, box.y1)]
-    np.testing.assert_allclose(ends, facing, atol=0.5)
+    np.testing.assert_allclose(ends, [(box.x0, box.y0), (box.x0, box.y1)], atol=0.5)
     # A panel takes the place that its equal scale leaves it when it is drawn: before the lines to it.
     assert panel.get_zorder() < the_map.get_zorder()
 

@@ -56,7 +56,7 @@ NOWHERE: Array = np.empty((0, 2))
 _LINE_WIDTH, _TRUTH_WIDTH = 1.5, 4.0
 # Room beside the map for legend and closer look, for the axes' labels, and how high a map may be.
 _BESIDE_IN, _LABELS_IN, _HIGHEST_IN, _LOWEST_IN = 1.9, 0.55, 6.0, 2.3
-_ENTRY_IN, _CLOSER_IN, _FLAT = 0.175, 1.6, 0.6
+_ENTRY_IN, _CLOSER_IN = 0.175, 1.6
 _LEAST_SQUARE = 0.015  # of the square in the map, as a share of the map
 
 
@@ -235,37 +235,17 @@ def _entries(
 
 
 def _places(view: View, entries: int, closer: View | None) -> tuple[Figure, Axes, Axes, Axes | None]:
-    """Return a figure with places for the map, the legend and the closer look, as the map's shape allows.
-
-    Beside a tall map there is room for both; under a flat one they stand side by side.
-    """
+    """Return a figure with a place for the map, and beside it one for the legend over one for the closer look."""
     legend_in, closer_in = _ENTRY_IN * entries + 0.1, 0.0 if closer is None else _CLOSER_IN
-    if view.ratio > _FLAT:
-        width_in = WIDTH_IN - _BESIDE_IN - _LABELS_IN
-        height_in = max(min(width_in * view.ratio, _HIGHEST_IN), legend_in + closer_in)
-        figure = new_figure(height_in + _LABELS_IN)
-        rest_in = max(height_in + _LABELS_IN - legend_in, 0.1)
-        grid = figure.add_gridspec(2, 2, width_ratios=(width_in, _BESIDE_IN), height_ratios=(legend_in, rest_in))
-        places = grid[:, 0], grid[0, 1], grid[1, 1]
-    else:
-        map_in = max((WIDTH_IN - _LABELS_IN) * view.ratio, _LOWEST_IN)
-        below_in = max(closer_in, legend_in)
-        figure = new_figure(map_in + below_in + 2.0 * _LABELS_IN)
-        # The closer look stands on the side of what it enlarges, the legend on the other.
-        widths = [WIDTH_IN - _CLOSER_IN - 2.0 * _LABELS_IN, _CLOSER_IN + 2.0 * _LABELS_IN]
-        right = closer is None or bool((closer.low + closer.high)[0] > (view.low + view.high)[0])
-        ratios = {"width_ratios": widths if right else widths[::-1], "height_ratios": (map_in + _LABELS_IN, below_in)}
-        grid = figure.add_gridspec(2, 2, **ratios)
-        places = grid[0, :], grid[1, int(not right)], grid[1, int(right)]
-    the_map, beside, under = places
-    legend_axes = figure.add_subplot(beside)
+    width_in = WIDTH_IN - _BESIDE_IN - _LABELS_IN
+    height_in = max(min(width_in * view.ratio, _HIGHEST_IN), legend_in + closer_in, _LOWEST_IN) + _LABELS_IN
+    figure = new_figure(height_in)
+    heights = (legend_in, max(height_in - legend_in, 0.1))
+    grid = figure.add_gridspec(2, 2, width_ratios=(width_in, _BESIDE_IN), height_ratios=heights)
+    legend_axes = figure.add_subplot(grid[0, 1])
     legend_axes.set_axis_off()
-    return (
-        figure,
-        figure.add_subplot(the_map, anchor="NW"),
-        legend_axes,
-        None if closer is None else figure.add_subplot(under),
-    )
+    the_map = figure.add_subplot(grid[:, 0], anchor="NW")
+    return figure, the_map, legend_axes, None if closer is None else figure.add_subplot(grid[1, 1])
 
 
 def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
@@ -285,22 +265,12 @@ def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
     place = (float(low[0]), float(low[1]), 2.0 * half, 2.0 * half)
     square = axes.indicate_inset(place, under, edgecolor=MUTED_COLOUR, alpha=1.0, linewidth=0.8, zorder=5)
     assert square.connectors is not None, "the panel is given"
-    facing = _corners_facing(axes, under)
-    for line, shown in zip(square.connectors, facing, strict=True):
+    # The map is on the left, and so would be the numbers, under the lines.
+    for line, shown in zip(square.connectors, (True, True, False, False), strict=True):
         line.set_visible(shown)
-    if facing[0]:  # the map is on the left, and so would be the numbers, under the lines
-        under.yaxis.tick_right()
+    under.yaxis.tick_right()
     # Drawn before the map, for its place is known then alone, and the lines end at its corners.
     under.set_zorder(axes.get_zorder() - 1)
-
-
-def _corners_facing(axes: Axes, under: Axes) -> tuple[bool, bool, bool, bool]:
-    """Say which corners of the panel face the map (lower left, upper left, lower right, upper right)."""
-    map_place, place = (one.get_subplotspec() for one in (axes, under))
-    assert map_place is not None
-    assert place is not None
-    below = place.rowspan.start >= map_place.rowspan.stop
-    return (not below, True, False, below)
 
 
 def _name(run: Run) -> str:
