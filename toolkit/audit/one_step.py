@@ -136,7 +136,8 @@ def _explained_px(sequence: Sequence, intervals: Intervals, own_px: float) -> fl
         depth_m = float(np.median(triangulate(uv_px, sequence.rig)[:, 2])) if len(uv_px) else np.inf
         moved_px = focal_px / depth_m * np.sqrt(step_s) * float(np.max(noise.velocity_noise_density))
     if isinstance(noise, ImuNoise):
-        scatter_radps = white_sigma(intervals.w_radps - intervals.w_seen_radps)
+        seen = intervals.w_seen_radps
+        scatter_radps = np.minimum(white_sigma(intervals.w_radps - seen), white_sigma(seen))  # clocks may differ
         mixed_px = focal_px * step_s * float(np.sqrt(np.mean(scatter_radps**2)))
     return float(np.sqrt(own_px**2 + turned_px**2 + moved_px**2 + mixed_px**2))
 
