@@ -11,11 +11,21 @@ import pytest
 from toolkit.audit import Finding, audit
 from toolkit.audit.calibration import gyro_scale
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.samples import coarse_samples, exchanged_samples, implausible, overstated_noise, stuck_samples
+from toolkit.audit.samples import (
+    coarse_samples,
+    exchanged_samples,
+    gravity_removed,
+    implausible,
+    overstated_noise,
+    stuck_samples,
+    understated_noise,
+    units,
+)
 from toolkit.audit.samples import saturated_samples as saturated
-from toolkit.geometry import Array
+from toolkit.geometry import Array, interpolate_poses
 from toolkit.measurements import ImuNoise, TwistNoise
 from toolkit.models.noise import white_sigma
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -228,6 +238,35 @@ def test_a_thousand_times_the_noise_of_an_imu_is_reported_by_its_name(name: str,
     assert reported is not None and reported.warns
     assert name in reported.detail
     assert overstated_noise(Evidence(replace(flight, noise=noise.scaled(10.0)))) is None  # room for vibration
+
+
+@pytest.mark.parametrize("name", ["accel", "gyro"])
+def test_noise_that_is_understated_is_reported_by_its_name_and_a_shaken_sensor_is_not(name: str) -> None:
+    flight = recording("flight")
+    noise, key = flight.noise, f"{name}_noise_density"
+    assert isinstance(noise, ImuNoise)
+    reported = understated_noise(Evidence(replace(flight, noise=replace(noise, **{key: getattr(noise, key) / 50.0}))))
+    assert reported is not None and reported.warns
+    assert key in reported.detail
+    assert understated_noise(Evidence(replace(flight, noise=noise.scaled(1.0 / 15.0)))) is None
+
+
+def test_gravity_that_was_taken_out_is_no_unit() -> None:
+    """What is left of a flight's accelerations is a tenth of gravity in the median, as values in g are."""
+    flight = recording("flight")
+    motion, truth = flight.motion, flight.truth
+    assert isinstance(motion, ImuSamples) and truth is not None
+    R_world_imu = interpolate_poses(truth.t_ns, truth.T_world_imu, np.clip(motion.t_ns, *truth.t_ns[[0, -1]]))[
+        :, :3, :3
+    ]
+    left = motion.accel_mps2 + np.einsum("nji,j->ni", R_world_imu, flight.gravity_world)
+    for scale in (1.0, 9.81 * 0.102 / np.median(np.linalg.norm(left, axis=1))):
+        removed = replace(flight, motion=ImuSamples(motion.t_ns, scale * left, motion.gyro_radps))
+        assert "gravity was taken out" in gravity_removed(Evidence(removed)).detail
+        assert units(Evidence(removed)) is None
+    in_g = replace(flight, motion=ImuSamples(motion.t_ns, motion.accel_mps2 / 9.80665, motion.gyro_radps))
+    assert gravity_removed(Evidence(in_g)) is None
+    assert "it is in g" in units(Evidence(in_g)).detail
 
 
 ORDERS = [((0, 1, 2), (-1.0, -1.0, -1.0)), ((0, 1, 2), (1.0, 1.0, -1.0)), ((1, 0, 2), (1.0, 1.0, 1.0))]

@@ -265,6 +265,54 @@ def test_poses_of_another_frame_are_moved_to_the_body(asl: Path, tmp_path: Path)
     np.testing.assert_allclose(truth.T_world_imu, expected.T_world_imu, atol=1e-9)
 
 
+UNKNOWN = "uint64 timestamp\nfloat32[3] gyro_rad\nfloat32[3] accelerometer_m_s2\n"
+
+
+def test_a_topic_of_another_type_that_measures_the_motion_or_holds_images_is_named(asl: Path, tmp_path: Path) -> None:
+    ros = Ros("sqlite", get_typestore(Stores.ROS2_HUMBLE))
+    px4, packet = "px4_msgs/msg/SensorCombined", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+    ros.store.register({**get_types_from_msg(UNKNOWN, px4), **get_types_from_msg("uint8[] data\n", packet)})
+    film = [item for item in film_of(asl, Ros.of("sqlite")) if item.topic != "/imu0"]
+    sample = ros.store.types[px4](0, np.zeros(3, np.float32), np.zeros(3, np.float32))
+    film.append(Item(film[0].t_ns, "/fmu/out/combined", px4, sample))
+    with pytest.raises(DataError, match=r"/fmu/out/combined \(px4_msgs/SensorCombined\) may measure the motion"):
+        load_sequence(str(ros.write(tmp_path / "px4", film)))
+    packed = Item(film[0].t_ns, "/left/packets", packet, ros.store.types[packet](np.zeros(3, np.uint8)))
+    with pytest.raises(DataError, match=r"/left/packets .* may hold some: write them as sensor_msgs/Image"):
+        load_sequence(str(ros.write(tmp_path / "packed", [packed, *motion_of(asl, Ros.of("sqlite"))])))
+
+
+def test_a_truth_keeps_the_poses_it_has_or_is_of_positions_alone_or_left_out(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("sqlite")
+    film, whole = film_of(asl, ros), load_sequence(str(asl)).truth
+    assert whole is not None
+    posed = [item for item in film if item.topic == "/ground_truth/pose"]
+    posed[3].value.pose.position.x = np.nan
+    lost = load_sequence(str(written(asl, "sqlite", tmp_path / "nan", film)))
+    assert (
+        f"1 of {len(posed)} poses of /ground_truth/pose are not finite and left out of the truth"
+        in lost.provenance.facts
+    )
+    assert lost.truth is not None
+    alone = "the truth is of positions alone"
+    for item in posed:
+        item.value.pose.orientation.w = item.value.pose.orientation.x = 0.0
+        item.value.pose.orientation.y = item.value.pose.orientation.z = 0.0
+    zero = load_sequence(str(written(asl, "sqlite", tmp_path / "zero", film)))
+    assert any(alone in fact for fact in zero.provenance.facts)
+    assert zero.truth is not None and (zero.truth.T_world_imu[:, :3, :3] == np.eye(3)).all()
+    assert load_sequence(str(tmp_path / "zero/film"), 0, Frontend(topics="truth=none")).truth is None
+    points = []
+    for item in posed:
+        value = ros.make("geometry_msgs/PointStamped", item.value.header, item.value.pose.position)
+        points.append(Item(item.t_ns, "/leica/position", bag_reader.POINT, value))
+    film = [*(item for item in film if item not in posed), *points]
+    path = written(asl, "sqlite", tmp_path / "point", film)
+    assert load_sequence(str(path)).truth is None
+    prism = load_sequence(str(path), 0, Frontend(topics="truth=/leica/position"))
+    assert any(alone in fact for fact in prism.provenance.facts)
+
+
 def test_topics_are_those_stated(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("sqlite")
     film = [

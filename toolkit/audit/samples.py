@@ -428,6 +428,37 @@ def overstated_noise(evidence: Evidence) -> Symptom | None:
     )
 
 
+# Limit of the samples' own scatter over the stated one. Rotors shake an accelerometer 15 times as much as stated, in
+# the quietest tenth of V1_01_easy too; units that were not converted and values of a bench are beyond.
+MOST_BEYOND_STATED = 20.0
+QUIET_S, QUIETEST = 0.5, 0.1
+
+
+def understated_noise(evidence: Evidence) -> Symptom | None:
+    """Report an IMU whose samples scatter far more than the stated noise, on every axis and where they are quietest."""
+    motion, noise = evidence.sequence.motion, evidence.sequence.noise
+    if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)) or motion.t_ns.size < LEAST_SAMPLES:
+        return None
+    step_s, found = usual_step_s(motion.t_ns), list[str]()
+    count = max(round(QUIET_S / max(step_s, 1e-6)), LEAST_SAMPLES // 5)
+    for name, (_, _, columns, unit) in zip(("accel", "gyro"), SENSORS["imu"], strict=True):
+        parts = np.array_split(motion.values[:, columns], max(len(motion.values) // count, 1))
+        measured = float(np.quantile([white_sigma(part).min() for part in parts], QUIETEST))
+        stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s) if step_s > 0.0 else np.inf
+        if measured > MOST_BEYOND_STATED * stated:
+            summary = (
+                f"by {name}_noise_density samples scatter by {stated:.2g} {unit}, and where they are quietest they"
+            )
+            found.append(f"{summary} do by {measured:.2g}, {measured / stated:.0f} times as much")
+    if not found:
+        return None
+    treatment = (
+        "estimators given this noise trust the IMU too much: state the densities of the sensor in motion, in SI and "
+        "not in g and degrees"
+    )
+    return Symptom.warning("; ".join(found), treatment, count=len(found))
+
+
 def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
     """Yield a description of each stated density that samples (S, 6) at times (S,) contradict, with both figures."""
     step_s = float(np.median(np.diff(t_s)))
@@ -510,6 +541,46 @@ def _sizes(sequence: Sequence) -> str:
     first, second = (float(np.median(np.linalg.norm(half, axis=1))) for half in np.split(sequence.motion.values, 2, 1))
     unit = "m/s^2" if sequence.motion_kind == "imu" else "m/s"
     return f"{first:.2g} {unit} and {second:.2g} rad/s (medians)"
+
+
+# A specific force whose median is below this share of gravity lacks it. One in g has a size that hardly changes over a
+# recording, averaged over this time (s): its range is less than this share of it (0.2 in the recordings at hand).
+LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE = 0.5, 0.25, 0.5
+
+
+def gravity_removed(evidence: Evidence) -> Symptom | None:
+    """Report an accelerometer whose driver took gravity out of what it measures: the motion's acceleration is left."""
+    ratio = force_ratio(evidence.sequence)
+    if ratio is None or not _lacks_gravity(evidence.sequence):
+        return None
+    size = (
+        f"{ratio.value:.2g} times gravity (median), which changes by {_range_of_force(evidence.sequence):.0%} of that"
+    )
+    return Symptom(
+        1,
+        f"the accelerometer reads {size}: gravity was taken out of it",
+        "record the specific force, which is gravity at rest: the raw topic of the sensor, not a linear acceleration",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _lacks_gravity(sequence: Sequence) -> bool:
+    """Say whether a specific force is far below gravity, and not one in g, which is as large and hardly changes."""
+    ratio = force_ratio(sequence)
+    if ratio is None or not ratio.value < LEAST_GRAVITY:
+        return False
+    is_as_large = _in_other_unit(ratio, FORCES, WITHIN_FACTOR, UNIT_SIGMAS) is not None
+    return not (is_as_large and _range_of_force(sequence) < STEADY_RANGE)
+
+
+def _range_of_force(sequence: Sequence) -> float:
+    """Return the range (5 to 95 %) of the size of the specific force, averaged over a time, over its median."""
+    motion = sequence.motion
+    count = max(round(AVERAGED_S / max(usual_step_s(motion.t_ns), 1e-6)), 1)
+    parts = np.array_split(motion.values[:, _LINEAR], max(len(motion.values) // count, 1))
+    low, median, high = np.quantile([np.linalg.norm(part.mean(axis=0)) for part in parts], [0.05, 0.5, 0.95])
+    return float((high - low) / median) if median > 0.0 else np.inf
 
 
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
@@ -665,7 +736,7 @@ _QUANTITIES = (
     ),
     _Quantity(
         "the accelerometer reads {:.3g} times gravity (median)",
-        lambda sequence, _: force_ratio(sequence),
+        lambda sequence, _: None if _lacks_gravity(sequence) else force_ratio(sequence),
         FORCES,
         WITHIN_FACTOR,
         _LINEAR,

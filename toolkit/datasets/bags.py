@@ -20,7 +20,7 @@ from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
 from toolkit.datasets.io.ros_values import Mounted, Recorded, mounted, recorded
 from toolkit.datasets.io.truth import truth_near, with_truth
-from toolkit.datasets.trajectories.formats import checked_poses
+from toolkit.datasets.trajectories.formats import checked_poses, known_poses, states_turns
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, StampedPair, matched_corners
 from toolkit.frontend.cache import ImageSpool
@@ -154,17 +154,26 @@ def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     if topic is None or not messages:
         return None, ()
     t_ns, first = np.unique(_stamps_ns(messages), return_index=True)
-    poses = ros_values.poses_of([message.value for message in messages], topic.type)[first]
-    T_world_child = checked_poses(Path(f"{source.path}: {topic.name}"), first.tolist(), t_ns, poses)
+    values = ros_values.poses_of([message.value for message in messages], topic.type)[first]
+    kept = known_poses(values)
+    if not kept.any():
+        return None, (f"no pose of {topic.name} is finite: it is left out, and there is no truth",)
+    what = Path(f"{source.path}: {topic.name}")
+    T_world_child = checked_poses(what, first[kept].tolist(), t_ns[kept], values[kept], "message")
+    lost = int((~kept).sum())
+    remarks = (f"{lost} of {kept.size} poses of {topic.name} are not finite and left out of the truth",) if lost else ()
+    if not states_turns(values).any():
+        alone = f"{topic.name} states no orientation (its quaternions are 0 or NaN): the truth is of positions alone"
+        return Truth(t_ns[kept], T_world_child), (*remarks, alone)
     body, child = source.body, ros_values.frame_name(getattr(messages[0].value, "child_frame_id", ""))
     T_child_body = source.tree.between(child, body)
     if T_child_body is not None:
-        return Truth(t_ns, T_world_child @ T_child_body), ()
+        return Truth(t_ns[kept], T_world_child @ T_child_body), remarks
     whose = (
         f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
         "body's"
     )
-    return Truth(t_ns, T_world_child), (whose,) if child and child != body else ()
+    return Truth(t_ns[kept], T_world_child), (*remarks, whose) if child and child != body else remarks
 
 
 def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progress) -> tuple[str, ...]:
@@ -216,10 +225,15 @@ def _twists(source: Recorded) -> TwistSamples:
     path, topic = source.path, source.chosen.twist
     if topic is None:
         others = ", ".join(source.chosen.other_twists)
+        missing = "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion"
+        if source.chosen.like_imus and not others:
+            raise DataError(
+                f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read; "
+                f"{', '.join(source.chosen.like_imus)} may measure the motion: convert it to sensor_msgs/Imu (m/s^2, "
+                "rad/s; its axes, PX4's x forward, y right, z down, are those that the camera stands on)"
+            )
         remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one with the images"
-        raise DataError(
-            f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; {remedy}"
-        )
+        raise DataError(f"{path}: {missing}; {remedy}")
     messages = _messages_of(source, topic)
     values = [message.value for message in messages]
     linear, angular = (ros_values.columns(values, part) for part in ros_values.VECTORS[topic.type])

@@ -50,8 +50,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST, TWIST_COV = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
 POSE_COV = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POINT = "geometry_msgs/msg/PointStamped"
 KNOWN_TYPES = frozenset(
-    {IMAGE, COMPRESSED, CAMERA_INFO, IMU, *TRANSFORMS, ODOMETRY, TWIST, TWIST_COV, POSE, POSE_COV, TRANSFORM}
+    {IMAGE, COMPRESSED, CAMERA_INFO, IMU, *TRANSFORMS, ODOMETRY, TWIST, TWIST_COV, POSE, POSE_COV, TRANSFORM, POINT}
 )
 _IMAGES, _POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE, POSE_COV, TRANSFORM)
 ROLES: dict[str, tuple[str, ...]] = {
@@ -62,7 +63,8 @@ ROLES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "accel": (IMU,),
     "twist": (ODOMETRY, TWIST, TWIST_COV),
-    "truth": _POSES,
+    # A point is taken for a truth only where it is said: it may be a goal.
+    "truth": (*_POSES, POINT),
 }
 # What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
 _SIDES = (("0", "1"), ("1", "2"), ("l", "r"))
@@ -75,20 +77,46 @@ _STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
 # Of a message that lists the topics of a bag, which may be hundreds.
 _LONGEST = 900
 _COMPRESSED_SUFFIX = "/compressed"
+# What names and definitions of other types have that measure motion, or hold images, and types that do neither.
+_LIKE_IMU = re.compile(r"gyro|accelerometer|angular_velocity|(^|[^a-z])imu", re.IGNORECASE)
+_LIKE_IMAGES = re.compile(r"ffmpeg|image|video|theora|h264|h265", re.IGNORECASE)
+_OF_ROS = (
+    "rcl_interfaces/",
+    "rosgraph_msgs/",
+    "diagnostic_msgs/",
+    "tf2_msgs/",
+    "std_msgs/",
+    "nav_msgs/",
+    "geometry_msgs/",
+)
+_NONE = "none"
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its name, the type of its messages, how many there are, and why they cannot be read."""
+    """A topic of a bag: its name, the type of its messages, how many there are, and why they cannot be read.
+
+    ``fields`` is the definition of a type that is not read, as far as the bag has it.
+    """
 
     name: str
     type: str
     count: int
     unreadable: str = ""
+    fields: str = ""
+
+    def is_like(self, words: re.Pattern[str]) -> bool:
+        """Say whether a topic of a type that is not read is called, or holds, something that words are about."""
+        is_other = self.type not in KNOWN_TYPES and not self.type.startswith(_OF_ROS)
+        return is_other and any(words.search(text) for text in (self.name, self.type, self.fields))
 
     def __str__(self) -> str:
         why = f", {self.unreadable}" if self.unreadable else ""
         return f"{printable(self.name)} ({printable(self.type).replace('/msg/', '/')}{why})"
+
+
+# The topics asked for by role, None of a truth that is left out.
+Given = dict[str, Topic | None]
 
 
 class Message(NamedTuple):
@@ -166,7 +194,8 @@ class Bag:
         types = sorted({connection.msgtype for connection in connections})
         count = sum(connection.msgcount or 0 for connection in connections)
         unreadable = "" if types[0] not in KNOWN_TYPES else self._why_not(connections)
-        return Topic(name, types[0] if len(types) == 1 else " and ".join(types), count, unreadable)
+        fields = "" if types[0] in KNOWN_TYPES else str(connections[0].msgdef.data)
+        return Topic(name, types[0] if len(types) == 1 else " and ".join(types), count, unreadable, fields)
 
     def _why_not(self, connections: list[Any]) -> str:
         """Return why messages of a known type cannot be read, nothing where they can."""
@@ -319,7 +348,8 @@ class Chosen:
     """The topics of a recording by role, None where there is none, and remarks on the choice.
 
     ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
-    transforms that may change, and ``other_imus`` those that were not chosen.
+    transforms that may change, ``other_imus`` those that were not chosen, and ``like_imus`` those of types that are not
+    read.
     """
 
     left: Topic
@@ -334,6 +364,7 @@ class Chosen:
     moving: tuple[Topic, ...]
     other_imus: tuple[str, ...]
     other_twists: tuple[str, ...]
+    like_imus: tuple[str, ...] = ()
     facts: tuple[str, ...] = ()
 
     @property
@@ -347,7 +378,7 @@ def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen
     given = _requested(path, topics, requested)
     usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
     left, right = _pair(path, topics, usable, given)
-    truth = given.get("truth") or _truth(usable)
+    truth = given.get("truth", _truth(usable))
     imus = _of_types(usable, (IMU,))
     imu = given.get("imu") or (None if "twist" in given else _imu(imus))
     accel = given.get("accel") or _partner(imu, imus)
@@ -365,17 +396,22 @@ def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen
         moving=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
         other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
         other_twists=tuple(topic.name for topic in _of_types(usable, ROLES["twist"])),
+        like_imus=tuple(str(one) for one in topics if one.is_like(_LIKE_IMU) or (one.type == IMU and one.unreadable)),
     )
     return replace(chosen, facts=_facts(topics, chosen, given))
 
 
-def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> dict[str, Topic]:
-    """Return the topics asked for by role, as in left=/cam0/image_raw,imu=/imu0."""
-    by_name, given = {topic.name: topic for topic in topics}, {}
+def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Given:
+    """Return the topics asked for by role, as in left=/cam0/image_raw,imu=/imu0; None of a truth that is left out."""
+    by_name = {topic.name: topic for topic in topics}
+    given: Given = {}
     for part in filter(None, (text.strip() for text in (requested or "").split(","))):
         role, equals, name = (text.strip() for text in part.partition("="))
         if not equals or role not in ROLES:
             raise DataError(f"--topics: {no_such('role', role, ROLES)}; write left=/cam0/image_raw,right=...,imu=...")
+        if (role, name) == ("truth", _NONE):
+            given[role] = None
+            continue
         if name not in by_name:
             raise DataError(f"{path}: {no_such('topic', name, by_name)}"[:_LONGEST])
         topic = by_name[name]
@@ -386,15 +422,17 @@ def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> di
             raise DataError(f"{path}: --topics names {role} twice; leave one out")
         given[role] = topic
     for left, right in (("left", "right"), ("left_info", "right_info")):
-        if left in given and given[left] == given.get(right):
-            raise DataError(f"{path}: --topics names {given[left].name} as {left} and {right}; a pair has a topic each")
+        same = given.get(left)
+        if same is not None and same == given.get(right):
+            raise DataError(f"{path}: --topics names {same.name} as {left} and {right}; a pair has a topic each")
     return given
 
 
-def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: dict[str, Topic]) -> tuple[Topic, Topic]:
+def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
     """Return the topics of the left and the right images."""
-    if "left" in given and "right" in given:
-        return given["left"], given["right"]
+    left, right = given.get("left"), given.get("right")
+    if left is not None and right is not None:
+        return left, right
     images = [topic for topic in _of_types(usable, _IMAGES) if topic.count >= _LEAST_IMAGES]
     pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
     pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
@@ -411,6 +449,10 @@ def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> st
     there = ", ".join(map(str, topics)) or "no topics"
     if not images:
         why = "holds no images that can be read, and the tracks are made of them"
+        packed = [str(topic) for topic in topics if topic.is_like(_LIKE_IMAGES)]
+        if packed:
+            may = f"{' and '.join(packed)} may hold some"
+            why += f"; {may}: write them as sensor_msgs/Image with image_transport republish"
     elif len(images) == 1:
         why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
     else:
@@ -487,7 +529,7 @@ def _most(topics: Iterable[Topic]) -> Topic | None:
     return max(sorted(topics, key=lambda topic: topic.name), key=lambda topic: topic.count, default=None)
 
 
-def _facts(topics: Sequence[Topic], chosen: Chosen, given: dict[str, Topic]) -> tuple[str, ...]:
+def _facts(topics: Sequence[Topic], chosen: Chosen, given: Given) -> tuple[str, ...]:
     """Return remarks on the topics by role, given or guessed, and on those that are not used."""
     found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
     named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from toolkit.datasets.io.bag_reader import (
     IMU,
     ODOMETRY,
+    POINT,
     POSE,
     POSE_COV,
     TRANSFORM,
@@ -199,7 +200,9 @@ def columns(values: Sequence[Any], part: str, axes: str = "xyz") -> Array:
 
 
 def poses_of(values: Sequence[Any], message_type: str) -> Array:
-    """Return x y z qx qy qz qw (N, 7) of messages of a type that has poses."""
+    """Return x y z qx qy qz qw (N, 7) of messages of a type that has poses; a point's quaternion is NaN."""
+    if message_type == POINT:
+        return np.hstack([columns(values, "point"), np.full((len(values), 4), np.nan)])
     at, turn = _POSES[message_type]
     return np.hstack([columns(values, at), columns(values, turn, "xyzw")])
 

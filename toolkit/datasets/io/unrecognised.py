@@ -17,6 +17,10 @@ _ARCHIVES = {
     b"PK\x03\x04": "zip",
     b"7z\xbc\xaf": "7-zip",
 }
+_UNPACKED_BY = {
+    **{"gzip": "gunzip", "zstd": "unzstd", "bzip2": "bunzip2", "xz": "unxz"},
+    **{"zip": "unzip", "7-zip": "7z x", "tar": "tar xf"},
+}
 # Archives of NumPy arrays, which need not be unpacked.
 _ARRAYS = ".npz"
 _TAR, _TAR_AT = b"ustar", 257
@@ -48,7 +52,21 @@ def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
             f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
         )
     inside = [printable(str(entry.relative_to(path))) for entry in _recordings_in(path, recognised)]
+    if not inside and (packed := _packed_in(path)):
+        return packed
     return f"is not a recording, but contains some: name {' or '.join(inside)} in it" if inside else ""
+
+
+def _packed_in(folder: Path) -> str:
+    """Return which files in a folder are packed, and how each is unpacked; empty where none is."""
+    files = [entry for entry in islice(sorted(folder.iterdir()), _LOOKED_AT) if is_regular(entry)]
+    packed = {file.name: how for file in files if file.suffix != _ARRAYS and (how := _archive(file)) is not None}
+    if not packed:
+        return ""
+    named = printable(", ".join(f"{name} with {_UNPACKED_BY[how]}" for name, how in list(packed.items())[:_NAMED]))
+    of_rosbag2 = any(ending in name for name in packed for ending in (".db3", ".mcap"))
+    lost = " (metadata.yaml is missing; a single one is read without it)" if of_rosbag2 else ""
+    return f"holds packed files: unpack {named}{lost} and remove what was packed; as it stands it is of no known format"
 
 
 def _of_file(path: Path) -> str:

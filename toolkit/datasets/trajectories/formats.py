@@ -472,7 +472,7 @@ def _begins_with_row_numbers(rows: Rows) -> bool:
 
 def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> PosesFile:
     """Return checked poses of rows (N, 7), those left out that are not known."""
-    kept = _known(values)
+    kept = known_poses(values)
     numbers = [n for n, is_kept in zip(rows.line_numbers, kept.tolist(), strict=True) if is_kept]
     if not numbers:
         raise DataError(f"{rows.path}: no line holds a position that is finite; write it again")
@@ -483,7 +483,7 @@ def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> Pose
 
 def _lines_unknown(numbers: list[int], t_ns: IntArray, values: Array) -> str:
     """Say which lines hold no pose that is known, and when that is."""
-    bad = np.flatnonzero(~_known(values))
+    bad = np.flatnonzero(~known_poses(values))
     what = "a quaternion of zeros" if np.isfinite(values[bad]).all() else "a value that is not finite"
     if bad.size == 1:
         return f"line {numbers[bad[0]]} holds {what}; remove the line"
@@ -493,14 +493,15 @@ def _lines_unknown(numbers: list[int], t_ns: IntArray, values: Array) -> str:
     return f"{lines} ({first_s:.1f} s after the first to {end})"
 
 
-def _known(values: Array) -> BoolArray:
+def known_poses(values: Array) -> BoolArray:
     """Say which rows (N, 7) hold a pose: a finite position, and a quaternion where any row states one."""
-    stated = _states_a_turn(values)
+    stated = states_turns(values)
     known = np.isfinite(values[:, :3]).all(axis=1)
     return np.asarray(known & stated if stated.any() else known)
 
 
-def _states_a_turn(values: Array) -> BoolArray:
+def states_turns(values: Array) -> BoolArray:
+    """Say which rows (N, 7) state a quaternion, which is neither NaN nor zero."""
     return np.asarray(np.isfinite(values[:, 3:]).all(axis=1) & values[:, 3:].any(axis=1))
 
 
@@ -510,7 +511,7 @@ def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: A
     Where no row states a quaternion, because all are zero or NaN, the orientations are the identity. Raises DataError,
     naming the ``row``, where a value is not finite, time does not increase or a quaternion is not of unit length.
     """
-    if not _states_a_turn(values).any():
+    if not states_turns(values).any():
         values = np.hstack([values[:, :3], np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))])
     checks = (
         (np.isfinite(values).all(axis=1), f"holds a value that is not finite; remove the {row}"),
