@@ -28,7 +28,9 @@ _BLOCKS = ("variance", "pose", "vel", "bias")
 ADDED = {
     "end_drift_percent": ["clock_offset_ms", "clock_offset_error_ms"],
     "heldout_reproj_rmse_px": ["heldout_over_motion", "heldout_over_motion_error"],
-    "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"],
+    "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"]
+    + [f"inside_{percent}_{block}_percent" for block in ("pose", "ori", "pos") for percent in (50, 90, 95)]
+    + ["log_score_pose", "log_score_ori", "log_score_pos", "energy_ori_deg", "energy_pos_m"],
     "nis_mean": ["gate_accepted_percent", "correction_trend", "correction_trend_limit"],
     "pairs": ["efficiency_percent", "bound_position_m", "bound_rotation_deg", "error_over_bound"]
     + [f"{kind}_{block}" for kind in ("excess", "claimed") for block in _BLOCKS],

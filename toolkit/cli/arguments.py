@@ -290,6 +290,16 @@ PART = (
     arg("--max-frames N", "use the first N of these frames only", at_least(2)),
 )
 WORKERS = arg("--workers N", "processes side by side (default: one a CPU)", at_least(1, MOST_WORKERS))
+# Repeated from toolkit.datasets.trajectories.covariances (a test compares them), as the help is to come at once.
+COV_CONVENTIONS = tuple(
+    f"{order}/{kind}" for order in ("rot-pos", "pos-rot") for kind in ("right", "left", "fixed", "mixed")
+)
+COV_CONVENTION = arg(
+    "--cov-convention NAME",
+    "of covariances where a file of trajectories does not say it: which block is first, and which error they are of "
+    f"({', '.join(COV_CONVENTIONS)}; see docs/conventions.md)",
+    choices=COV_CONVENTIONS,
+)
 REPAIR = OneOf(
     (
         flag("--no-repair", "report the faults of a recording, repair none"),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
+    COV_CONVENTION,
     WORKERS,
     arg,
     at_least,
@@ -44,6 +45,7 @@ MOST_RUNS = 10_000
         "pair each pose with the nearest one within S seconds, as evo does (default: interpolate)",
         positive_seconds,
     ),
+    COV_CONVENTION,
     arg("--offset S", "added to the trajectories' stamps", number_within("seconds", -1e9, 1e10), default=0.0),
     arg("--gap S", "the longest time between two poses that counts as covered", positive_seconds, default=5.0),
     flag("--imu", "the vertical is measured: place the first pose by heading and position only"),
@@ -55,7 +57,7 @@ MOST_RUNS = 10_000
     ),
     arg("--runs N", "expected runs of each system and sequence; missing ones count as failed", at_least(1, MOST_RUNS)),
     arg("--metric KEY", "metric that ranks and is tested", default="ate_se3_m"),
-    arg("--columns KEY,...", "metrics of the table, or all (default: the usual)", names, default=()),
+    arg("--columns KEY,...", "metrics of the table, uncertainty, or all (default: the usual)", names, default=()),
     choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text"),
     output("evaluation.json, and nothing else", "see the exit status and --out"),
     arg("--out DIR", "write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV", Path),
@@ -70,16 +72,18 @@ def evaluate(options: argparse.Namespace) -> int:
     medians over runs, ranks and paired tests over sequences, failures counted. See docs/evaluate.md.
     """
     from toolkit.cli.progress_display import of_this_process
+    from toolkit.datasets.trajectories.covariances import convention_called
     from toolkit.evaluation.gathering import gather
     from toolkit.evaluation.scoring import Terms
     from toolkit.evaluation.standings import evaluate
     from toolkit.experiment.workers import usable_cpus
     from toolkit.report.evaluation import check_evaluation_directory, write_evaluation
 
-    (ranked_by,), columns = _metrics((options.metric,)), _metrics(options.columns)
+    ranked_by, columns = _metric(options.metric), _metrics(options.columns)
     if options.out is not None:
         check_evaluation_directory(options.out)
-    terms = Terms(options.max_dt, options.offset, options.gap, options.imu, options.least_coverage)
+    convention = None if options.cov_convention is None else convention_called(options.cov_convention)
+    terms = Terms(options.max_dt, options.offset, options.gap, options.imu, options.least_coverage, convention)
     gathered = gather(options.truth, options.given, options.runs)
     with of_this_process()(f"{len(gathered.items)} trajectories") as progress:
         found = evaluate(gathered, terms, ranked_by.key, progress, options.workers or usable_cpus())
@@ -108,11 +112,21 @@ def _shown(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argpar
     return f"{texts.evaluation_text(found, columns, width_of_output())}\n{where}"
 
 
+def _metric(key: str) -> Metric:
+    """Return a metric by its key; raises UsageError for one that trajectories do not have."""
+    from toolkit.evaluation.scoring import METRICS
+
+    by_key = {metric.key: metric for metric in METRICS}
+    return by_key[known_names("metric of a trajectory", (key,), by_key)[0]]
+
+
 def _metrics(keys: tuple[str, ...]) -> tuple[Metric, ...]:
     """Return metrics by their keys; raises UsageError for one that trajectories do not have."""
     from toolkit.evaluation.scoring import METRICS
+    from toolkit.metrics import uncertainty
 
     if keys == ("all",):
         return METRICS
-    by_key = {metric.key: metric for metric in METRICS}
-    return tuple(by_key[key] for key in known_names("metric of a trajectory", keys, by_key))
+    by_key = {metric.key: (metric,) for metric in METRICS} | {uncertainty.GROUP: uncertainty.METRICS}
+    chosen = known_names("metric of a trajectory", keys, by_key)
+    return tuple(metric for key in chosen for metric in by_key[key])

@@ -4,9 +4,9 @@ The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so
 paired on the stamps of the sparser of both, between whose neighbours the other is interpolated. ``max_dt_s`` asks for
 the rule of evo (Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017) instead: the nearest pose.
 
-A file may state two covariances for each pose: of its orientation, whose error is a turn of the body frame, and of its
-position, in the estimate's world, as OpenVINS has them. Their NEES: Bar-Shalom, Li and Kirubarajan, "Estimation with
-applications to tracking and navigation" (2001), section 5.4.
+A file may state covariances, which are judged as an estimator's are. So may the one in the place of the truth: it is
+then another estimate of the same run, and a difference is compared with the sum of both covariances. Errors that both
+share cancel in it, so that this finds too little, and never too much.
 """
 
 from collections.abc import Callable
@@ -27,12 +27,25 @@ from toolkit.datasets.trajectories.belonging import (
     other_axes,
     range_s,
 )
-from toolkit.datasets.trajectories.formats import PosesFile, StatedApart, check_order, read_finite_poses, read_rows
+from toolkit.datasets.trajectories.covariances import CovConvention
+from toolkit.datasets.trajectories.formats import PosesFile, check_order, read_finite_poses, read_rows
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
-from toolkit.geometry import Array, IntArray, se3_inverse, so3_log
+from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
+from toolkit.metrics import (
+    Metric,
+    Scores,
+    Unavailable,
+    ate,
+    clock_offset,
+    coverage,
+    drift,
+    kitti,
+    nees,
+    rpe,
+    uncertainty,
+)
 from toolkit.metrics.parts.against_truth import (
     STAMP_TOLERANCE_NS,
     AgainstTruth,
@@ -48,10 +61,13 @@ from toolkit.metrics.parts.consistency import (
     NOT_MET,
     NOT_PLACED,
     OTHER_WORLD,
-    PLACED,
+    BodyErrors,
+    StatedErrors,
     chi2_quantile,
+    nees_of,
+    with_covariances,
 )
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.metrics.parts.readings import likelier_reading
 from toolkit.sequence import content_digest
 
 TIME_COVERAGE = "time_coverage_percent"
@@ -65,7 +81,7 @@ COVERAGE = Metric(
     table="always",
 )
 _PAIRS = next(metric for metric in coverage.METRICS if metric.key == "pairs")
-_NEES_KEYS = ("nees_ori_mean", "nees_pos_mean")
+_NEES_KEYS = (*nees.OF_POSE, *(metric.key for metric in uncertainty.METRICS))
 METRICS: tuple[Metric, ...] = (
     *ate.METRICS,
     *rpe.METRICS,
@@ -73,6 +89,7 @@ METRICS: tuple[Metric, ...] = (
     *drift.METRICS,
     *clock_offset.METRICS,
     *(metric for metric in nees.METRICS if metric.key in _NEES_KEYS),
+    *uncertainty.METRICS,
     COVERAGE,
     _PAIRS,
 )
@@ -105,6 +122,10 @@ _TIMES = "times.txt"
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _NONE = "the file states no covariance"
+_NO_CONVENTION = "the file does not say what its covariances mean: name it with --cov-convention"
+_OF_TWO = (
+    "the truth states covariances: differences are compared with the sum of both, and what both share is not found"
+)
 
 
 @dataclass(frozen=True)
@@ -114,7 +135,7 @@ class Terms:
     ``max_dt_s`` pairs each pose with the nearest one that is no farther in time, None interpolates; ``offset_s`` is
     added to the stamps of the trajectories; ``gap_s`` is the longest time between two poses that counts as covered;
     ``level`` says that the vertical is measured, as by an IMU; a run that covers less than ``least_coverage_percent``
-    of the truth's time counts as failed.
+    of the truth's time counts as failed. ``cov_convention`` is that of covariances where a file does not say it.
     """
 
     max_dt_s: float | None = None
@@ -122,6 +143,7 @@ class Terms:
     gap_s: float = 5.0
     level: bool = False
     least_coverage_percent: float = 50.0
+    cov_convention: CovConvention | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +157,15 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class TruthFile(Poses):
-    """The truth of a sequence; its stamps are its lines where it has none, ``left_out`` are lines without a pose."""
+    """The truth of a sequence; its stamps are its lines where it has none, ``left_out`` are lines without a pose.
+
+    ``cov`` (N, d, d) is there where it is another estimate, and states covariances.
+    """
 
     name: str
     is_timed: bool
     left_out: str = ""
+    cov: Array | None = None
 
     @property
     def digest(self) -> str:
@@ -162,18 +188,20 @@ class TruthFile(Poses):
         return float(distance_along(self.poses[:, :3, 3])[-1])
 
 
-def read_truth(name: str, path: Path) -> TruthFile:
+def read_truth(name: str, path: Path, cov_convention: CovConvention | None = None) -> TruthFile:
     """Read the truth of a sequence, without the lines that hold no finite pose.
 
-    Raises DataError where it is none, or holds fewer than two poses.
+    ``cov_convention`` is that of its covariances where it has some and does not say it. Raises DataError where it is
+    none, or holds fewer than two poses.
     """
-    file = _with_times(read_finite_poses(path))
+    file = _with_times(read_finite_poses(path, cov_convention))
     if len(file) < 2:
         raise DataError(f"{path}: a truth of {len(file)} pose; give at least two")
     if file.other_order is not None and changes(file.T_world_imu[:, :3, :3]):
         check_order(path, file.T_world_imu, file.other_order)
     t_ns = _lines_ns(len(file)) if file.t_ns is None else file.t_ns
-    return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None, file.not_finite)
+    cov = None if file.covariances is None else file.covariances.of(file.T_world_imu)
+    return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None, file.not_finite, cov)
 
 
 def _with_times(file: PosesFile) -> PosesFile:
@@ -194,7 +222,7 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     Raises DataError where the file cannot be used or does not belong to the truth: a wrong clock, unit of time or of
     length, order of quaternions or number of lines is named.
     """
-    file = read_poses(path)
+    file = read_poses(path, terms.cov_convention)
     if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
         file = _with_times(file)
     estimate = _stamped(file, truth, terms.offset_s)
@@ -359,46 +387,56 @@ def _lines_ns(count: int) -> IntArray:
     return np.arange(count, dtype=np.int64) * _FRAME_NS
 
 
-def _nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
-    """Return the mean NEES of orientation and position over their 3 degrees of freedom, None with the reason.
+def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: bool) -> Scores:
+    """Return the scores of the stated covariances, None with the reason.
 
-    They are computed in the truth's world if the first pose is plausible there under its own covariances. Otherwise the
-    first pose is placed on the truth's, by heading and position alone where the vertical is measured (``level``).
+    The remark on them is where their convention, by the truth, is another one.
     """
+    covariances = file.covariances
+    if covariances is None:
+        return Scores.none(_NEES_KEYS, _NONE)
+    cov = covariances.of(file.T_world_imu)
+
+    def errors(cov: Array) -> StatedErrors:
+        return stated_against(cov, estimate, truth, level=level)
+
+    likelier = likelier_reading(covariances, file.T_world_imu, errors)
+    if cov is None:
+        return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
     try:
-        return _scores(file.covariances, estimate, truth, level=level)
+        stated = errors(cov)
     except Unavailable as reason:
         return Scores.none(_NEES_KEYS, str(reason))
+    scores = nees.of_stated(stated) | uncertainty.of_stated(stated)
+    remark = "; ".join(filter(None, (likelier, "" if truth.cov is None else _OF_TWO)))
+    return scores.remarked(_NEES_KEYS, remark)
 
 
-def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
-    if stated is None:
-        raise Unavailable(_NONE)
+def stated_against(cov: Array, estimate: Poses, truth: TruthFile, *, level: bool) -> StatedErrors:
+    """Return the errors of the poses that have a covariance, of (N, d, d), and a true pose, with the covariances.
+
+    They are in the truth's world if the first pose is plausible there under its own covariance. Otherwise the first
+    pose is placed on the truth's, by heading and position alone where the vertical is measured (``level``). Raises
+    Unavailable where there are none.
+    """
     met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
     if not met.any():
         raise Unavailable(NOT_MET)
-    poses, covs = estimate.poses[met], (stated.orientation[met], stated.position[met])
-    bad = sum(int((~np.isfinite(cov).all(axis=(1, 2)) | (_least_eigenvalue(cov) <= 0.0)).sum()) for cov in covs)
-    if bad:
-        raise Unavailable(f"{bad} of {2 * len(poses)} covariances are not positive definite")
-    first = _nees(true[:1], poses[:1], covs[0][:1], covs[1][:1])
-    placed = max(float(one[0]) for one in first) > chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0
-    if placed:
-        if not met[0]:
-            raise Unavailable(NOT_PLACED)
-        # The truth moves into the estimate's world, in which the covariances are stated.
-        true = place_first(poses[0], true[0], level).apply(true)
-    orientation, position = _nees(true, poses, *covs)
-    scores = Scores(dict(zip(_NEES_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
-    return scores.remarked(_NEES_KEYS, PLACED if placed else "")
+    if truth.cov is not None:
+        cov = cov[:, :6, :6] + truth.cov[_nearest(truth.t_ns, estimate.t_ns), :6, :6]
+    poses, rows = estimate.poses[met], np.flatnonzero(met)
+    errors = BodyErrors(estimate.t_ns[met], rows, se3_inverse(poses) @ true, poses, placed=False)
+    stated = with_covariances(errors, cov)
+    of_all = nees_of(stated)
+    if max(of_all.orientation[0], of_all.position[0]) <= chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0:
+        return stated
+    if not met[0]:
+        raise Unavailable(NOT_PLACED)
+    placed = place_first(true[0], poses[0], level).apply(poses)
+    return with_covariances(BodyErrors(errors.t_ns, rows, se3_inverse(placed) @ true, placed, placed=True), cov)
 
 
-def _nees(true: Array, poses: Array, cov_orientation: Array, cov_position: Array) -> tuple[Array, Array]:
-    turned = so3_log((se3_inverse(poses) @ true)[:, :3, :3])
-    moved = true[:, :3, 3] - poses[:, :3, 3]
-    return mahalanobis_squared(turned, cov_orientation) / 3.0, mahalanobis_squared(moved, cov_position) / 3.0
-
-
-def _least_eigenvalue(cov: Array) -> Array:
-    finite = np.where(np.isfinite(cov), cov, 0.0)
-    return np.asarray(np.linalg.eigvalsh(finite)[:, 0])
+def _nearest(t_ns: IntArray, at_ns: IntArray) -> IntArray:
+    """Return the indices (M,) of stamps (N,) nearest to others (M,)."""
+    after = np.clip(np.searchsorted(t_ns, at_ns), 1, t_ns.size - 1)
+    return np.asarray(np.where(at_ns - t_ns[after - 1] <= t_ns[after] - at_ns, after - 1, after))

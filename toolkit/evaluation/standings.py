@@ -253,7 +253,7 @@ def evaluate(
     Raises DataError where a truth cannot be used, or no run can. A single run that cannot be used counts as failed,
     with the reason, and so does a run that covers too little of the truth's time.
     """
-    truths = {name: read_truth(name, path) for name, path in gathered.truths.items()}
+    truths = {name: read_truth(name, path, terms.cov_convention) for name, path in gathered.truths.items()}
     by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
     units = [_Unit(name, path, by_sequence[name], terms) for name, path in gathered.truths.items()]
     scored: dict[Item, RunRecord] = {}
@@ -279,7 +279,7 @@ class _Unit:
 
 
 def _evaluated(unit: _Unit, progress: Progress) -> tuple[RunRecord, ...]:
-    truth = read_truth(unit.sequence, unit.truth)
+    truth = read_truth(unit.sequence, unit.truth, unit.terms.cov_convention)
     runs = []
     for i, item in enumerate(unit.items):
         progress.advance(i, len(unit.items))

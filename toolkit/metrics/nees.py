@@ -9,7 +9,15 @@ from collections.abc import Callable
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.consistency import PLACED, POSE_DOF, nees_band, nees_over_time, stated_errors
+from toolkit.metrics.parts.consistency import (
+    PLACED,
+    POSE_DOF,
+    UNCOUPLED,
+    StatedErrors,
+    nees_band,
+    nees_of,
+    stated_errors,
+)
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.models.gating import mahalanobis_squared
@@ -69,18 +77,19 @@ _OF_STATE = tuple(
     )
 )
 METRICS = (*_OF_POSE, *_OF_STATE)
+OF_POSE = tuple(metric.key for metric in _OF_POSE)
 
 
 def score(evaluation: Evaluation) -> Scores:
     """Score the stated covariances against the truth."""
-    return Scores.attempt(_OF_POSE, lambda: _of_pose(evaluation)) | Scores.attempt(
+    return Scores.attempt(_OF_POSE, lambda: of_stated(stated_errors(evaluation))) | Scores.attempt(
         _OF_STATE, lambda: _of_state(evaluation)
     )
 
 
-def _of_pose(evaluation: Evaluation) -> Scores:
-    """Score the stated covariances of poses against the truth."""
-    nees = nees_over_time(evaluation)
+def of_stated(stated: StatedErrors) -> Scores:
+    """Score the covariances of some errors; of the pose there is no value where its blocks are stated apart."""
+    nees = nees_of(stated)
     low, high = nees_band(POSE_DOF)
     scores = Scores(
         {
@@ -90,6 +99,8 @@ def _of_pose(evaluation: Evaluation) -> Scores:
             "nees_pose_in_band_percent": 100.0 * float(np.mean((nees.pose >= low) & (nees.pose <= high))),
         }
     )
+    if not nees.is_coupled:
+        scores = scores.without(("nees_pose_mean", "nees_pose_in_band_percent"), UNCOUPLED)
     return scores.remarked(scores.values, PLACED if nees.placed else "")
 
 

@@ -45,7 +45,7 @@ from toolkit.report.text import (
 # Beside the metric that ranks, where there are values.
 _USUAL = (
     *("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "rpe_100m_percent", "kitti_t_percent"),
-    *("nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
+    *("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
 )
 _OF_ORIENTATION = "ate_se3_deg"
 # What a terminal shows of long lists; evaluation.json has all.

@@ -6,19 +6,32 @@ here, as in every file, they are the IMU's. EuRoC: Burri et al., "The EuRoC micr
 OpenVINS: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020): its states, and the recording of its poses with
 two covariances, upper triangles row by row: of the orientation, whose error is a small turn of the IMU frame, and of
 the position in the world. JPL's quaternion of the world to the IMU has the same four numbers as Hamilton's of the IMU
-to the world.
+to the world. Behind the columns of TUM, EuRoC and OpenVINS' states a covariance may stand, as an upper triangle row by
+row, of the pose or of the state; the header says which one it is (:mod:`~toolkit.datasets.trajectories.covariances`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.trajectories.covariances import (
+    OPENVINS,
+    OURS,
+    STATE,
+    CovConvention,
+    StatedCovariances,
+    from_triangle,
+    said_in,
+    upper_triangle,
+    with_triangles_apart,
+    written_as,
+)
 from toolkit.datasets.trajectories.headings import Named, named_columns
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
@@ -46,7 +59,8 @@ class Rows:
 
     There is at least one line; ``commas`` is True where commas separate the cells, and not blanks; ``underscored``
     where a cell has an underscore, for Python takes 1_0 for ten and no other program does. ``heading`` are the names of
-    the columns, where a line above the first row has as many words as that has cells.
+    the columns, where a line above the first row has as many words as that has cells; ``header`` has all comments
+    before that row.
     """
 
     path: Path
@@ -55,6 +69,7 @@ class Rows:
     commas: bool
     underscored: bool = False
     heading: tuple[str, ...] = ()
+    header: str = ""
 
     @property
     def width(self) -> int:
@@ -118,7 +133,8 @@ def read_rows(path: Path, kind: str) -> Rows:
     headings = [one for one in headings if len(one) == len(cells[0]) and named_columns(one) is not None]
     heading = tuple(headings[-1]) if headings else ()
     underscored = "_" in text and any("_" in line for line in lines)
-    return Rows(path, line_numbers, cells, separator is not None, underscored, heading)
+    header = "\n".join(takewhile(lambda line: line.lstrip().startswith("#"), text.splitlines()))
+    return Rows(path, line_numbers, cells, separator is not None, underscored, heading, header)
 
 
 def stamp_text(t_ns: int) -> str:
@@ -168,23 +184,12 @@ class OtherOrder:
 
 
 @dataclass(frozen=True, eq=False)
-class StatedApart:
-    """Covariances (N, 3, 3) without what couples them: of orientations, rad^2 in the body frame, and of positions.
-
-    Those of positions are m^2 in the world frame.
-    """
-
-    orientation: Array
-    position: Array
-
-
-@dataclass(frozen=True, eq=False)
 class PosesFile:
     """The poses (N, 4, 4) of a trajectory file, their stamps (N,) ns, and how its quaternions might be misread.
 
-    Stamps are None where the format has none, and the order where it has no quaternions. ``covariances`` are those of
-    the orientation and of the position, where the file has them. Orientations are all the identity where it has none.
-    ``not_finite`` says which lines are left out, because they hold no finite pose.
+    Stamps are None where the format has none, and the order where it has no quaternions. Velocities (N, 3), biases
+    (N, 6) [accel, gyro] and ``covariances`` are there where the file has them. Orientations are all the identity where
+    it has none. ``not_finite`` says which lines are left out, because they hold no finite pose.
     """
 
     path: Path
@@ -192,11 +197,20 @@ class PosesFile:
     t_ns: IntArray | None
     T_world_imu: Array
     other_order: OtherOrder | None
-    covariances: StatedApart | None = None
+    covariances: StatedCovariances | None = None
+    v_world: Array | None = None
+    bias: Array | None = None
     not_finite: str = ""
 
     def __len__(self) -> int:
         return len(self.T_world_imu)
+
+    def with_convention(self, unless_said: CovConvention | None) -> "PosesFile":
+        """Return the file with a convention for its covariances, where it has some and does not say it."""
+        stated = self.covariances
+        if stated is None or stated.convention is not None:
+            return self
+        return replace(self, covariances=replace(stated, convention=unless_said))
 
     def whole(self) -> "PosesFile":
         """Return the file; raises DataError where a line of it holds no finite pose."""
@@ -219,14 +233,19 @@ class TrajectoryFormat(Protocol):
         """Return the poses of rows; raise DataError, naming the line, where they are not of this format."""
 
     def text(self, trajectory: Trajectory) -> str:
-        """Return a trajectory as the text of a file."""
+        """Return the poses of a trajectory, and what else the format has but covariances, as the text of a file."""
+
+
+# Behind the columns of a format: no covariance, those of orientation and position apart, that of the pose or the state.
+Covariance = Literal["", "apart", "pose", "state"]
+_TRIANGLES: Mapping[Covariance, int] = {"": 0, "apart": 12, "pose": 21, "state": STATE * (STATE + 1) // 2}
 
 
 @dataclass(frozen=True)
 class Stamped:
     """A format of stamps, positions (m) and quaternions; ``order`` are its columns behind the stamp.
 
-    They count x y z qx qy qz qw vx vy vz, gyro bias and accelerometer bias (three each) from 0. Only the pose is read.
+    They count x y z qx qy qz qw vx vy vz, gyro bias and accelerometer bias (three each) from 0.
     """
 
     name: str
@@ -237,11 +256,11 @@ class Stamped:
     unit_ns: int = NS_PER_S
     commas: bool = False
     may_go_on: bool = False
-    has_covariances: bool = False
+    covariance: Covariance = ""
 
     @property
     def _width(self) -> int:
-        return 1 + len(self.order) + 12 * self.has_covariances
+        return 1 + len(self.order) + _TRIANGLES[self.covariance]
 
     def recognises(self, rows: Rows) -> bool:
         """Say whether rows have the separator and the number of columns of this format."""
@@ -264,11 +283,29 @@ class Stamped:
         # A view where nothing is moved: a copy lies in another order, in which sums may differ in the last bit.
         values = table[:, 1:8] if pose == [*range(1, 8)] else table[:, pose]
         file = _stamped_poses(rows, self._stamps(rows, table), values, self.name)
-        kept = ... if len(file) == len(table) else np.isfinite(values).all(axis=1)
-        stated = (
-            StatedApart(_symmetric(table[kept, 8:14]), _symmetric(table[kept, 14:20])) if self.has_covariances else None
-        )
-        return replace(file, other_order=self.other_order, covariances=stated)
+        if len(file) < len(table):
+            table = table[np.isfinite(values).all(axis=1)]
+        v_world, bias = self._motion(table)
+        stated = self._covariances(rows, table[:, 1 + len(self.order) : self._width])
+        return replace(file, other_order=self.other_order, covariances=stated, v_world=v_world, bias=bias)
+
+    def _motion(self, table: Array) -> tuple[Array | None, Array | None]:
+        """Return velocities (N, 3) and biases (N, 6) [accel, gyro], None where the format or the file has none."""
+        if len(self.order) <= 7:
+            return None, None
+        v_world, bias = table[:, 8:11], table[:, [14, 15, 16, 11, 12, 13]]
+        return None if np.isnan(v_world).all() else v_world, None if np.isnan(bias).all() else bias
+
+    def _covariances(self, rows: Rows, entries: Array) -> StatedCovariances | None:
+        if not self.covariance:
+            return None
+        if self.covariance == "apart":
+            return with_triangles_apart(entries[:, :6], entries[:, 6:])
+        try:
+            convention, lower = said_in(rows.header)
+        except DataError as error:
+            raise DataError(f"{rows.path}: its header: {error}") from error
+        return StatedCovariances(from_triangle(entries, lower=lower), convention)
 
     def _stamps(self, rows: Rows, table: Array) -> IntArray:
         """Return the stamps of rows (N,) ns; raises DataError naming a wrong unit, or stamps of too few digits."""
@@ -295,13 +332,33 @@ class Stamped:
         Poses that are not finite are left out; velocity and biases that it does not have are nan.
         """
         kept = _finite(trajectory)
+        return self._text(kept, self.header, np.empty((len(kept), 0)))
+
+    def text_with_covariances(self, trajectory: Trajectory, convention: CovConvention | None = None) -> str:
+        """Return the same with the covariances of a trajectory, in a convention that the header then names.
+
+        Without one it is the format's own: GTSAM's, or OpenVINS'. A state's covariance has nan where it is not known.
+        Raises DataError where the trajectory has no covariances.
+        """
+        with_covariances = {"TUM": TUM_COV, "EuRoC": EUROC_COV, "OpenVINS": OPENVINS_COV}[self.name]
+        kept = _finite(trajectory)
+        if kept.cov is None:
+            raise DataError("no covariances are known; leave out the convention of covariances")
+        chosen = convention or (OPENVINS if self.name == "OpenVINS" else OURS)
+        size = STATE if with_covariances.covariance == "state" else 6
+        what = "order q p v bg ba; " if size == STATE else ""
+        header = f"{self.header}\n# then the upper triangle of a covariance ({size} x {size}) row by row; {what}"
+        values = upper_triangle(written_as(chosen, kept.T_world_imu, kept.cov, size))
+        return self._text(kept, header + chosen.words, values)
+
+    def _text(self, kept: Trajectory, header: str, more: Array) -> str:
         unknown = np.full((len(kept), 6), np.nan)
         v_world = unknown[:, :3] if kept.v_world is None else kept.v_world
         bias = unknown if kept.bias is None else kept.bias[:, [3, 4, 5, 0, 1, 2]]
         quaternions = quaternion_from_rotation(kept.T_world_imu[:, :3, :3])
-        values = np.hstack([kept.positions, quaternions, v_world, bias])[:, self.order]
+        values = np.hstack([np.hstack([kept.positions, quaternions, v_world, bias])[:, self.order], more])
         stamps = map(stamp_text if self.unit_ns == NS_PER_S else str, kept.t_ns.tolist())
-        return _rows_text(self.header, zip(stamps, values.tolist(), strict=True), "," if self.commas else " ")
+        return _rows_text(header, zip(stamps, values.tolist(), strict=True), "," if self.commas else " ")
 
 
 class Kitti:
@@ -381,14 +438,16 @@ openvins = Stamped(
     ),
     may_go_on=True,
 )
-_OPENVINS_RECORDED = Stamped(
-    "OpenVINS",
-    "t x y z qx qy qz qw Pr11 ... Pt33",
-    "",
-    order=tum.order,
-    other_order=openvins.other_order,
-    has_covariances=True,
+_OPENVINS_RECORDED = replace(tum, name="OpenVINS", columns=f"{tum.columns} Pr11 ... Pt33", covariance="apart")
+TUM_COV, EUROC_COV = (
+    replace(one, columns=f"{one.columns} and 21 of a covariance", may_go_on=False, covariance="pose")
+    for one in (tum, euroc)
 )
+OPENVINS_COV = replace(
+    openvins, columns=f"{openvins.columns} and 120 of a covariance", may_go_on=False, covariance="state"
+)
+# Of two that have the same width the header decides: more columns of EuRoC and OpenVINS may be anything.
+_SAYS_SO: tuple[Stamped, ...] = (EUROC_COV, OPENVINS_COV)
 _POSITIONS_ALONE = "t x y z"
 _MISNAMED = OtherOrder(-1, "w first", f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
 FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
@@ -398,19 +457,22 @@ _KIND = (
 )
 
 
-def read_poses(path: Path) -> PosesFile:
+def read_poses(path: Path, cov_convention: CovConvention | None = None) -> PosesFile:
     """Read a file of any of the formats, which is recognised from its content and not from its name.
+
+    ``cov_convention`` is that of its covariances where the file does not say it.
 
     Raises DataError, naming the line and the likely cause, where it is missing, empty, of none of the formats or
     not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
     only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
     """
-    return read_finite_poses(path).whole()
+    return read_finite_poses(path, cov_convention).whole()
 
 
-def read_finite_poses(path: Path) -> PosesFile:
+def read_finite_poses(path: Path, cov_convention: CovConvention | None = None) -> PosesFile:
     """Read a file as :func:`read_poses`, and leave lines out that hold no finite pose, as of a truth with gaps."""
     rows = read_rows(path, _KIND)
+    said = cov_convention is not None or "cov-convention" in rows.header
     named = named_columns(rows.heading) if rows.heading else None
     with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
         if named is not None and not _is_usual(named, rows):
@@ -419,9 +481,9 @@ def read_finite_poses(path: Path) -> PosesFile:
             return _by_name(rows, Named(0, None, (1, 2, 3), ()))
         if _begins_with_row_numbers(rows):
             raise DataError(f"{path}: the first column is the number of the row, and stamps come first; remove it")
-        for one in (_OPENVINS_RECORDED, *FORMATS.values()):
+        for one in (_OPENVINS_RECORDED, TUM_COV, *(_SAYS_SO if said else ()), *FORMATS.values()):
             if one.recognises(rows):
-                return one.parse(rows)
+                return one.parse(rows).with_convention(cov_convention)
     kind = "separated by commas" if rows.commas else "separated by blanks"
     raise DataError(f"{path}: {rows.width} columns {kind} are no format that is known; {_KIND}")
 
@@ -432,7 +494,7 @@ def _is_usual(named: Named, rows: Rows) -> bool:
     if begin == (0, 1, 2, 3) and rows.commas and named.quaternion == (5, 6, 7, 4):
         return named.unit_ns == 1 or (named.unit_ns is None and _unit_ns(rows.numbers(rows.width, "t")[:, 0]) == 1)
     if begin == (0, 1, 2, 3) and not rows.commas and named.quaternion == (4, 5, 6, 7):
-        return rows.width == 1 + len(tum.order)
+        return any(one.recognises(rows) for one in (tum, TUM_COV, _OPENVINS_RECORDED))
     if named.quaternion or rows.width < 1 + len(tum.order):
         return False
     # Names that are not known may be those of a quaternion.
@@ -478,7 +540,7 @@ def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> Pose
         raise DataError(f"{rows.path}: no line holds a position that is finite; write it again")
     not_finite = "" if kept.all() else _lines_unknown(rows.line_numbers, t_ns, values)
     T_world_imu = checked_poses(rows.path, numbers, t_ns[kept], values[kept])
-    return PosesFile(rows.path, kind, t_ns[kept], T_world_imu, None, None, not_finite)
+    return PosesFile(rows.path, kind, t_ns[kept], T_world_imu, None, not_finite=not_finite)
 
 
 def _lines_unknown(numbers: list[int], t_ns: IntArray, values: Array) -> str:
@@ -564,16 +626,11 @@ def _check_lines(
             raise DataError(f"{path}: {row} {numbers[int(np.argmin(passed))]} {complaint}")
 
 
-def _symmetric(upper: Array) -> Array:
-    """Return the matrices (N, 3, 3) of upper triangles (N, 6) row by row."""
-    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-
-
 def _finite(trajectory: Trajectory) -> Trajectory:
     """Return a trajectory without the poses that are not finite, which readers of files reject."""
     kept = np.isfinite(trajectory.T_world_imu).all(axis=(1, 2))
-    v_world, bias = (None if one is None else one[kept] for one in (trajectory.v_world, trajectory.bias))
-    return Trajectory(trajectory.t_ns[kept], trajectory.T_world_imu[kept], v_world, bias)
+    others = (None if one is None else one[kept] for one in (trajectory.v_world, trajectory.bias, trajectory.cov))
+    return Trajectory(trajectory.t_ns[kept], trajectory.T_world_imu[kept], *others)
 
 
 def _rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: str) -> str:

@@ -33,6 +33,7 @@ PLACED = (
 )
 NOT_MET = "no pose has a true one at its time"
 NOT_PLACED = "the estimate has its own world frame, and the truth has no pose for its first one"
+UNCOUPLED = "what couples orientation and position is not stated"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,10 @@ class BodyErrors:
 
 
 class StatedErrors(NamedTuple):
-    """The n errors whose covariance the estimate states, and these covariances (n, d, d)."""
+    """The n errors whose covariance the estimate states, and these covariances (n, d, d).
+
+    Those of orientation and position are finite; what couples the two is NaN where it is not stated.
+    """
 
     errors: BodyErrors
     cov: Array
@@ -69,13 +73,22 @@ class StatedErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Nees:
-    """NEES at stamps (n,) of pose, orientation and position, each (n,) and divided by its degrees of freedom."""
+    """NEES at stamps (n,) of pose, orientation and position, each (n,) and divided by its degrees of freedom.
+
+    ``errors`` (n, 6) are the logarithms. That of the pose is NaN where orientation and position are stated apart.
+    """
 
     t_ns: IntArray
     pose: Array
     orientation: Array
     position: Array
     placed: bool
+    errors: Array
+
+    @property
+    def is_coupled(self) -> bool:
+        """Say whether the covariance of the whole pose is stated everywhere."""
+        return bool(np.isfinite(self.pose).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,20 +228,38 @@ def stated_errors(evaluation: Evaluation) -> StatedErrors:
         raise Unavailable("the truth comes from the instrument that measured the motion, so agreement proves nothing")
     if cov is None:
         raise Unavailable("the estimator states no covariance")
-    errors = body_errors(evaluation)
-    stated = np.asarray(np.isfinite(cov[errors.rows, :POSE_DOF, :POSE_DOF]).all(axis=(1, 2)))
+    return with_covariances(body_errors(evaluation), cov)
+
+
+def with_covariances(errors: BodyErrors, cov: Array) -> StatedErrors:
+    """Return the errors whose pose has a covariance, of those (N, d, d) of all poses of the estimate.
+
+    Raises Unavailable as :func:`stated_errors`.
+    """
+    of_pose = cov[errors.rows, :POSE_DOF, :POSE_DOF]
+    stated = np.asarray(np.isfinite(np.stack([of_pose[:, :3, :3], of_pose[:, 3:, 3:]])).all(axis=(0, 2, 3)))
     if not stated.any():
         raise Unavailable("no pose with a true one has a finite covariance")
-    covs = cov[errors.rows[stated]]
-    indefinite = int((np.linalg.eigvalsh(covs[:, :POSE_DOF, :POSE_DOF])[:, 0] <= 0.0).sum())
+    apart = np.where(np.isfinite(of_pose[stated]), of_pose[stated], 0.0)
+    indefinite = int((np.linalg.eigvalsh(apart)[:, 0] <= 0.0).sum())
     if indefinite:
-        raise Unavailable(f"the covariance of {indefinite} of {len(covs)} poses is not positive definite")
-    return StatedErrors(errors.select(stated), covs)
+        raise Unavailable(f"the covariance of {indefinite} of {len(apart)} poses is not positive definite")
+    return StatedErrors(errors.select(stated), cov[errors.rows[stated]])
 
 
 def nees_over_time(evaluation: Evaluation) -> Nees:
-    """Return the NEES of every pose that has a covariance and a true pose. Raises as :func:`stated_errors`."""
-    stated = stated_errors(evaluation)
+    """Return the NEES of every pose that has a covariance and a true pose.
+
+    Raises as :func:`stated_errors`, and where the covariance of the whole pose is not stated.
+    """
+    nees = nees_of(stated_errors(evaluation))
+    if not nees.is_coupled:
+        raise Unavailable(UNCOUPLED)
+    return nees
+
+
+def nees_of(stated: StatedErrors) -> Nees:
+    """Return the NEES of errors with their covariances."""
     errors, pose_cov = stated.errors, stated.cov[:, :POSE_DOF, :POSE_DOF]
     xi = se3_log(errors.T_estimate_truth)
     return Nees(
@@ -237,4 +268,5 @@ def nees_over_time(evaluation: Evaluation) -> Nees:
         mahalanobis_squared(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
         mahalanobis_squared(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
         errors.placed,
+        xi,
     )

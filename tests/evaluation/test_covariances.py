@@ -1,0 +1,93 @@
+"""Files with covariances: scored as their errors are, wrong conventions named, two estimates compared without truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets.trajectories import tum
+from toolkit.datasets.trajectories.covariances import CONVENTIONS
+from toolkit.estimate import Trajectory
+from toolkit.geometry import se3_exp
+
+# Heading and forward position are the least certain (rad, m); and the position depends on the heading.
+ROOT = np.diag([2e-3, 2e-3, 1e-2, 0.3, 0.05, 0.05])
+ROOT[4, 2] = 0.1
+COV = ROOT @ ROOT.T
+
+
+def estimate(scene, seed: int = 0, times: float = 1.0) -> Trajectory:
+    """A consistent estimate in the truth's world; its covariance is stated so many times as large."""
+    t_ns = scene.stamps(20.0)
+    errors = np.random.default_rng(seed).standard_normal((t_ns.size, 6)) @ ROOT.T
+    cov = np.tile(times * COV, (t_ns.size, 1, 1))
+    return Trajectory(t_ns, scene.poses_at(t_ns) @ se3_exp(errors), cov=cov)
+
+
+def written(trajectory: Trajectory, said: str = "rot-pos/right", meant: str = "") -> None:
+    """Write est.tum, whose header says one convention, while its covariances are in the one that is meant."""
+    text = tum.text_with_covariances(trajectory, CONVENTIONS[meant or said])
+    Path("est.tum").write_text(
+        text.replace(f"cov-convention {meant or said}", f"cov-convention {said}" if said else "")
+    )
+
+
+def run_of(vislam, *words: str) -> dict:
+    assert vislam("evaluate", "truth.tum", "est.tum", *words, "--out", "out", "--quiet") == 0
+    (run,) = json.loads(Path("out/evaluation.json").read_text())["runs"]
+    return run
+
+
+def test_a_consistent_estimate_is_found_so_in_every_score(scene, vislam) -> None:
+    written(estimate(scene))
+    run = run_of(vislam)
+    # 1200 independent poses: three standard deviations of a mean NEES over 6, and of a share.
+    assert run["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=3.0 * np.sqrt(2.0 / 6.0 / 1200.0))
+    assert run["metrics"]["inside_90_pose_percent"] == pytest.approx(90.0, abs=2.7)
+    assert run["metrics"]["energy_pos_m"] < run["metrics"]["ate_none_m"]
+    assert "nees_pose_mean" not in run["notes"]
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        *((said, "rot-pos/right") for said in CONVENTIONS if said != "rot-pos/right"),
+        ("rot-pos/right", "rot-pos/left"),
+        ("rot-pos/right", "pos-rot/fixed"),
+        ("pos-rot/fixed", "rot-pos/mixed"),
+    ],
+)
+def test_a_wrong_convention_is_named_with_the_right_one(scene, vislam, said: str, meant: str) -> None:
+    written(estimate(scene), said, meant)
+    note = run_of(vislam)["notes"]["nees_pose_mean"]
+    assert note.startswith(f"the covariances are said to be {said} and fit the errors only as ")
+    assert meant in note.partition(": ")[0]
+
+
+def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam) -> None:
+    written(estimate(scene, times=0.01))
+    run = run_of(vislam)
+    assert run["metrics"]["nees_pose_mean"] > 50.0
+    assert "said to be" not in run["notes"].get("nees_pose_mean", "")
+
+
+def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam) -> None:
+    written(estimate(scene), "", "pos-rot/fixed")
+    run = run_of(vislam)
+    assert run["metrics"]["nees_pose_mean"] is None
+    best = "name it with --cov-convention; the truth fits them best as pos-rot/left or pos-rot/fixed"
+    assert best in run["notes"]["nees_pose_mean"]
+    assert run["metrics"]["ate_se3_m"] < 0.5
+    said = run_of(vislam, "--cov-convention", "pos-rot/fixed")
+    assert said["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 0.9, 1.1), (0.25, 1.4, 1.8)])
+def test_two_estimates_of_one_run_are_compared_without_a_truth(scene, vislam, times: float, low, high) -> None:
+    """With a quarter of its covariance stated, (1 + 1) / (1 + 1/4) = 1.6 of one is left."""
+    Path("truth.tum").write_text(tum.text_with_covariances(estimate(scene, 1)))
+    written(estimate(scene, 2, times))
+    run = run_of(vislam)
+    assert low < run["metrics"]["nees_pose_mean"] < high
+    assert "differences are compared with the sum of both" in run["notes"]["nees_pose_mean"]
