@@ -350,3 +350,18 @@ def test_nothing_slow_is_imported_before_it_is_used() -> None:
     messages = surrounded(["-c", program], None, Path())
     assert messages.startswith("[] ")
     assert all(repr(name) in messages for name in toolkit.__all__)
+
+
+def test_a_sweep_is_the_rows_of_a_long_table_and_shows_itself() -> None:
+    swept = toolkit.sweep(
+        "drive", {"fault:dropped_frames": [0.2, 0.4]}, ["dead-reckoning"], max_frames=FRAMES, seeds=2, workers=1
+    )
+    rows = [row for row in swept if row["metric"] == "ate_none_m" and row["output"] == "final"]
+    assert [(row["fault:dropped_frames"], row["seed"]) for row in rows] == [
+        (dose, seed) for dose in (0.0, 0.2, 0.4) for seed in (0, 1)
+    ]
+    assert {row["status"] for row in rows} == {"ok"}
+    assert "breaks at" in str(swept.table()) and "breaks at" in repr(swept)
+    assert isinstance(swept.figures["sweep_fault_dropped_frames"], Figure)
+    with pytest.raises(SettingsError, match="no argument is called max_frame"):
+        toolkit.sweep("drive", {"fault:dropped_frames": [0.2]}, max_frame=3)  # type: ignore[call-arg]

@@ -14,20 +14,22 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict, Unpack, get_args
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from toolkit.answers import Output, Run
-from toolkit.errors import VislamError, did_you_mean, type_of
+from toolkit.errors import VislamError, did_you_mean, no_such, type_of
 from toolkit.estimator import Build
-from toolkit.experiment import Comparison, Record
+from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
+from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.progress import silent
 from toolkit.registry import find_all
 from toolkit.report.comparison_table import comparison_table, requested_columns
+from toolkit.report.sweep import sweep_document, sweep_table, sweep_text, write_sweep
 from toolkit.report.text import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
@@ -85,13 +87,66 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,
     ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
+    given = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s, "to_s": to_s}
+    how = {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
+    plan, kept = _planned(source, estimators, own, settings, {**given, **how, "every": every, "keep": keep})
+    if kept is not None and plan.settings.seeds == 1:
+        raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
+    return Result(run_plan(plan, silent, () if kept is None else (kept,))[0])
+
+
+class SweepOptions(TypedDict, total=False):
+    """What :func:`sweep` takes beside what is varied, as :func:`compare` does."""
+
+    own: Mapping[str, Build] | None
+    truth: str | Path | None
+    max_frames: int | None
+    from_s: float
+    to_s: float | None
+    every: int
+    keep: Names
+    seed: int | None
+    seeds: int | None
+    settings: Settings | Mapping[str, Any]
+    workers: int | None
+    scheduler: str | None
+    resume: str | Path | None
+
+
+def sweep(
+    source: Source,
+    over: Mapping[str, Iterable[Any]],
+    estimators: Names | None = None,
+    *,
+    each: bool = False,
+    **options: Unpack[SweepOptions],
+) -> "SweepResult":
+    """Run estimators on a recording at every value of settings, or with faults planted in it in doses.
+
+    ``over`` has values by setting, as in ``{"window.lag_s": [0.3, 1.0]}``, and doses by fault, as in
+    ``{"fault:dropped_frames": [0.1, 0.5]}`` (``vislam list injectors``). Two are crossed, every value with every other,
+    unless ``each`` is varied by itself. All else is as in :func:`compare`; the result is the long table.
+
+    Raises as :func:`compare` does, and SettingsError for a fault or a value there is not.
+    """
+    if strange := sorted(options.keys() - SweepOptions.__annotations__.keys()):
+        raise SettingsError(no_such("argument", strange[0], SweepOptions.__annotations__))
+    given = dict(options)
+    own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
+    plan, kept = _planned(source, estimators, own, settings, given)
+    return SweepResult(run_sweep(plan, over, crossed=not each, directory=kept))
+
+
+def _planned(
+    source: Source, estimators: Names | None, own: Any, settings: Any, given: Mapping[str, Any]
+) -> tuple[Plan, Path | None]:
+    """Return the plan of a function's arguments, and the directory its outcomes are kept in, if any."""
     if not isinstance(source, str | Path | Sequence):
         raise SettingsError(f"source is {type_of(source)}; give one recording: a path, a built-in name, a Sequence")
-    given = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s, "to_s": to_s}
-    given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", keep), "every": every}
-    request = record_of(Request, _plain({key: value for key, value in given.items() if value is not None}), "")
-    how = {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
-    run = record_of(_Run, _plain(how), "")
+    what = {key: value for key, value in given.items() if key not in _Run.__struct_fields__ and value is not None}
+    what |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
+    request = record_of(Request, _plain({key: value for key, value in what.items() if value is not None}), "")
+    run = record_of(_Run, _plain({key: value for key, value in given.items() if key in _Run.__struct_fields__}), "")
     plan = plan_of(
         Configuration(request, _with_seeds(settings, run)),
         (source if isinstance(source, Sequence) else str(source),),
@@ -99,9 +154,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         run.workers,
         run.scheduler,
     )
-    if run.resume is not None and plan.settings.seeds == 1:
-        raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
-    return Result(run_plan(plan, silent, () if run.resume is None else (Path(run.resume),))[0])
+    return plan, None if run.resume is None else Path(run.resume)
 
 
 def _names(what: str, given: Names | None) -> Any:
@@ -215,6 +268,43 @@ class Result:
     def __repr__(self) -> str:
         seeds = f", {len(self.comparison.seeds)} seeds" if self.comparison.over_seeds else ""
         return f"{self.comparison.name}{seeds}\n{self.table()}"
+
+    def _repr_markdown_(self) -> str:
+        return self.table()._repr_markdown_()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SweepResult:
+    """What a sweep found: an iterable of the rows of its long table, as pandas takes them. ``sweep`` has the values.
+
+    A row has the sequence, a column an axis, seed, estimator, output, metric, value and status.
+    """
+
+    sweep: Sweep
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return self.sweep.records()
+
+    def table(self) -> "ShownTable":
+        """Return errors over the clean ones with their intervals, and the dose at which each estimator breaks."""
+        return ShownTable(sweep_table(sweep_document(self.sweep)))
+
+    @cached_property
+    def figures(self) -> Mapping[str, "Figure"]:
+        """The figures by name."""
+        from toolkit.report.figures.sweeps import draw_sweep
+
+        return {figure.name: figure.figure for figure in draw_sweep(self.sweep)}
+
+    def save(self, directory: str | Path) -> Path:
+        """Write the directory that ``vislam sweep`` writes; raises OutputError where it cannot be written."""
+        from toolkit.report.figures.sweeps import draw_sweep
+
+        write_sweep(self.sweep, Path(directory), "toolkit.sweep", list(draw_sweep(self.sweep)))
+        return Path(directory)
+
+    def __repr__(self) -> str:
+        return sweep_text(sweep_document(self.sweep))
 
     def _repr_markdown_(self) -> str:
         return self.table()._repr_markdown_()

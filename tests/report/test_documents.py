@@ -33,8 +33,8 @@ from toolkit.settings.records import Noise
 
 Document = dict[str, Any]
 
-# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records; the card by the
-# first command that made one of its version.
+# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records; card and sweep
+# by the first command that made one of its version.
 OLD = Path(__file__).parent / "documents"
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
 CASES = {
@@ -52,6 +52,7 @@ CASES = {
     "verification.json": "verification-1",
     "diff.json": "diff-1",
     "bundle.json": "bundle-1",
+    "sweep.json": "sweep-1",
 }
 
 

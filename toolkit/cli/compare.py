@@ -41,6 +41,38 @@ if TYPE_CHECKING:
 SEQUENCES = ("drive", "kitti00")
 
 
+# How recordings are prepared and estimators run, of every command that does so.
+HOW = (
+    *PART,
+    REPAIR,
+    setting(
+        "start",
+        choice(
+            "--start",
+            ("measurements", "truth"),
+            "source of the first state; a start from the truth is labelled (default: measurements)",
+        ),
+    ),
+    TRACKS,
+    TOPICS,
+    setting("first_seed", arg("--seed N", "of simulated sequences (default: 0)", at_least(0))),
+    setting("seeds", arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1))),
+    setting(
+        "vary",
+        choice(
+            "--vary",
+            ("noise", "world"),
+            "what a seed draws of a simulation: the noise, or trajectory and landmarks as well (default: noise)",
+        ),
+    ),
+    *SETTINGS,
+)
+SCHEDULER = arg(
+    "--scheduler ADDRESS",
+    "run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+)
+
+
 class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     """An interrupt after which something is kept that the same command continues from."""
 
@@ -68,28 +100,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         "command continues where it stopped",
         Path,
     ),
-    *PART,
-    REPAIR,
-    setting(
-        "start",
-        choice(
-            "--start",
-            ("measurements", "truth"),
-            "source of the first state; a start from the truth is labelled (default: measurements)",
-        ),
-    ),
-    TRACKS,
-    TOPICS,
-    setting("first_seed", arg("--seed N", "of simulated sequences (default: 0)", at_least(0))),
-    setting("seeds", arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1))),
-    setting(
-        "vary",
-        choice(
-            "--vary",
-            ("noise", "world"),
-            "what a seed draws of a simulation: the noise, or trajectory and landmarks as well (default: noise)",
-        ),
-    ),
+    *HOW,
     flag(
         "--keep-trajectories",
         "with --seeds, write the trajectories of every seed (of a single one they always are)",
@@ -101,7 +112,6 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         names,
         default=(),
     ),
-    *SETTINGS,
     WORKERS,
     choice("--figures", ("few", "all", "none"), "figures to draw; docs/figures.md shows all of them", default="few"),
     choice(
@@ -111,10 +121,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         default="png",
     ),
     output("what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"),
-    arg(
-        "--scheduler ADDRESS",
-        "run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
-    ),
+    SCHEDULER,
     examples=("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",),
 )
 def compare(options: argparse.Namespace) -> int:
@@ -132,13 +139,13 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.report.text import width_of_output
 
     columns = requested_columns(options.columns)
-    requested = _configuration(options)
+    requested = requested_configuration(options)
     plan = plan_of(requested, SEQUENCES, workers=options.workers, scheduler=options.scheduler)
     made_by = MadeBy(shlex.join(options.command_line), requested, options.figure_format, options.figures)
     progress_for, all_ok = of_this_process(), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
-        directories = directories_for(cases, options.out if options.out is not None else _new_run())
+        directories = directories_for(cases, options.out if options.out is not None else new_run())
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
         open_files.enter_context(_kept_when_interrupted(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
@@ -159,18 +166,19 @@ def compare(options: argparse.Namespace) -> int:
     return 0 if all_ok else 1
 
 
-def _configuration(options: argparse.Namespace) -> Configuration:
+def requested_configuration(options: argparse.Namespace) -> Configuration:
     """Return what is to be compared and how: the file of --config, and over it the command line."""
     from toolkit.experiment.configuration import Request, configuration, read_configuration
     from toolkit.metrics import requests_of
     from toolkit.settings.reading import with_changes
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
-    switches = () if options.columns == ("all",) else requests_of(options.columns)
-    by_columns = [(f"--columns {','.join(options.columns)}", f"metrics.{switch}", True) for switch in switches]
+    columns = getattr(options, "columns", ())
+    switches = () if columns == ("all",) else requests_of(columns)
+    by_columns = [(f"--columns {','.join(columns)}", f"metrics.{switch}", True) for switch in switches]
     changes = requested_changes(options, *by_columns)
-    given = {name: getattr(options, name) for name in Request.__struct_fields__} | {"keep": kept_faults(options)}
-    given |= {"trajectories": dict(options.trajectories)}
+    given = {name: getattr(options, name, None) for name in Request.__struct_fields__} | {"keep": kept_faults(options)}
+    given |= {"trajectories": dict(getattr(options, "trajectories", ()))}
     given = {name: value for name, value in given.items() if value not in (None, [], {})}
     places = ([] if options.config is None else [str(options.config)]) + (["the command line"] if changes else [])
     place = " or ".join(places) or "the command line"
@@ -200,7 +208,7 @@ def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None
             store.close()
 
 
-def _new_run() -> Path:
+def new_run() -> Path:
     """Return a directory named by the local time that does not exist yet."""
     from datetime import datetime
 

@@ -11,21 +11,23 @@ from toolkit.cli.arguments import arg, choice, command, output
 if TYPE_CHECKING:
     from toolkit.registry import EstimatorEntry
     from toolkit.settings.reading import Described
+    from toolkit.simulation.faults import Injector
 
-KINDS = ("estimators", "metrics", "faults", "settings", "formats", "sequences")
+KINDS = ("estimators", "metrics", "faults", "injectors", "settings", "formats", "sequences")
 # How many names of each kind stand for all of it.
 _EXAMPLES = 4
 
 
 @command(
     "list",
-    "list estimators, metrics, faults, settings, formats and built-in sequences",
+    "list estimators, metrics, faults, injectors of faults, settings, formats and built-in sequences",
     choice("kind KIND", KINDS, f"one of {', '.join(KINDS)}", nargs="?"),
     examples=("vislam list", "vislam list estimators"),
 )
 def list_parts(options: argparse.Namespace) -> int:
     """Print one kind of what can be named on the command line, a name a line: estimators, metrics, faults the audit
-    knows, settings, formats that are recognised, built-in sequences. Without a kind, how many there are of each.
+    knows, injectors of faults for vislam sweep, settings, formats that are recognised, built-in sequences. Without a
+    kind, how many there are of each.
     """
     if options.kind is None:
         print("\n".join(_summary(kind, list(_entries(kind))) for kind in KINDS))
@@ -41,20 +43,24 @@ def _entries(kind: str) -> Mapping[str, str]:
     from toolkit.audit import faults
     from toolkit.registry import discover
     from toolkit.settings.reading import describe
+    from toolkit.simulation.faults import INJECTORS
 
     match kind:
         case "estimators":
-            return {name: _estimator(entry) for name, entry in discover().items()}
+            entries: Mapping[str, str] = {name: _estimator(entry) for name, entry in discover().items()}
         case "metrics":
-            return metrics.describe() | _marked(metrics.unavailable())
+            entries = metrics.describe() | _marked(metrics.unavailable())
         case "faults":
-            return faults()
+            entries = faults()
+        case "injectors":
+            entries = {name: _injector(one) for name, one in INJECTORS.items()}
         case "settings":
-            return {one.key: _setting(one) for one in describe()}
+            entries = {one.key: _setting(one) for one in describe()}
         case "formats":
-            return datasets.formats() | _marked(datasets.unavailable())
+            entries = datasets.formats() | _marked(datasets.unavailable())
         case _:
-            return dict.fromkeys(datasets.built_in_names(), "")
+            entries = dict.fromkeys(datasets.built_in_names(), "")
+    return entries
 
 
 def _summary(kind: str, names: list[str]) -> str:
@@ -75,6 +81,10 @@ def _listing(entries: Mapping[str, str]) -> str:
 def _estimator(entry: EstimatorEntry) -> str:
     ignored = "".join(f" (not {rule}: {why})" for rule, why in entry.ignores().items())
     return f"{entry.summary()}{' (default)' if entry.is_default() else ''}{ignored}"
+
+
+def _injector(one: Injector) -> str:
+    return f"{one.meaning} [{one.unit}, none at {one.clean:g}]"
 
 
 def _setting(one: Described) -> str:

@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.documents import Record, readable
 from toolkit.files.reading import read_text_input
-from toolkit.settings import Settings, SettingsError
+from toolkit.settings import Scalar, Settings, SettingsError
 from toolkit.settings.reading import read_toml, settings_of, without_removed
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # The table of a configuration that says what to compare; all others are settings.
 COMPARE = "compare"
+# And the one that says what to sweep over, which concerns vislam sweep alone.
+SWEEP = "sweep"
 
 
 class Request(Struct, frozen=True):
@@ -38,6 +40,13 @@ class Request(Struct, frozen=True):
     keep_trajectories: bool = False
 
 
+class SweepRequest(Struct, frozen=True):
+    """What to sweep over: values by setting or fault; ``each`` axis by itself, or every value with every other."""
+
+    over: dict[str, tuple[Scalar, ...]] = {}
+    each: bool = False
+
+
 class Configuration(Struct, frozen=True):
     """What to compare, and with which settings."""
 
@@ -51,10 +60,20 @@ def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]
     Raises SettingsError where it is neither TOML nor a manifest that holds settings.
     """
     values = _manifest(path) if path.suffix == ".json" else read_toml(path)
+    values.pop(SWEEP, None)
     request = values.pop(COMPARE, {})
     if not isinstance(request, Mapping):
         raise SettingsError(f"{path}: {COMPARE} is not a table")
     return request, values
+
+
+def read_sweep_request(path: Path) -> SweepRequest:
+    """Return the sweep in a file, nothing where it has none; raises SettingsError where it is not TOML, or no sweep."""
+    values = {} if path.suffix == ".json" else read_toml(path).get(SWEEP, {})
+    if strange := values.keys() - set(SweepRequest.__struct_fields__):
+        meant = did_you_mean(min(strange), SweepRequest.__struct_fields__)
+        raise SettingsError(f"{path}: there is no {SWEEP}.{min(strange)}{meant}")
+    return record_of(SweepRequest, values, f"{path}: {SWEEP}.")
 
 
 def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place: str) -> Configuration:

@@ -104,7 +104,7 @@ def contests_of(rows: Sequence[Row], sequence: Recorded) -> tuple[Contest, ...]:
     Only rows that ended well under every seed take part, and that answered for as much as the best one.
     """
     able = list(_able(rows))
-    key = _accuracy(able)
+    key = accuracy_of(able)
     test_drift, test_tracks = (_over_seeds(key), _over_seeds(HELD_OUT)) if _many(able) else _of_one_run(sequence)
     wanted: tuple[tuple[Question, str, tuple[str, ...], Compared], ...] = (
         ("accuracy at each frame", key, ("causal", "both"), test_drift),
@@ -134,7 +134,7 @@ def _able(rows: Sequence[Row]) -> Iterator[Row]:
     yield from (row for row in good if (row.value(COVERAGE) or 0.0) >= most - _COVERAGE_MARGIN_PERCENT)
 
 
-def _accuracy(rows: Iterable[Row]) -> str:
+def accuracy_of(rows: Iterable[Row]) -> str:
     """Return the ATE to rank by: after a fit of heading and position, but where a world's tilt is most of that error.
 
     The remark on such a value says so.

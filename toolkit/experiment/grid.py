@@ -143,7 +143,7 @@ def _units(plans: Mapping[Trial, Plan], case: Prepared) -> Iterator[tuple[Trial,
         for trial, plan in plans.items():
             entry, build = _entry(plan, trial), plan.own.get(trial.estimator)
             name = trial.estimator if entry is None else entry.name
-            recording = replace(plan.recording(source, seed), faults=trial.faults or clean)
+            recording = plan.recording(source, seed, trial.faults or clean)
             units.append((trial, Unit(recording, seed, name, plan.settings, build, entry=entry)))
         alike = {recording: i for i, recording in enumerate(dict.fromkeys(unit.recording for _, unit in units))}
         yield from sorted(units, key=lambda pair: (alike[pair[1].recording], -_rung(pair[1])))

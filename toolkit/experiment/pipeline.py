@@ -22,6 +22,7 @@ from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.registry import LADDER, EstimatorEntry, check_options, find_all
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings, SettingsError
+from toolkit.simulation.faults import Doses
 from toolkit.threads import MOST_WORKERS
 
 
@@ -70,11 +71,11 @@ class Plan:
         """Return the seeds of simulated sequences."""
         return tuple(range(self.settings.first_seed, self.settings.first_seed + self.settings.seeds))
 
-    def recording(self, source: str | Recorded, seed: int) -> Recording:
-        """Return a source of the plan under a seed."""
+    def recording(self, source: str | Recorded, seed: int, faults: Doses | None = None) -> Recording:
+        """Return a source of the plan under a seed, with faults to be planted in it."""
         return Recording.under(
             self.settings, source, seed, truth=self.truth, keep=self.keep, max_frames=self.max_frames, part=self.part,
-            card=self.settings.card and seed == self.seeds[0],
+            card=self.settings.card and seed == self.seeds[0], faults=faults,
         )  # fmt: skip
 
 

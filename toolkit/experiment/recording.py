@@ -147,13 +147,35 @@ def prepare_once(recording: Recording) -> Prepared:
     Its audit is taken from the one before, where that differs by nothing an audit depends on.
     """
     with on_one_thread():
-        others = {name: getattr(_NO_RECORDING, name) for name in ("noise", "tracks", "start", "card", "faults")}
-        return _prepared(recording, _audited_once(replace(recording, **others)))
+        return _prepared(recording, _audited_once(_for_audit(recording)))
+
+
+def _for_audit(recording: Recording) -> Recording:
+    """Return what the audit of a recording depends on."""
+    others = {name: getattr(_NO_RECORDING, name) for name in ("noise", "tracks", "start", "card", "faults")}
+    return replace(recording, **others)
 
 
 @lru_cache(maxsize=1)
 def _audited_once(recording: Recording) -> Audit:
     return audited_recording(recording)
+
+
+@lru_cache(maxsize=1)
+def _found_in_part(recording: Recording) -> frozenset[str]:
+    return _faults_in(_cut(_audited_once(recording).sequence, recording))
+
+
+def _faults_in(sequence: Sequence) -> frozenset[str]:
+    return frozenset(finding.fault for finding in audit(sequence).findings)
+
+
+def found_where_planted(recording: Recording, _progress: Progress = SILENT) -> tuple[str, ...]:
+    """Return the faults that the audit finds where some are planted in the part that is run, and does not without."""
+    with on_one_thread():
+        clean = _for_audit(recording)
+        part = _cut(_audited_once(clean).sequence, recording)
+        return tuple(_faults_in(planted(part, recording.faults or (), recording.seed)) - _found_in_part(clean))
 
 
 def _prepared(recording: Recording, audited: Audit) -> Prepared:

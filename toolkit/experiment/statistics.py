@@ -10,13 +10,15 @@ over N independent runs the mean NEES of a consistent estimator stays within the
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
 
 from toolkit.geometry import Array, IntArray
+from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 from toolkit.metrics.parts.scores import Best
 
@@ -111,6 +113,37 @@ def standard_error(differences: Array) -> Array:
     equal = np.ptp(differences, axis=-1) == 0.0  # whose computed variance need not be exactly zero
     n = differences.shape[-1]
     return np.where(equal, 0.0, differences.std(axis=-1, ddof=1) / np.sqrt(n))
+
+
+class Interval(NamedTuple):
+    """A value with the 95 % interval it lies in."""
+
+    value: float
+    low: float
+    high: float
+
+    def exp(self) -> "Interval":
+        """Return the interval of the exponential; what no double holds is infinite."""
+        with np.errstate(over="ignore"):
+            return Interval(*(float(np.exp(end)) for end in self))
+
+
+def mean_interval(values: Array) -> Interval:
+    """Return the mean of values (n,) with its interval by Student's t; an infinite one of a single value."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return Interval(mean, -math.inf, math.inf)
+    return _within(mean, float(standard_error(np.asarray(values))), len(values))
+
+
+def jackknife_interval(estimate: Callable[..., float], *rows: Array) -> Interval:
+    """Return an estimate from arrays (M, ...) in order of time, with its interval by :mod:`toolkit.jackknife`."""
+    return _within(estimate(*rows), jackknife_error(estimate, *rows), STRETCHES)
+
+
+def _within(value: float, error: float, count: int) -> Interval:
+    reach = float(stdtrit(count - 1, 1.0 - _LEVEL / 2.0)) * error
+    return Interval(value, value - reach, value + reach)
 
 
 @dataclass(frozen=True)

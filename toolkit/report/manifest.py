@@ -104,7 +104,7 @@ def manifest_document(comparison: Comparison, command: str, requested: Configura
         date=_now(),
         versions={"python": platform.python_version(), **versions},
         git_revision=_git_revision(),
-        sequence=_recording(comparison.sequence),
+        sequence=recording_record(comparison.sequence),
         start=comparison.prior.source,
         noise=UNSET if comparison.measured is None else comparison.measured,
         estimators=here,
@@ -141,7 +141,8 @@ def _threads(comparison: Comparison) -> dict[str, int | str | None]:
     return {"cpus": usable_cpus(), "workers": comparison.workers, "per_worker": 1, **variables}
 
 
-def _recording(sequence: Sequence) -> RecordingRecord:
+def recording_record(sequence: Sequence) -> RecordingRecord:
+    """Return the record of a recording."""
     return RecordingRecord(
         name=sequence.name,
         hash=sequence.content_hash(),

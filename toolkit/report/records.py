@@ -24,6 +24,7 @@ from toolkit.report.export import BundleRecord
 from toolkit.report.manifest import Manifest, read_manifest
 from toolkit.report.report_json import Report, SeedsReport, read_report, read_seeds_report
 from toolkit.report.scores import MetricsDocument, Seeds, read_metrics, read_seeds
+from toolkit.report.sweep import SweepRecord, read_sweep
 from toolkit.report.verify_text import VerificationRecord
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "read_report",
     "read_seeds",
     "read_seeds_report",
+    "read_sweep",
     "schema_files",
 ]
 # By the name of the schema's file, without its ending.
@@ -52,6 +54,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "verification-1": VerificationRecord,
     "diff-1": DiffRecord,
     "bundle-1": BundleRecord,
+    "sweep-1": SweepRecord,
 }
 
 

@@ -177,12 +177,16 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
     """Have what is kept of the runs in a new run directory, too, before it takes the place of the old one."""
     trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
     for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
-        place = directory / name
-        place.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            place.hardlink_to(target / name)
-        except OSError:  # a file system without links
-            shutil.copyfile(target / name, place)
+        take_over(target / name, directory / name)
+
+
+def take_over(file: Path, place: Path) -> None:
+    """Have a file in another place, too."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.hardlink_to(file)
+    except OSError:  # a file system without links
+        shutil.copyfile(file, place)
 
 
 def _files_in(directory: Path) -> tuple[str, ...]:

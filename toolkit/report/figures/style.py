@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, Self, TypedDict
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.legend_handler import HandlerTuple
@@ -52,7 +53,12 @@ class NamedFigure(NamedTuple):
 
 def colour_of(comparison: Comparison, estimator: str) -> str:
     """Return the colour an estimator has in every figure of every run."""
-    return _COLOURS[look_numbers(comparison.estimators)[estimator] % COLOURS]
+    return colour_among(comparison.estimators, estimator)
+
+
+def colour_among(estimators: Iterable[str], estimator: str) -> str:
+    """Return the colour of an estimator, given all that are shown."""
+    return _COLOURS[look_numbers(estimators)[estimator] % COLOURS]
 
 
 def line_of(output: Output) -> Dashes:
@@ -197,16 +203,16 @@ def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entri
         legend_below(figure, entries)
 
 
-def scale_by_decades(axes: Axes, low: float, high: float) -> None:
-    """Make the vertical axis, and those shared with it, logarithmic between two values, with few and plain numbers."""
-    axes.set_yscale("log")
-    axes.set_ylim(low, high)
+def scale_by_decades(axes: Axes, low: float, high: float, which: Literal["x", "y"] = "y") -> None:
+    """Make an axis, and those shared with it, logarithmic between two values, with few and plain numbers."""
+    axes.set(**{f"{which}scale": "log", f"{which}lim": (low, high)})
+    axis: Axis = getattr(axes, f"{which}axis")
     few = np.log10(high / low) < _FEW_DECADES
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
     if few:
-        axes.yaxis.set_major_formatter("{x:g}")
+        axis.set_major_formatter("{x:g}")
     # Ticks between decades are many, and take longer to draw than all else.
-    axes.yaxis.set_minor_locator(NullLocator())
+    axis.set_minor_locator(NullLocator())
 
 
 def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:

@@ -33,17 +33,21 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     # Here, because pages of other systems' trajectories are made without what reads a run directory.
     from toolkit.report.html.payload import payload_of
     from toolkit.report.run_directory import read_run
+    from toolkit.report.sweep import SWEEP, read_sweep, sweep_section
 
-    runs = [read_run(directory) for directory in directories]
-    write_text(target, page_text(payload_of(runs)))
+    sweeps = [directory for directory in directories if (directory / SWEEP).is_file()]
+    runs = [read_run(directory) for directory in directories if directory not in sweeps]
+    sections = [sweep_section(read_sweep(directory / SWEEP), directory) for directory in sweeps]
+    write_text(target, page_text(payload_of(runs), "\n".join(sections)))
 
 
-def page_text(payload: dict[str, Any]) -> str:
-    """Return the page of a payload with its ``title``; refuses NaN and infinity, which are not JSON."""
+def page_text(payload: dict[str, Any], sections: str = "") -> str:
+    """Return the page of a payload with its ``title``, and sections of HTML below; refuses NaN and infinity."""
     parts = {
         "title": html.escape(printable(payload["title"])),
         "style": source("style.css"),
         "payload": json_in_html(payload),
+        "sections": sections,
         "script": "\n".join(source(f"scripts/{name}.js") for name in SCRIPTS),
     }
     return filled_page("page.html", parts)

@@ -1,0 +1,199 @@
+"""A sweep: errors, NEES and withheld tracks over the values of an axis, a grid of two, and error against time."""
+
+import math
+from collections.abc import Iterator
+from typing import TypeGuard
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+
+from toolkit.experiment.comparison import plain_name
+from toolkit.experiment.statistics import Interval
+from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
+from toolkit.report.figures.style import (
+    MUTED_COLOUR,
+    SMALL_PT,
+    TICK_PT,
+    TITLE_PT,
+    ZERO_COLOUR,
+    Entry,
+    NamedFigure,
+    colour_among,
+    columns_for,
+    legend_below,
+    new_figure,
+    scale_by_decades,
+    style_axes,
+)
+from toolkit.report.sweep import metric_of, shown_value
+from toolkit.report.text import number
+
+# Doses that span more than this factor are laid out by their logarithm.
+_WIDE = 8.0
+# Beyond this a ratio or NEES is drawn at the limit.
+_MOST = 1e4
+# Ratios of the darkest shades of a grid.
+_SHADES = (0.5, 50.0)
+_HEIGHT_IN, _PANEL_IN = 2.9, 2.4
+
+
+def draw_sweep(sweep: Sweep) -> Iterator[NamedFigure]:
+    """Yield the figures of a sweep: one an axis, that of a grid, and that of error against time where settings vary."""
+    for axis in sweep.axes:
+        yield _curves(sweep, axis)
+    if any(len(point) > 1 for point in sweep.points):
+        yield _crossed(sweep)
+    for axis in sweep.axes:
+        if not axis.is_fault:
+            yield _against_time(sweep, axis)
+
+
+class _Places:
+    """Where the values of an axis stand, and the clean one; wide ranges by their logarithm, words one after another."""
+
+    def __init__(self, axis: Axis) -> None:
+        clean = float(axis.clean) if _is_number(axis.clean) else math.nan
+        numeric = all(map(_is_number, axis.values))
+        doses = dict(zip(axis.values, map(float, axis.values if numeric else range(len(axis.values))), strict=True))
+        least, most = min(doses.values()), max(doses.values())
+        by_log = numeric and least > 0.0 and (most / least > _WIDE or clean == 1.0)
+        self.of = {value: math.log(dose) if by_log else dose for value, dose in doses.items()}
+        least, most = min(self.of.values()), max(self.of.values())
+        step = (most - least) / max(len(doses) - 1, 1) or 1.0
+        if math.isfinite(clean) and not (by_log and clean <= 0.0):
+            self.clean = math.log(clean) if by_log else clean
+        else:
+            self.clean = most + step if clean == math.inf else least - step
+        self.ticks = {self.clean: _word(axis), **{place: shown_value(value) for value, place in self.of.items()}}
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _word(axis: Axis) -> str:
+    return "clean" if axis.is_fault else "default"
+
+
+def _curves(sweep: Sweep, axis: Axis) -> NamedFigure:
+    figure = new_figure(_HEIGHT_IN)
+    panels, places = figure.subplots(1, 3, sharex=True), _Places(axis)
+    titles = ("error over clean", "pose NEES / 6", "withheld tracks over clean")
+    for axes, title, field in zip(panels, titles, ("over_clean", "nees", "held_out"), strict=True):
+        style_axes(axes, title, f"{axis.name.removeprefix('fault:')}{f' [{axis.unit}]' if axis.unit else ''}", "")
+        axes.axhline(1.0, color=ZERO_COLOUR, linewidth=0.8)
+        lines = {name: _line(sweep, axis, places, name, field) for name in sweep.estimators}
+        _draw_lines(axes, lines)
+        axes.set_xticks(list(places.ticks), list(places.ticks.values()), fontsize=TICK_PT)
+    panels[0].axhline(BREAKS_AT, color=MUTED_COLOUR, linewidth=0.8, linestyle=":")
+    figure.suptitle(f"{sweep.grid.case.name}: {axis.name}", fontsize=TITLE_PT, x=0.01, ha="left")
+    legend_below(figure, _entries(sweep))
+    over = f"{len(sweep.grid.plan.seeds)} seeds, paired" if sweep.over_seeds else "stretches of the recording"
+    caption = (
+        f"{axis.name} on {sweep.grid.case.name} ({axis.meaning.rstrip('.')}): error over that of the clean recording "
+        f"(dotted: {BREAKS_AT:g} times), pose NEES over its 6 degrees of freedom, and error of withheld tracks over "
+        f"the clean one; 95 % intervals over {over}. Crosses: runs that did not end well."
+    )
+    return NamedFigure(f"sweep_{plain_name(axis.name)}", caption, figure)
+
+
+def _line(sweep: Sweep, axis: Axis, places: _Places, name: str, field: str) -> list[tuple[float, Interval]]:
+    known = {places.clean: CLEAN, **{places.of[point[0][1]]: point for point in axis.points}}
+    effects = {place: getattr(sweep.effects[name, point], field) for place, point in sorted(known.items())}
+    return [(place, one) for place, one in effects.items() if one is not None]
+
+
+def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> None:
+    if not any(lines.values()):
+        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+    values = [min(one.value, _MOST) for line in lines.values() for _, one in line if math.isfinite(one.value)]
+    low, high = 0.7 * min([0.9, *values]), 1.5 * max([BREAKS_AT, *values])
+    for name, line in lines.items():
+        colour, place = colour_among(tuple(lines), name), [place for place, _ in line]
+        value, below, above = (np.clip([one[end] for _, one in line], low, high) for end in range(3))
+        axes.fill_between(place, below, above, color=colour, alpha=0.13, linewidth=0.0)
+        axes.plot(place, value, color=colour, linewidth=1.3, marker="o", markersize=2.5)
+        bad = [(place, high) for place, one in line if math.isinf(one.value)]
+        if bad:
+            axes.plot(*zip(*bad, strict=True), color=colour, linestyle="", marker="x", markersize=6.0, clip_on=False)
+    scale_by_decades(axes, low, high)
+
+
+def _crossed(sweep: Sweep) -> NamedFigure:
+    down, across = sweep.axes
+    columns = columns_for(len(sweep.estimators))
+    rows = -(-len(sweep.estimators) // columns)
+    figure = new_figure(0.6 + _PANEL_IN * rows)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(sweep.estimators) :]:
+        axes.set_axis_off()
+    for axes, name in zip(panels, sweep.estimators, strict=False):
+        effects = [[sweep.effects[name, one + other].over_clean for other in _steps(across)] for one in _steps(down)]
+        ratios = np.array([[np.nan if effect is None else effect.value for effect in line] for line in effects])
+        axes.imshow(np.clip(ratios, *_SHADES), norm=LogNorm(*_SHADES), cmap="RdYlBu_r", aspect="auto")
+        style_axes(axes, name, across.name, down.name)
+        axes.grid(False)
+        for (i, k), ratio in np.ndenumerate(ratios):
+            text = number(float(ratio), 2) if math.isfinite(ratio) else f"{ratio:g}"
+            axes.text(k, i, text, ha="center", va="center", fontsize=SMALL_PT)
+        axes.set_yticks(range(len(down.values) + 1), [_word(down), *map(shown_value, down.values)])
+        axes.set_xticks(range(len(across.values) + 1), [_word(across), *map(shown_value, across.values)])
+    figure.suptitle(f"{sweep.grid.case.name}: error over clean", fontsize=TITLE_PT, x=0.01, ha="left")
+    names = f"{down.name} and {across.name}"
+    caption = f"Error over that of the clean recording on {sweep.grid.case.name}, under {names} together."
+    return NamedFigure("sweep_grid", caption, figure)
+
+
+def _steps(axis: Axis) -> tuple[Point, ...]:
+    return (CLEAN, *axis.points)
+
+
+def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
+    metric = metric_of(sweep)
+    figure = new_figure(3.6)
+    axes = figure.subplots()
+    style_axes(axes, "", "CPU of a frame [ms]", f"{metric.name} [{metric.unit}]")
+    reached = {name: _reached(sweep, axis, name) for name in sweep.estimators}
+    everywhere = [at for points in reached.values() for at in points.values()]
+    for name, points in reached.items():
+        colour = colour_among(sweep.estimators, name)
+        line = [at for point, at in points.items() if point]
+        axes.plot(*np.reshape(line, (-1, 2)).T, color=colour, linewidth=1.0, alpha=0.6)
+        for point, at in points.items():
+            on_front = not any(_dominates(other, at) for other in everywhere)
+            face = colour if on_front else "white"
+            axes.plot(*at, color=colour, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face)
+            word = shown_value(point[0][1]) if point else _word(axis)
+            axes.annotate(word, at, (4, 4), textcoords="offset points", fontsize=SMALL_PT, color=MUTED_COLOUR)
+    cpu_ms, errors = np.reshape(everywhere, (-1, 2)).T
+    if cpu_ms.size:
+        scale_by_decades(axes, 0.8 * cpu_ms.min(), 1.25 * cpu_ms.max(), "x")
+        scale_by_decades(axes, 0.8 * errors.min(), 1.25 * errors.max())
+    title = f"{sweep.grid.case.name}: error against time over {axis.name}"
+    figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
+    legend_below(figure, _entries(sweep))
+    caption = (
+        f"{metric.name} against processor time over the values of {axis.name} on {sweep.grid.case.name}, means over "
+        "the runs. Filled: on the Pareto front, no other is both more accurate and faster."
+    )
+    return NamedFigure(f"pareto_{plain_name(axis.name)}", caption, figure)
+
+
+def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, float]]:
+    """Return CPU (ms) and error at each point where all runs are ok; one point where the setting changes neither."""
+    effects = {point: sweep.effects[name, point] for point in _steps(axis)}
+    good = {
+        point: (one.cpu_ms, one.error)
+        for point, one in effects.items()
+        if one.ok == one.runs and one.error and one.cpu_ms
+    }
+    return dict([*good.items()][: 1 if len({error for _, error in good.values()}) == 1 else None])
+
+
+def _entries(sweep: Sweep) -> list[Entry]:
+    return [Entry.of_line(name, colour_among(sweep.estimators, name)) for name in sweep.estimators]
+
+
+def _dominates(other: tuple[float, float], one: tuple[float, float]) -> bool:
+    return other != one and other[0] <= one[0] and other[1] <= one[1]

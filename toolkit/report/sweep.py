@@ -1,0 +1,297 @@
+"""A sweep as ``sweep.json`` (the contract ``vislam.sweep/1``), as a table and text made of that, and as a folder."""
+
+import base64
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+
+from toolkit.errors import DataError
+from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
+from toolkit.experiment.statistics import Interval
+from toolkit.experiment.sweep import BREAKS_AT, Axis, Effect, Sweep
+from toolkit.files.documents import number as finite
+from toolkit.files.documents import of_attributes, read, to_text
+from toolkit.files.reading import read_input
+from toolkit.files.writing import check_replaceable, replaced_directory
+from toolkit.metrics import Metric, known_metrics
+from toolkit.report.comparison_table import sequence_line
+from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
+from toolkit.report.run_directory import PAGE, take_over
+from toolkit.report.text import (
+    MISSING,
+    Table,
+    as_html,
+    as_markdown,
+    as_text,
+    cell,
+    in_html,
+    in_markdown,
+    number,
+    unit_of,
+)
+from toolkit.settings import Scalar, changes_of
+
+if TYPE_CHECKING:
+    from toolkit.report.figures.style import NamedFigure
+
+SWEEP, TEXT, _FIGURES = "sweep.json", "sweep.md", "figures"
+
+
+class IntervalRecord(Struct, frozen=True, kw_only=True):
+    """A value with its 95 % interval; null is infinite, as the error of runs that did not end well is."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+class AxisRecord(Struct, frozen=True, kw_only=True):
+    """What was varied: a setting by its key, or a planted fault as fault:NAME."""
+
+    name: str
+    meaning: str
+    unit: str
+    clean: Annotated[Scalar | None, Meta(description="without it; null where that is none, or no finite number")]
+    values: tuple[Scalar, ...]
+    found: Annotated[tuple[tuple[str, ...], ...], Meta(description="faults the audit names, by dose; none of settings")]
+
+
+class EffectRecord(Struct, frozen=True, kw_only=True):
+    """An estimator at one point; null is what is not known."""
+
+    estimator: str
+    at: Annotated[dict[str, Scalar], Meta(description="value by axis; an axis that is not here is at its clean value")]
+    runs: Annotated[int, Meta(ge=1)]
+    ok: Annotated[int, Meta(ge=0)]
+    error: Annotated[float | None, Meta(description="mean over the runs that are ok, of the metric of the sweep")]
+    over_clean: Annotated[IntervalRecord | None, Meta(description="error over that of the clean recording")]
+    held_out: Annotated[IntervalRecord | None, Meta(description="error of withheld tracks over that of the clean one")]
+    nees: Annotated[IntervalRecord | None, Meta(description="of the pose, over its 6 degrees of freedom")]
+    cpu_ms: Annotated[float | None, Meta(description="of a frame")]
+
+
+class BreakingRecord(Struct, frozen=True, kw_only=True):
+    """The dose at which an estimator passes three times its clean error; null is beyond the largest, ``tried``."""
+
+    estimator: str
+    axis: str
+    tried: float
+    dose: float | None
+    low: float | None
+    high: float | None
+
+
+class SweepRecord(Struct, frozen=True, kw_only=True):
+    """What a sweep found."""
+
+    schema: Literal["vislam.sweep/1"]
+    made: Annotated[dict[str, str], Meta(description="command, date, git_revision and cpu")]
+    sequence: RecordingRecord
+    about: Annotated[str, Meta(description="the sequence in a line")]
+    seeds: SeedsUsed
+    settings: Annotated[dict[str, Any], Meta(description="those that are not the defaults, nested")]
+    estimators: tuple[str, ...]
+    metric: Annotated[str, Meta(description="key of the error")]
+    intervals: Annotated[Literal["seeds", "stretches"], Meta(description="what they are over")]
+    axes: tuple[AxisRecord, ...]
+    effects: tuple[EffectRecord, ...]
+    breaking: tuple[BreakingRecord, ...]
+    figures: Annotated[dict[str, str], Meta(description="caption by file")]
+    files: Annotated[tuple[str, ...], Meta(description="that the sweep wrote, relative to its directory")]
+
+
+def read_sweep(path: Path) -> SweepRecord:
+    """Read a ``sweep.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, SweepRecord, remedy="repeat the sweep")
+
+
+def sweep_document(
+    sweep: Sweep, command: str = "", figures: Mapping[str, str] | None = None, files: Iterable[str] = ()
+) -> SweepRecord:
+    """Return a sweep as a record; ``figures`` are captions by file, ``files`` what was written beside it."""
+    plan, sequence = sweep.grid.plan, sweep.grid.case.sequence
+    return SweepRecord(
+        schema="vislam.sweep/1",
+        made=made_here(command),
+        sequence=recording_record(sequence),
+        about=sequence_line(sequence),
+        seeds=SeedsUsed(sequence=plan.seeds[0], count=len(plan.seeds)),
+        settings=changes_of(plan.settings),
+        estimators=sweep.estimators,
+        metric=sweep.metric,
+        intervals="seeds" if sweep.over_seeds else "stretches",
+        axes=tuple(_axis(sweep, axis) for axis in sweep.axes),
+        effects=tuple(map(_effect, sweep.effects.values())),
+        breaking=tuple(of_attributes(BreakingRecord, one, axis=one.axis.name) for one in sweep.breaking),
+        figures=dict(figures or {}),
+        files=tuple(files),
+    )
+
+
+def _axis(sweep: Sweep, axis: Axis) -> AxisRecord:
+    clean = None if isinstance(axis.clean, float) and math.isinf(axis.clean) else axis.clean
+    found = tuple(sweep.found[point] for point in axis.points if point in sweep.found)
+    return of_attributes(AxisRecord, axis, clean=clean, found=found)
+
+
+def _effect(effect: Effect) -> EffectRecord:
+    return of_attributes(EffectRecord, effect, _in_json, at=dict(effect.point))
+
+
+def _in_json(value: Any) -> Any:
+    if isinstance(value, Interval):
+        return IntervalRecord(**dict(zip(Interval._fields, map(finite, value), strict=True)))
+    return finite(value) if isinstance(value, float) else value
+
+
+def sweep_table(sweep: SweepRecord) -> Table:
+    """Return each estimator's error over its clean one, with the interval, at every point, and where it breaks."""
+    of_faults = (axis for axis in sweep.axes if axis.found)
+    found = {(a.name, value): names for a in of_faults for value, names in zip(a.values, a.found, strict=True)}
+    rows = []
+    for at, effects in groupby(sweep.effects, key=lambda effect: effect.at):
+        if at:
+            told = ", ".join(name for one in at.items() for name in found.get(one, ()))
+            rows.append((*_named(at), told, *(in_words(effect.over_clean) for effect in effects)))
+        else:
+            rows.append(("clean", "", "", *_clean_cells(metric_of(sweep), list(effects))))
+    for (name, _), sides in groupby(sweep.breaking, key=lambda one: (one.axis, one.tried)):
+        axis = next(axis for axis in sweep.axes if axis.name == name)
+        rows.append((name, "breaks at", "", *(_breaking(one, axis) for one in sides)))
+    heads = ("over", "value", "audit says", *sweep.estimators)
+    return Table(tuple((head, "", "") for head in heads), tuple(rows), labels=3, under=tuple(_under(sweep)))
+
+
+def metric_of(sweep: Sweep | SweepRecord) -> Metric:
+    """Return the metric of a sweep's error."""
+    return next(metric for metric in known_metrics() if metric.key == sweep.metric)
+
+
+def _named(at: Mapping[str, Scalar]) -> tuple[str, str]:
+    return ", ".join(at), ", ".join(map(shown_value, at.values()))
+
+
+def shown_value(value: Scalar) -> str:
+    """Return a value of an axis as text."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _clean_cells(metric: Metric, effects: Sequence[EffectRecord]) -> Iterator[str]:
+    unit = unit_of(metric, [effect.error for effect in effects])
+    for effect in effects:
+        of = "" if effect.ok == effect.runs else f", {effect.ok} of {effect.runs} ok"
+        yield f"{cell(effect.error, metric, unit)} {unit.name}{of}"
+
+
+def in_words(interval: IntervalRecord | None) -> str:
+    """Return a ratio with its interval, as in 1.20 (0.98-1.47)."""
+    if interval is None:
+        return MISSING
+    value, low, high = ("inf" if one is None else number(one) for one in (interval.value, interval.low, interval.high))
+    return value if low == high == "inf" else f"{value} ({low}-{high})"
+
+
+def _breaking(one: BreakingRecord, axis: AxisRecord) -> str:
+    is_below = isinstance(axis.clean, str) or axis.clean is None or one.tried < axis.clean
+    beyond = f"{'<' if is_below else '>'}{number(one.tried)}"
+    dose, low, high = (beyond if end is None else number(end) for end in (one.dose, one.low, one.high))
+    return beyond if dose == low == high else f"{dose} ({low}-{high})"
+
+
+def _under(sweep: SweepRecord) -> Iterator[str]:
+    metric, over = metric_of(sweep), f"{sweep.seeds.count} seeds, paired by seed"
+    what = metric.name
+    if sweep.intervals == "stretches":
+        what, over = (what if metric.unit == "px" else "drift"), "stretches of the one recording"
+    yield f"{what} over that of the clean recording, with 95 % intervals over {over}; inf: runs that did not end well"
+    if sweep.breaking:
+        yield f"breaks at: the dose at which it passes {BREAKS_AT:g} times clean, between doses that were run"
+    for axis in sweep.axes:
+        yield f"{axis.name}{f' [{axis.unit}]' if axis.unit else ''}: {axis.meaning}"
+
+
+def sweep_text(sweep: SweepRecord) -> str:
+    """Return a sweep as it is printed."""
+    return f"{sweep.about}\n\n{as_text(sweep_table(sweep))}"
+
+
+def sweep_markdown(sweep: SweepRecord) -> str:
+    """Return a sweep as ``sweep.md``: the table, the figures, and everything of each point."""
+    shown = (f"![{in_markdown(text)}]({name})\n\n{in_markdown(text)}" for name, text in sweep.figures.items())
+    parts = [
+        f"# Sweep of {in_markdown(sweep.sequence.name)}",
+        in_markdown(sweep.about),
+        as_markdown(sweep_table(sweep)),
+    ]
+    return "\n\n".join([*parts, *shown, "## Every point", as_markdown(_whole_table(sweep))]) + "\n"
+
+
+def _whole_table(sweep: SweepRecord) -> Table:
+    metric = metric_of(sweep)
+    unit = unit_of(metric, [effect.error for effect in sweep.effects])
+    heads = ("over", "value", "estimator", "ok", f"error [{unit.name}]", "over clean", "withheld tracks over clean")
+    rows = tuple(
+        (
+            *(_named(effect.at) if effect.at else ("clean", "")),
+            effect.estimator,
+            f"{effect.ok} of {effect.runs}",
+            cell(effect.error, metric, unit),
+            *map(in_words, (effect.over_clean, effect.held_out, effect.nees)),
+            MISSING if effect.cpu_ms is None else number(effect.cpu_ms),
+        )
+        for effect in sweep.effects
+    )
+    return Table(tuple((head, "", "") for head in (*heads, "NEES pose", "CPU frame [ms]")), rows, labels=3)
+
+
+def sweep_section(sweep: SweepRecord, directory: Path) -> str:
+    """Return the section of the page for a sweep, with the figures of its directory inside, as HTML.
+
+    Raises DataError where a figure is missing.
+    """
+    table = sweep_table(sweep)
+    parts = [f"<h2>Sweep of {in_html(sweep.sequence.name)}</h2>", f"<p>{in_html(sweep.about)}</p>", as_html(table)]
+    parts += [f'<p class="fine">{in_html(line)}</p>' for line in table.under]
+    for name, caption in sweep.figures.items():
+        image = base64.b64encode(read_input(directory / name)).decode("ascii")
+        figure = f'<img src="data:image/png;base64,{image}" alt="{in_html(caption)}" style="max-width: 100%">'
+        parts.append(f"<figure>{figure}<figcaption>{in_html(caption)}</figcaption></figure>")
+    return f'<section class="card sweep">{"".join(parts)}</section>'
+
+
+def check_sweep_directory(target: Path) -> None:
+    """Raise OutputError unless a sweep can be written at ``target`` without the loss of anybody's files."""
+    check_replaceable(target, _ours)
+
+
+def _ours(directory: Path) -> frozenset[str]:
+    """Return what in a directory an earlier sweep wrote, by its relative path; folders have a slash behind."""
+    files = set(files_of_ours(directory))
+    with suppress(DataError):
+        files |= {SWEEP, PAGE, *read_sweep(directory / SWEEP).files}
+    return frozenset(files | {f"{part.as_posix()}/" for file in files for part in PurePosixPath(file).parents} - {"./"})
+
+
+def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Sequence[NamedFigure]") -> SweepRecord:
+    """Write ``sweep.json``, ``sweep.md`` and the figures, PNG and PDF, beside the outcomes kept in a directory.
+
+    Raises OutputError where it cannot be written or holds something else; nothing is left behind then.
+    """
+    from toolkit.report.figures import save
+
+    with replaced_directory(target, _ours) as directory:
+        if (target / OUTCOMES).exists():
+            take_over(target / OUTCOMES, directory / OUTCOMES)
+        (directory / _FIGURES).mkdir()
+        save(figures, directory / _FIGURES, "pdf")
+        captions = {f"{_FIGURES}/{name}": text for name, text in save(figures, directory / _FIGURES).items()}
+        written = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file())
+        document = sweep_document(sweep, command, captions, (*sorted(written), TEXT, SWEEP))
+        (directory / TEXT).write_text(sweep_markdown(document), encoding="utf-8")
+        (directory / SWEEP).write_text(to_text(document), encoding="utf-8")
+    return document
