@@ -87,6 +87,15 @@ def test_killed_and_started_again_nothing_runs_twice_and_the_result_is_the_same(
         np.testing.assert_array_equal(kept.outputs["final"].heldout_px, fresh.outputs["final"].heldout_px)
 
 
+def test_trials_that_come_to_the_same_run_run_once(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[Unit] = []
+    monkeypatch.setattr(pipeline, "run_unit", lambda unit, progress: (ran.append(unit), run_unit(unit, progress))[1])
+    default = Trial.of("dead-reckoning", {"noise.motion_scale": "auto"})
+    grid = run_grid(plan, [CLEAN, default, Trial.of("dead-reckoning", {"estimators.ekf.landmark_uncertainty": False})])
+    assert len(ran) == 2
+    assert len({id(outcomes[0]) for outcomes in grid.outcomes.values()}) == 1
+
+
 def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan: Plan) -> None:
     grid = run_grid(plan, [CLEAN, Trial.of("dead-reckoning", faults={"nan_span": 0.5})])
     clean, broken = grid.outcomes.values()

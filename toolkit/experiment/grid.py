@@ -3,16 +3,18 @@
 Whoever asks what a change costs or brings lists the trials; what is not kept from before is run, side by side.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from toolkit.answers import Output, Status
 from toolkit.errors import no_such
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.outcome_store import NOWHERE
+from toolkit.experiment.outcome_store import NOWHERE, settings_of_a_run
 from toolkit.experiment.pipeline import Job, Plan, located, outcomes_of, prepared_cases, store_of, workers_of
 from toolkit.experiment.recording import WHOLE, Prepared
 from toolkit.experiment.units import Outcome, Unit
@@ -110,10 +112,20 @@ def run_grid(
         for faults in dict.fromkeys(trial.faults for trial in plans):
             planted(case.sequence, faults, plan.seeds[0])
         with closing(NOWHERE if directory is None else store_of(plan, case, directory)) as store:
-            jobs = {(trial, unit.seed): Job(unit, store) for trial, unit in _units(plans, case)}
+            jobs: dict[Hashable, Job] = {}
+            of_trial: dict[Trial, list[Hashable]] = {trial: [] for trial in plans}
+            for trial, unit in _units(plans, case):
+                of_trial[trial].append(_all_that_it_depends_on(unit))
+                jobs.setdefault(of_trial[trial][-1], Job(unit, store))
             found = dict(outcomes_of(list(jobs.values()), workers, case.name, progress_for))
-    by_job = {job: found[place] for place, job in enumerate(jobs)}
-    return Grid(plan, case, {trial: tuple(by_job[trial, seed] for seed in plan.seeds) for trial in plans})
+    outcomes = {job: found[place] for place, job in enumerate(jobs)}
+    return Grid(plan, case, {trial: tuple(outcomes[job] for job in of) for trial, of in of_trial.items()})
+
+
+def _all_that_it_depends_on(unit: Unit) -> Hashable:
+    """Return a key that two units share which come to the same run, as where a setting has its default."""
+    settings = settings_of_a_run(unit.settings, unit.estimator)
+    return unit.recording, unit.estimator, msgspec.json.encode(settings, order="deterministic")
 
 
 def _plan_of(plan: Plan, trial: Trial) -> Plan:

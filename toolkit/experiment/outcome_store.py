@@ -236,7 +236,7 @@ class Conditions:
             data=self.data,
             seed=unit.seed,
             estimator=unit.estimator,
-            settings=_settings_of_a_run(unit.settings, unit.estimator),
+            settings=settings_of_a_run(unit.settings, unit.estimator),
             keep=tuple(sorted(self.keep | unit.requested.keep)),
             faults=unit.requested.faults,
             code=_code("" if unit.entry is None else unit.entry.own_digest),
@@ -254,7 +254,7 @@ def _code(own: str) -> str:
     return hashlib.sha256(f"{code_digest()}{own}".encode()).hexdigest() if own else code_digest()
 
 
-def _settings_of_a_run(settings: Settings, estimator: str) -> dict[str, object]:
+def settings_of_a_run(settings: Settings, estimator: str) -> dict[str, object]:
     """Return the settings that a run depends on: all but the number of seeds and the requested metrics."""
     values = as_values(settings)
     for name in ("first_seed", "seeds", "metrics"):

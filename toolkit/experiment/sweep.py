@@ -26,7 +26,7 @@ from toolkit.errors import no_such
 from toolkit.experiment.comparison import NEES, Row
 from toolkit.experiment.contests import COST, HELD_OUT, accuracy_of
 from toolkit.experiment.grid import Grid, Trial, run_grid
-from toolkit.experiment.pipeline import Plan, workers_of
+from toolkit.experiment.pipeline import Plan, located, workers_of
 from toolkit.experiment.recording import found_where_planted
 from toolkit.experiment.statistics import Interval, jackknife_interval, mean_interval
 from toolkit.experiment.workers import LostUnit
@@ -255,9 +255,10 @@ def _trial(estimator: str, point: Point) -> Trial:
 def _found_by_the_audit(plan: Plan, axes: Iterable[Axis], progress_for: ProgressFor) -> dict[Point, tuple[str, ...]]:
     """Return what the audit finds where a fault is planted in the recording of the first seed, by axis and dose."""
     points = [point for axis in axes if axis.is_fault for point in axis.points]
-    asked = [plan.recording(plan.sources[0], plan.seeds[0], _trial("", point).faults) for point in points]
     if not points:
         return {}
+    source = located(plan.sources[0])
+    asked = [plan.recording(source, plan.seeds[0], _trial("", point).faults) for point in points]
     with (
         workers_of(plan) as workers,
         progress_for("auditing each dose") as progress,
