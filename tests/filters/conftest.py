@@ -6,24 +6,28 @@ a tiny share of the stated ones is linear in effect: what a filter linearises at
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
-from types import SimpleNamespace
+from functools import cache, partial
 
 import gtsam
 import numpy as np
-import pytest
 
+from filters.ekf_slam import JointEkf
+from filters.kalman import joint_landmarks
+from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
 from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
+from filters.kalman.online_output import LandmarkMemory
 from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import B, L, StereoFactors, V, X
+from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.models.stereo import project, triangulate_world
 from toolkit.sequence import Observations, Sequence
+from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import Scenario, simulate
 
 SEED = 11
@@ -39,9 +43,7 @@ class Recording:
 
     @property
     def setup(self) -> Setup:
-        s = self.sequence
-        assert s.prior is not None
-        return runner.setup_of(s, s.prior)
+        return setup_of(self.sequence)
 
     def truth_at(self, k: int) -> Estimate:
         truth = self.sequence.truth
@@ -130,16 +132,6 @@ def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
     assert np.abs((one - other) / np.outer(sigma, sigma)).max() < relative
 
 
-@pytest.fixture(scope="session")
-def oracle() -> SimpleNamespace:
-    """Return the tools of this file: what is not a fixture cannot be imported from here."""
-    return SimpleNamespace(
-        recorded=recorded,
-        batch=BatchAtTruth,
-        assert_covariances_agree=assert_covariances_agree,
-    )
-
-
 def with_clones(scenario: Scenario, seed: int, count: int) -> tuple[Sequence, JointBelief]:
     """Return a recording and the joint belief after its first frames, of which it has a clone each, without vision."""
     sequence = simulate(scenario, seed)
@@ -151,25 +143,82 @@ def with_clones(scenario: Scenario, seed: int, count: int) -> tuple[Sequence, Jo
     return sequence, joint
 
 
-@pytest.fixture(scope="session")
-def window_of_clones() -> Callable[[Scenario, int, int], tuple[Sequence, JointBelief]]:
-    """Return a maker of windows of exact clones, of a scenario under a seed."""
-    return with_clones
+def recording_with_a_fleck(scenario: Scenario, tracks: int, seed: int, depth_m: float) -> Sequence:
+    """Return a recording of few tracks, with a point that moves with the car tracked throughout."""
+    sequence = short(scenario, scenario.duration_s, tracks, seed)
+    count, seen, rig = sequence.frame_count, sequence.observations, sequence.rig
+    noise = np.random.default_rng(seed).standard_normal((count, 3)) * np.sqrt(np.diag(rig.cov_uv_px2))
+    observations = Observations.sorted(
+        np.r_[seen.frame, np.arange(count)],
+        np.r_[seen.track_id, np.full(count, 10**6)],
+        np.r_[seen.uv_px, project(depth_m * np.array([0.1, 0.05, 1.0]), rig) + noise],
+    )
+    return replace(sequence, observations=observations)
 
 
-@pytest.fixture
-def recording_with_a_fleck() -> Callable[[Scenario, int, int, float], Sequence]:
-    """Return a maker of recordings of few tracks, with a point that moves with the car tracked throughout."""
+def short(scenario: Scenario, duration_s: float, tracks: int | None = None, seed: int = 0) -> Sequence:
+    """Simulate so many seconds of a scenario with at most so many tracks in view."""
+    camera = replace(scenario.camera, max_tracks=tracks or scenario.camera.max_tracks)
+    return simulate(replace(scenario, duration_s=duration_s, camera=camera), seed)
 
-    def record(scenario: Scenario, tracks: int, seed: int, depth_m: float) -> Sequence:
-        sequence = simulate(replace(scenario, camera=replace(scenario.camera, max_tracks=tracks)), seed)
-        count, seen, rig = sequence.frame_count, sequence.observations, sequence.rig
-        noise = np.random.default_rng(seed).standard_normal((count, 3)) * np.sqrt(np.diag(rig.cov_uv_px2))
-        observations = Observations.sorted(
-            np.r_[seen.frame, np.arange(count)],
-            np.r_[seen.track_id, np.full(count, 10**6)],
-            np.r_[seen.uv_px, project(depth_m * np.array([0.1, 0.05, 1.0]), rig) + noise],
-        )
-        return replace(sequence, observations=observations)
 
-    return record
+def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
+    assert sequence.prior is not None
+    return runner.setup_of(sequence, sequence.prior, settings)
+
+
+def numerical_jacobian(function: Callable[[Array], Array], size: int, step: float = 1e-3) -> Array:
+    """Five-point central differences: good to 1e-10 of values near 1."""
+    columns = []
+    for unit in step * np.eye(size):
+        near, far = function(unit) - function(-unit), function(2.0 * unit) - function(-2.0 * unit)
+        columns.append((8.0 * near - far) / (12.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def carried(
+    scenario: Scenario, belief: Callable[..., JointBelief], tracks: int
+) -> tuple[JointBelief, StereoFrame, StereoRig]:
+    """Return a joint belief that has been filtered for six frames and carried to the next, that frame and its rig."""
+    sequence, at = short(scenario, 1.0, tracks, 3), AtLatestEstimates()
+    ekf, packets = JointEkf(setup_of(sequence), at, partial(belief, sequence.rig)), list(sequence.packets())
+    for packet in packets[:6]:
+        ekf.step(packet)
+    joint, frame = ekf.joint, packets[6].frame
+    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), at, packets[6].motion)
+    joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
+    assert len(joint.landmark_ids) > 5
+    return joint, frame, sequence.rig
+
+
+# How a joint filter's belief is made of a rig and the first core.
+BELIEFS: dict[str, Callable[[StereoRig, Belief], JointBelief]] = {
+    "plain": lambda rig, core: JointBelief(core),
+    "riekf": lambda rig, core: InvariantBelief(core),
+    "iekf": lambda rig, core: AnchoredBelief(core, rig.T_imu_cam),
+}
+
+
+class Problem:
+    """Two seconds of a simulated recording as a graph, started from disturbed truth."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        sequence = short(scenario, 2.0, seed=2)
+        self.rig, self.packets = sequence.rig, list(sequence.packets())
+        motion, maker = motion_model(sequence.noise, sequence.gravity_world), StereoFactors(sequence.rig)
+        self.graph, self.start = motion.hold(motion.initial_belief(sequence.prior), 0), gtsam.Values()
+        self.increments: dict[int, GraphIncrement] = {}
+        truth, rng = sequence.truth, np.random.default_rng(5)
+        for k, packet in enumerate(self.packets):
+            disturbed = gtsam.Pose3(truth.T_world_imu[k]).retract(0.02 * rng.standard_normal(6)).matrix()
+            estimate = Estimate(packet.frame.t_ns, disturbed, v_world=truth.v_world[k], bias=np.zeros(6))
+            motion.insert(self.start, estimate, k)
+            if packet.motion is not None:
+                self.increments[k] = motion.integrate(packet.motion, np.zeros(6))
+                self.graph.push_back(self.increments[k].factors(k))
+            for factor in maker.of(packet.frame, k):
+                self.graph.add(factor)
+            points = triangulate_world(packet.frame.uvs_px, disturbed, sequence.rig)
+            for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
+                if not self.start.exists(L(track_id)):
+                    self.start.insert(L(track_id), point)

@@ -1,24 +1,233 @@
-"""What the decoupled filter keeps of a filter's promises, though it drops the cross-covariances: its gate."""
+"""The decoupled filter: the report's corrections, the map that is kept of what is in view, and its gate."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from filters.ekf import DecoupledEkf, as_uncertain_as_stated
-from toolkit import runner
+from filters.ekf import DecoupledEkf, as_uncertain_as_stated, correct_pose
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, first_sighting
+from tests.filters.conftest import setup_of
+from toolkit.geometry import Array, se3_exp
+from toolkit.measurements import StereoFrame
+from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX, FrameGate, chi2_bound, huber_weights, mahalanobis_squared
+from toolkit.models.state import IMU_LAYOUT, TWIST_LAYOUT, Belief, Layout
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
+RIG = DRIVE.rig
+N = 60
+PROBABILITY, HUBER = 0.95, 1.5
+# Both forms invert matrices whose condition is about 1e6 here: nine digits are left of sixteen.
+RELATIVE = 1e-9
 
-def filter_of(sequence: Sequence) -> DecoupledEkf:
-    prior = sequence.prior
-    return DecoupledEkf(runner.setup_of(sequence, prior), as_uncertain_as_stated)
+each_layout = pytest.mark.parametrize("layout", [TWIST_LAYOUT, IMU_LAYOUT], ids=["twist", "imu"])
+
+
+class Scene(NamedTuple):
+    """A belief, a map drawn from its own covariances, and noisy sightings (N, 3) px of it."""
+
+    belief: Belief
+    landmarks: LandmarkMap
+    uvs_px: Array
+
+
+def correlated(size: int, rng: np.random.Generator) -> Array:
+    """Return a covariance with correlations of every pair."""
+    root = np.eye(size) + 0.3 * rng.standard_normal((size, size))
+    covariance: Array = root @ root.T
+    return covariance
+
+
+def scene(layout: Layout, seed: int = 1) -> Scene:
+    rng = np.random.default_rng(seed)
+    true_pose = se3_exp(np.array([0.1, -0.2, 1.3, 20.0, -7.0, 2.0]))
+    cov = np.diag(np.full(layout.size, 0.02)) @ correlated(layout.size, rng) @ np.diag(np.full(layout.size, 0.02))
+    depth_m = rng.uniform(5.0, 25.0, N)
+    points_cam = np.stack([rng.uniform(-0.6, 0.6, N) * depth_m, rng.uniform(-0.2, 0.2, N) * depth_m, depth_m], axis=1)
+    T_world_cam = true_pose @ RIG.T_imu_cam
+    points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    covs = np.array([0.05**2 * correlated(3, rng) for _ in range(N)])
+    noise_px = rng.standard_normal((N, 3)) @ np.linalg.cholesky(RIG.cov_uv_px2).T
+    uvs_px = stereo.predict(points, true_pose, RIG).uv_px + noise_px
+    guessed = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.standard_normal((N, 3)))
+    root = np.linalg.cholesky(cov)
+    T_world_imu = true_pose @ se3_exp(root[:6] @ rng.standard_normal(layout.size))
+    belief = Belief(layout, T_world_imu, np.array([5.0, 1.0, 0.2]), np.zeros(6), cov)
+    return Scene(belief, LandmarkMap(np.arange(N), guessed, covs), uvs_px)
+
+
+def by_the_book(belief: Belief, H_pose: Array, residual: Array, noise: Array) -> tuple[Array, Array]:
+    """Return the correction (d,) and covariance (d, d) of Kang's eqs. 12-14, with the matrix of all measurements."""
+    H = np.zeros((residual.size, belief.layout.size))
+    H[:, :6] = H_pose
+    gain = belief.cov @ H.T @ np.linalg.inv(H @ belief.cov @ H.T + noise)
+    return gain @ residual, (np.eye(belief.layout.size) - gain @ H) @ belief.cov
+
+
+def assert_same(updated: Belief, belief: Belief, correction: Array, cov: Array) -> None:
+    expected = belief.moved(correction, cov)
+    np.testing.assert_allclose(updated.cov, expected.cov, rtol=0.0, atol=RELATIVE * np.abs(cov).max())
+    for name in ("T_world_imu", "v_world", "bias"):
+        largest = np.abs(correction).max()
+        np.testing.assert_allclose(getattr(updated, name), getattr(expected, name), rtol=0.0, atol=RELATIVE * largest)
+
+
+@each_layout
+def test_pose_correction_is_the_reports_update_with_the_weights_and_gates_it_reports(layout):
+    """In the form of information, against the gain with all measurements in one matrix."""
+    belief, landmarks, uvs_px = scene(layout)
+    uvs_px[::7] += 80.0
+    gate = FrameGate(PROBABILITY, HUBER)
+    corrected, accepted = correct_pose(belief, landmarks, uvs_px, RIG, gate)
+    assert not accepted[::7].any()
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
+    residual_px = uvs_px - predicted.uv_px
+    own_cov = RIG.cov_uv_px2 + predicted.d_uv_d_point @ landmarks.covs @ np.swapaxes(predicted.d_uv_d_point, 1, 2)
+    innovation_cov = own_cov + predicted.d_uv_d_pose @ belief.cov[:6, :6] @ np.swapaxes(predicted.d_uv_d_pose, 1, 2)
+    nis = np.array([r @ np.linalg.inv(S) @ r for r, S in zip(residual_px, innovation_cov, strict=True)])
+    np.testing.assert_array_equal(accepted, nis < chi2_bound(3, PROBABILITY))
+    assert (gate.tested, gate.accepted, gate.dof) == (N, accepted.sum(), 3 * accepted.sum())
+    assert gate.nis == pytest.approx(nis[accepted].sum(), rel=RELATIVE)
+    weights = huber_weights(mahalanobis_squared(residual_px, own_cov), HUBER)
+    kept = np.flatnonzero(accepted)
+    noise = np.zeros((3 * kept.size, 3 * kept.size))
+    for row, i in enumerate(kept):
+        noise[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = own_cov[i] / weights[i]
+    expected = by_the_book(belief, predicted.d_uv_d_pose[kept].reshape(-1, 6), residual_px[kept].ravel(), noise)
+    assert_same(corrected, belief, *expected)
+
+
+@pytest.mark.parametrize("pose_known", [True, False])
+def test_landmark_correction_is_a_kalman_update_of_each_landmark_alone(pose_known):
+    """Kang, eqs. 8-10, one landmark at a time; a doubtful pose counts as measurement noise."""
+    belief, landmarks, uvs_px = scene(TWIST_LAYOUT)
+    pose_cov = np.zeros((6, 6)) if pose_known else belief.cov[:6, :6]
+    corrected = correct_landmarks(landmarks, uvs_px, belief.T_world_imu, pose_cov, RIG)
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
+    for i in range(N):
+        H, H_pose, P = predicted.d_uv_d_point[i], predicted.d_uv_d_pose[i], landmarks.covs[i]
+        innovation_cov = H @ P @ H.T + RIG.cov_uv_px2 + H_pose @ pose_cov @ H_pose.T
+        gain = P @ H.T @ np.linalg.inv(innovation_cov)
+        residual = uvs_px[i] - predicted.uv_px[i]
+        expected = landmarks.points[i] + gain @ residual
+        np.testing.assert_allclose(corrected.landmarks.points[i], expected, atol=RELATIVE)
+        expected_cov = (np.eye(3) - gain @ H) @ P
+        tolerance = RELATIVE * np.abs(P).max()
+        np.testing.assert_allclose(corrected.landmarks.covs[i], expected_cov, rtol=0.0, atol=tolerance)
+        assert corrected.nis[i] == pytest.approx(residual @ np.linalg.inv(innovation_cov) @ residual, rel=RELATIVE)
+
+
+POSE = se3_exp(np.array([0.1, -0.2, 1.3, 20.0, -7.0, 2.0]))
+
+
+def frame_of(ids: list[int], u_left: float = 400.0, disparity_px: float = 40.0) -> StereoFrame:
+    uvs_px = np.array([[u_left + i, u_left + i - disparity_px, 150.0 + i] for i in ids]).reshape(-1, 3)
+    return StereoFrame(0, np.array(ids, dtype=np.int64), uvs_px)
+
+
+def test_a_first_sighting_stands_where_stereo_sees_it():
+    frame = frame_of([3, 8, 9])
+    started = first_sighting(frame, np.array([0, 2]), POSE, RIG)
+    np.testing.assert_array_equal(started.track_ids, [3, 9])
+    np.testing.assert_allclose(started.points, stereo.triangulate_world(frame.uvs_px[[0, 2]], POSE, RIG), atol=1e-12)
+
+
+def test_the_covariance_of_a_first_sighting_is_the_measurements_carried_through_triangulation():
+    """By numerical differences of the triangulation: an independent way to the same 3x3 matrix."""
+    frame = frame_of([0, 30, 200])
+    started, step = first_sighting(frame, np.arange(3), POSE, RIG), 1e-3
+    for i, uv_px in enumerate(frame.uvs_px):
+        columns = [
+            (stereo.triangulate_world(uv_px + d, POSE, RIG) - stereo.triangulate_world(uv_px - d, POSE, RIG))
+            for d in step * np.eye(3)
+        ]
+        jacobian = np.stack(columns, axis=1) / (2.0 * step)
+        expected = jacobian @ RIG.cov_uv_px2 @ jacobian.T
+        # Central differences at 40 px of disparity err by (1e-3 / 40)^2.
+        np.testing.assert_allclose(started.covs[i], expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_too_little_disparity_waits_for_a_better_view():
+    far = frame_of([1], disparity_px=0.9 * LEAST_DISPARITY_PX)
+    tracked = TrackedMap(RIG)
+    seen, _ = tracked.seen_again(far)
+    tracked.keep(seen, far, POSE)
+    assert len(tracked.landmarks()) == 0
+    near = frame_of([1], disparity_px=2.0 * LEAST_DISPARITY_PX)
+    seen, _ = tracked.seen_again(near)
+    tracked.keep(seen, near, POSE)
+    np.testing.assert_array_equal(tracked.landmarks().track_ids, [1])
+
+
+def test_lost_landmarks_leave_the_state():
+    """What is matched is at most what the last frame showed, however long the drive."""
+    sequence = simulate(DRIVE, 0)
+    tracked, before = TrackedMap(RIG), np.empty(0, dtype=np.int64)
+    for packet, pose in zip(sequence.packets(), sequence.truth.T_world_imu, strict=True):
+        seen, uvs_px = tracked.seen_again(packet.frame)
+        assert set(seen.track_ids) <= set(before) & set(packet.frame.track_ids)
+        assert len(seen) == len(uvs_px)
+        tracked.keep(seen, packet.frame, pose)
+        before = packet.frame.track_ids
+    everyone = tracked.landmarks()
+    assert np.isin(everyone.track_ids, sequence.visible.track_id).all()
+    assert len(everyone) > 10 * before.size
+
+
+def test_an_id_that_comes_back_is_a_new_landmark():
+    tracked = TrackedMap(RIG)
+    for frame in (frame_of([1, 2]), frame_of([2])):
+        seen, _ = tracked.seen_again(frame)
+        tracked.keep(seen, frame, POSE)
+    returned = frame_of([1, 2], u_left=500.0)
+    seen, _ = tracked.seen_again(returned)
+    np.testing.assert_array_equal(seen.track_ids, [2])
+    tracked.keep(seen, returned, POSE)
+    expected = stereo.triangulate_world(returned.uvs_px[:1], POSE, RIG)
+    np.testing.assert_allclose(tracked.landmarks().points_world[0], expected[0], atol=1e-12)
+
+
+def moved(landmarks: LandmarkMap, by_m: Array) -> LandmarkMap:
+    return landmarks.corrected(np.ones(len(landmarks), dtype=bool), landmarks.points + by_m, landmarks.covs)
+
+
+def test_the_archive_keeps_every_id_once_with_its_last_value():
+    tracked = TrackedMap(RIG)
+    first, second = frame_of([4, 7]), frame_of([7])
+    seen, _ = tracked.seen_again(first)
+    tracked.keep(seen, first, POSE)
+    seen, _ = tracked.seen_again(second)
+    tracked.keep(moved(seen, np.array([1.0, 0.0, 0.0])), second, POSE)
+    nothing = frame_of([])
+    seen, _ = tracked.seen_again(nothing)
+    tracked.keep(seen, nothing, POSE)
+    # Returns to be archived a second time.
+    seen, _ = tracked.seen_again(first)
+    tracked.keep(moved(seen, np.zeros(3)), first, POSE)
+    landmarks = tracked.landmarks()
+    np.testing.assert_array_equal(landmarks.track_ids, [4, 7])
+    np.testing.assert_allclose(landmarks.points_world, stereo.triangulate_world(first.uvs_px, POSE, RIG), atol=1e-12)
+
+
+def test_the_last_value_of_a_lost_landmark_is_the_corrected_one():
+    tracked = TrackedMap(RIG)
+    frame = frame_of([4, 7])
+    seen, _ = tracked.seen_again(frame)
+    tracked.keep(seen, frame, POSE)
+    seen, _ = tracked.seen_again(frame)
+    shift_m = np.array([0.5, -0.25, 1.0])
+    tracked.keep(moved(seen, shift_m), frame, POSE)
+    tracked.seen_again(frame_of([]))
+    expected = stereo.triangulate_world(frame.uvs_px, POSE, RIG) + shift_m
+    np.testing.assert_allclose(tracked.landmarks().points_world, expected, atol=1e-12)
 
 
 def accepted_share(sequence: Sequence) -> float:
     """Return the share of sightings of known landmarks that pass the gate, over a whole run."""
-    ekf = filter_of(sequence)
+    ekf = DecoupledEkf(setup_of(sequence), as_uncertain_as_stated)
     info = [ekf.step(packet).info for packet in sequence.packets()]
     return sum(i["gate_accepted"] for i in info) / sum(i["gate_tested"] for i in info)
 

@@ -16,35 +16,18 @@ import pytest
 from filters import iekf
 from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
-from filters.kalman.coordinates import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
-from filters.kalman.online_output import LandmarkMemory
-from toolkit import runner
-from toolkit.estimator import Setup
+from filters.kalman.coordinates import AnchoredBelief, inverse_depth, inverse_depth_jacobian
+from filters.kalman.joint import AtLatestEstimates, JointBelief
+from tests.filters.conftest import BELIEFS, carried, numerical_jacobian, setup_of, short
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.gating import FrameGate
-from toolkit.models.motion import motion_model
-from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings
-from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.simulation import DRIVE, FLIGHT
 
 AT = AtLatestEstimates()
 both_kinds = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
-
-
-def recording(scenario, duration_s: float, tracks: int, seed: int = 3) -> Sequence:
-    return simulate(replace(scenario, duration_s=duration_s, camera=replace(scenario.camera, max_tracks=tracks)), seed)
-
-
-def setup_of(sequence: Sequence) -> Setup:
-    assert sequence.prior is not None
-    return runner.setup_of(sequence, sequence.prior)
-
-
-def anchored(rig: StereoRig):
-    return partial(AnchoredBelief, T_imu_cam=rig.T_imu_cam)
 
 
 class Scene(NamedTuple):
@@ -58,35 +41,17 @@ class Scene(NamedTuple):
         return iekf.Measurement(self.joint, self.frame, AT, self.rig, np.ones(len(self.joint.points), dtype=bool))
 
 
-def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) -> Scene:
+def scene(scenario, belief: str = "iekf", disturbed: float = 2.0) -> Scene:
     """Return a belief some standard deviations away from where it would have been."""
-    sequence = recording(scenario, 1.0, tracks=12)
-    ekf = JointEkf(setup_of(sequence), AT, belief(sequence.rig))
-    packets = list(sequence.packets())
-    for packet in packets[:frames]:
-        ekf.step(packet)
-    joint, frame = ekf.joint, packets[frames].frame
-    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), AT, packets[frames].motion)
-    joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
-    rows = np.isin(frame.track_ids, joint.landmark_ids)
+    joint, frame, rig = carried(scenario, BELIEFS[belief], 12)
     drawn = np.random.default_rng(8).standard_normal(joint.cov.shape[0])
     joint.move(disturbed * np.linalg.cholesky(joint.cov) @ drawn)
     joint.clone()
-    assert len(joint.points) > 5
-    return Scene(joint, frame.select(rows), sequence.rig)
-
-
-def numerical(function, size: int, step: float = 1e-3) -> Array:
-    """Five-point central differences."""
-    columns = []
-    for unit in step * np.eye(size):
-        near, far = function(unit) - function(-unit), function(2.0 * unit) - function(-2.0 * unit)
-        columns.append((8.0 * near - far) / (12.0 * step))
-    return np.stack(columns, axis=-1)
+    return Scene(joint, frame.select(np.isin(frame.track_ids, joint.landmark_ids)), rig)
 
 
 @both_kinds
-@pytest.mark.parametrize("belief", [lambda _: JointBelief, lambda _: InvariantBelief, anchored])
+@pytest.mark.parametrize("belief", BELIEFS)
 def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario, belief) -> None:
     joint, frame, rig = scene(scenario, belief)
     n, part = joint.cov.shape[0], joint_landmarks.columns(joint)
@@ -102,7 +67,7 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     seen = joint_landmarks.linearise_sightings(joint.displaced(delta), frame, AT, rig)
     H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
     H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
-    expected = -numerical(residuals, part.stop - part.start)
+    expected = -numerical_jacobian(residuals, part.stop - part.start)
     assert np.abs(H.toarray() - expected).max() < 1e-7 * np.abs(expected).max()
     plain, _ = measurement.stacked(seen)
     assert np.abs(plain.toarray() - expected).max() > 1e-4 * np.abs(expected).max(), "the move was too small to tell"
@@ -114,10 +79,10 @@ def test_the_covariance_keeps_relative_inverse_depths_and_the_pose_while_the_est
     joint, *_ = scene(scenario)
     joint.forget_clones(np.ones(1, dtype=bool))
     assert isinstance(joint, AnchoredBelief)
-    before, P = numerical(partial(anchored_error, joint), joint.cov.shape[0]), joint.cov
+    before, P = numerical_jacobian(partial(anchored_error, joint), joint.cov.shape[0]), joint.cov
     drawn = np.random.default_rng(4).standard_normal(joint.cov.shape[0])
     joint.move(np.linalg.cholesky(joint.cov) @ drawn)
-    after = numerical(partial(anchored_error, joint), joint.cov.shape[0])
+    after = numerical_jacobian(partial(anchored_error, joint), joint.cov.shape[0])
     carry = np.linalg.solve(after, before)
     sigma = np.sqrt(np.diag(joint.cov))
     assert np.abs((joint.cov - carry @ P @ carry.T) / np.outer(sigma, sigma)).max() < 1e-8
@@ -145,7 +110,7 @@ def test_inverse_depth_is_its_own_inverse_and_has_that_jacobian() -> None:
     points = np.array([[1.0, -2.0, 5.0], [0.1, 0.2, 0.7], [-3.0, 1.0, -4.0]])
     np.testing.assert_allclose(inverse_depth(inverse_depth(points)), points, rtol=1e-14)
     for point in points:
-        expected = numerical(lambda d, at=point: inverse_depth(at + d), 3)
+        expected = numerical_jacobian(lambda d, at=point: inverse_depth(at + d), 3)
         np.testing.assert_allclose(inverse_depth_jacobian(point), expected, rtol=0.0, atol=1e-9)
 
 
@@ -192,9 +157,9 @@ class LagZero:
         T, points = values.atPose3(X(0)).matrix(), np.array([values.atPoint3(k) for k in self._keys[1:]])
         error = self._error(T, points)
         if jacobians is not None:
-            jacobians[0] = numerical(lambda d: self._error(T @ se3_exp(d), points), 6)
+            jacobians[0] = numerical_jacobian(lambda d: self._error(T @ se3_exp(d), points), 6)
             for i in range(len(points)):
-                jacobians[i + 1] = numerical(
+                jacobians[i + 1] = numerical_jacobian(
                     lambda d, i=i: self._error(T, points + np.eye(len(points))[i][:, None] * d), 3
                 )
         return error
@@ -272,10 +237,10 @@ def test_an_iteration_that_is_broken_off_ends_at_its_lowest_cost(monkeypatch) ->
 @both_kinds
 def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(scenario) -> None:
     """The gate is open and every frame shows each landmark where another one is."""
-    sequence = recording(scenario, 1.0, tracks=12)
+    sequence = short(scenario, 1.0, 12, 3)
     open_gate = Settings(outliers=Outliers(gate_probability=1.0))
     setup, rng, unconverged = replace(setup_of(sequence), settings=open_gate), np.random.default_rng(0), 0.0
-    ekf = JointEkf(setup, AT, anchored(sequence.rig), iekf.correct)
+    ekf = JointEkf(setup, AT, partial(BELIEFS["iekf"], sequence.rig), iekf.correct)
     for packet in sequence.packets():
         frame = packet.frame
         estimate = ekf.step(replace(packet, frame=replace(frame, uvs_px=rng.permutation(frame.uvs_px))))
@@ -291,8 +256,8 @@ def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
 
     def nees(belief, seed: int) -> float:
         """Return the mean normalised error squared of the pose over a run."""
-        sequence = recording(FLIGHT, 3.0, tracks=25, seed=seed)
-        ekf, errors = JointEkf(setup_of(sequence), AT, belief(sequence.rig), iekf.correct), []
+        sequence = short(FLIGHT, 3.0, 25, seed)
+        ekf, errors = JointEkf(setup_of(sequence), AT, partial(BELIEFS[belief], sequence.rig), iekf.correct), []
         assert sequence.truth is not None
         for packet in sequence.packets():
             estimate = ekf.step(packet)
@@ -300,7 +265,7 @@ def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
             errors.append(error @ np.linalg.solve(estimate.cov[:6, :6], error) / 6)
         return float(np.mean(errors))
 
-    in_metres = np.mean([nees(lambda _: InvariantBelief, seed) for seed in range(6)])
-    in_inverse_depth = np.mean([nees(anchored, seed) for seed in range(6)])
+    in_metres = np.mean([nees("riekf", seed) for seed in range(6)])
+    in_inverse_depth = np.mean([nees("iekf", seed) for seed in range(6)])
     assert in_inverse_depth < 1.6
     assert in_metres > 1.5 * in_inverse_depth

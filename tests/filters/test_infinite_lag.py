@@ -9,6 +9,7 @@ from filters import ekf
 from filters.batch import Batch
 from filters.fixed_lag import FixedLag
 from filters.smart import Smart
+from tests.filters.conftest import recorded
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
@@ -22,7 +23,7 @@ def largest_difference(one, other) -> float:
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 @pytest.mark.parametrize("kind", [FixedLag, Smart])
-def test_an_infinite_lag_is_the_batch(kind, scenario, oracle):
+def test_an_infinite_lag_is_the_batch(kind, scenario):
     """Held equal: packets, prior, stated noise, the motion's and the stereo factors, the gate that lets all pass.
 
     Not equal: the robust losses, Huber from the gate on against Cauchy. The errors are drawn at a tenth of the
@@ -31,7 +32,7 @@ def test_an_infinite_lag_is_the_batch(kind, scenario, oracle):
     linearised until it has moved by 0.01, which in metres or radians, squared, is the tolerance. Smart factors stop
     a fraction of a sigma short.
     """
-    recording = oracle.recorded(replace(scenario, camera=replace(scenario.camera, max_tracks=30)), 0.1, seed=3)
+    recording = recorded(replace(scenario, camera=replace(scenario.camera, max_tracks=30)), 0.1, seed=3)
     setup, duration_s = recording.setup, recording.sequence.duration_s
     endless, batch, filtered = kind(setup, 10.0 * duration_s), Batch(setup), ekf.build(setup)
     for packet in recording.sequence.packets():

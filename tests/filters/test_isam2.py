@@ -32,24 +32,8 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.faults import cut_tracks, moving_vehicles
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
-STEP_BIAS = np.array([0.01, -0.02, 0.005])
 # What a pose is from itself, in its tangent space.
 ROUNDING = 1e-12
-
-
-def values_of(start: gtsam.Pose3, end: gtsam.Pose3, bias: np.ndarray) -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(X(0), start)
-    values.insert(X(1), end)
-    values.insert(B(0), bias)
-    return values
-
-
-@pytest.fixture
-def values() -> gtsam.Values:
-    rng = np.random.default_rng(0)
-    start, off = gtsam.Pose3.Expmap(rng.standard_normal(6)), gtsam.Pose3.Expmap(0.01 * rng.standard_normal(6))
-    return values_of(start, start.compose(gtsam.Pose3(gtsam.Rot3(), [0.8, 0.0, 0.0])).compose(off), STEP_BIAS + 0.01)
 
 
 def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -336,7 +320,7 @@ def isam2_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Isam2:
     return Isam2(runner.setup_of(s, s.prior, settings))
 
 
-@pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
 def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     """Of every factor it took in, the Python ones themselves: many more steps lead nowhere else.
 
@@ -357,14 +341,6 @@ def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     assert (np.abs(off) < 0.01 * sigma).all()
     was = [se3_log(se3_inverse(optimum[k]) @ before.atPose3(X(k)).matrix()) for k in range(len(final))]
     assert (np.abs(was) > 0.02 * sigma).any(), "there was something to solve for"
-
-
-def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
-    sequence = simulate(replace(DRIVE, duration_s=6.0), 1)
-    hidden = (sequence.observations.frame >= 15) & (sequence.observations.frame < 45)
-    run = run_estimator("isam2", replace(sequence, observations=sequence.observations.select(~hidden)))
-    assert run.status == "ok", run.log
-    assert np.isfinite(run.causal.cov).all()
 
 
 def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew():

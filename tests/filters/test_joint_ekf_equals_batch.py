@@ -12,6 +12,7 @@ import pytest
 
 from filters.ekf_slam import JointEkf
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
 # Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
@@ -23,8 +24,9 @@ SCENARIOS = [
 SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=30)) for s in SCENARIOS]
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-both_weights = pytest.mark.parametrize("weight", [1.0, 0.25])
-both_linearisations = pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
+both_linearisations_and_weights = pytest.mark.parametrize(
+    ("at", "weight"), [(AtFirstEstimates(), 1.0), (AtLatestEstimates(), 0.25)], ids=["first", "latest, weighed"]
+)
 
 
 def last_answer(recording, at):
@@ -45,13 +47,12 @@ def weighing(recording, weight):
 
 
 @every_scenario
-@both_linearisations
-@both_weights
-def test_its_last_mean_is_that_of_the_batch(scenario, at, weight, oracle):
+@both_linearisations_and_weights
+def test_its_last_mean_is_that_of_the_batch(scenario, at, weight):
     """Errors of 1e-4 of the stated noise: both correct by micrometres and agree to a hundredth of that or better."""
-    recording = weighing(oracle.recorded(scenario, 1e-4), weight)
+    recording = weighing(recorded(scenario, 1e-4), weight)
     estimate, last, forgotten = last_answer(recording, at)
-    mean, _ = oracle.batch(recording, recording.track_ids).state(last)
+    mean, _ = BatchAtTruth(recording, recording.track_ids).state(last)
     assert forgotten > 10, "tracks must have come and gone"
     # The second order is the square of a relative error of 1e-4 in positions of centimetres.
     assert np.abs(recording.error_of(estimate, last) - mean).max() < 1e-8
@@ -59,30 +60,29 @@ def test_its_last_mean_is_that_of_the_batch(scenario, at, weight, oracle):
 
 
 @every_scenario
-@both_linearisations
-@both_weights
-def test_its_last_covariance_is_that_of_the_batch(scenario, at, weight, oracle):
+@both_linearisations_and_weights
+def test_its_last_covariance_is_that_of_the_batch(scenario, at, weight):
     """Errors of 1e-7 of the stated noise: depths, and with them Jacobians, are off by 1e-8 of themselves."""
-    recording = weighing(oracle.recorded(scenario, 1e-7), weight)
+    recording = weighing(recorded(scenario, 1e-7), weight)
     estimate, last, forgotten = last_answer(recording, at)
-    _, cov = oracle.batch(recording, recording.track_ids).state(last)
+    _, cov = BatchAtTruth(recording, recording.track_ids).state(last)
     assert forgotten > 10, "tracks must have come and gone"
-    oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
+    assert_covariances_agree(estimate.cov, cov, 1e-6)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS[::2], ids=lambda s: s.name)
-def test_with_later_sightings_by_the_left_image_alone_it_is_the_batch_still(scenario, oracle):
+def test_with_later_sightings_by_the_left_image_alone_it_is_the_batch_still(scenario):
     """A landmark begins with a pair; of every later sighting uL and v correct, in both with the same noise."""
-    exact = [oracle.recorded(scenario, scale) for scale in (1e-4, 1e-7)]
+    exact = [recorded(scenario, scale) for scale in (1e-4, 1e-7)]
     for_mean, for_cov = (replace(one, sequence=without_later_pairs(one.sequence)) for one in exact)
     estimate, last, forgotten = last_answer(for_mean, AtFirstEstimates())
-    mean, _ = oracle.batch(for_mean, for_mean.track_ids).state(last)
+    mean, _ = BatchAtTruth(for_mean, for_mean.track_ids).state(last)
     assert forgotten > 10, "tracks must have come and gone"
     assert np.abs(for_mean.error_of(estimate, last) - mean).max() < 1e-8
     estimate, last, _ = last_answer(for_cov, AtFirstEstimates())
-    _, cov = oracle.batch(for_cov, for_cov.track_ids).state(last)
-    oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
-    _, cov_of_pairs = oracle.batch(exact[1], exact[1].track_ids).state(last)
+    _, cov = BatchAtTruth(for_cov, for_cov.track_ids).state(last)
+    assert_covariances_agree(estimate.cov, cov, 1e-6)
+    _, cov_of_pairs = BatchAtTruth(exact[1], exact[1].track_ids).state(last)
     assert np.trace(cov) > 1.02 * np.trace(cov_of_pairs), "the right images must have told something"
 
 
@@ -97,10 +97,10 @@ def without_later_pairs(sequence):
 
 
 @every_scenario
-def test_a_landmark_left_out_would_show(scenario, oracle):
+def test_a_landmark_left_out_would_show(scenario):
     """The two tests above can fail: a batch without one track in twenty is another problem."""
-    recording = oracle.recorded(scenario, 1e-7)
+    recording = recorded(scenario, 1e-7)
     estimate, last, _ = last_answer(recording, AtFirstEstimates())
-    _, cov = oracle.batch(recording, np.delete(recording.track_ids, np.s_[::20])).state(last)
+    _, cov = BatchAtTruth(recording, np.delete(recording.track_ids, np.s_[::20])).state(last)
     with pytest.raises(AssertionError):
-        oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
+        assert_covariances_agree(estimate.cov, cov, 1e-6)

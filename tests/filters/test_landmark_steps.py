@@ -64,10 +64,9 @@ def test_a_solve_whose_last_iteration_gained_little_enough_has_converged_without
         assert solution.converged == converged
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_start_that_drifts_comes_to_the_minimum_in_few_iterations(seed):
-    """With landmarks that move in metres, these took 60 (the most allowed) and 30, and ended 10 and 6 m off."""
-    graph, start, images = bent_drive(seed)
+def test_a_start_that_drifts_comes_to_the_minimum_in_few_iterations():
+    """With landmarks that move in metres, this took 60 (the most allowed), and ended 10 m off."""
+    graph, start, images = bent_drive(0)
     solution = solve(graph, start, Stopping(1e-4, 10), landmarks=images)
     assert solution.converged
     longer = solve(graph, start, EXACT, landmarks=images)

@@ -7,37 +7,12 @@ import numpy as np
 import pytest
 
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from tests.filters.conftest import Problem
 from toolkit.errors import EstimatorError
-from toolkit.estimate import Estimate
-from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.models.motion import motion_model
-from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate
+from toolkit.simulation import DRIVE, FLIGHT
 
 EXACT = Stopping(relative_decrease=1e-12, max_iterations=100)
-
-
-class Problem:
-    """Two seconds of a simulated recording as a graph, started from disturbed truth."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        sequence = simulate(replace(scenario, duration_s=2.0), 2)
-        self.rig, self.packets = sequence.rig, list(sequence.packets())
-        motion, maker = motion_model(sequence.noise, sequence.gravity_world), StereoFactors(sequence.rig)
-        self.graph, self.start = motion.hold(motion.initial_belief(sequence.prior), 0), gtsam.Values()
-        truth, rng = sequence.truth, np.random.default_rng(5)
-        for k, packet in enumerate(self.packets):
-            disturbed = gtsam.Pose3(truth.T_world_imu[k]).retract(0.02 * rng.standard_normal(6)).matrix()
-            estimate = Estimate(packet.frame.t_ns, disturbed, v_world=truth.v_world[k], bias=np.zeros(6))
-            motion.insert(self.start, estimate, k)
-            if packet.motion is not None:
-                self.graph.push_back(motion.integrate(packet.motion, np.zeros(6)).factors(k))
-            for factor in maker.of(packet.frame, k):
-                self.graph.add(factor)
-            points = stereo.triangulate_world(packet.frame.uvs_px, disturbed, sequence.rig)
-            for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
-                if not self.start.exists(L(track_id)):
-                    self.start.insert(L(track_id), point)
 
 
 @pytest.fixture(params=[DRIVE, FLIGHT], ids=["drive", "flight"])

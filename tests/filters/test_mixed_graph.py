@@ -1,46 +1,26 @@
 """A graph with Python factors: a solver sees the same, together or one by one, and calls none that is on arrays."""
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
 
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.mixed_graph import MixedGraph, TwistFactors
-from toolkit.estimate import Estimate
+from tests.filters.conftest import Problem
 from toolkit.geometry import Array, se3_exp
 from toolkit.measurements import TwistMotion, TwistNoise
-from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.models.factors import B, X
 from toolkit.models.graph_state import GraphIncrement
-from toolkit.models.motion import motion_model
-from toolkit.models.stereo import triangulate_world
 from toolkit.models.twist import TwistIncrement, TwistModel, twist_factor
-from toolkit.simulation import DRIVE, simulate
+from toolkit.simulation import DRIVE
 
 NOISE = TwistNoise(np.array([0.01, 0.02, 0.03]), np.array([0.1, 0.2, 0.3]), np.full(3, 1e-5))
 STATES = 7
 
 
 def drive() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, GraphIncrement]]:
-    """Return two seconds of a drive from disturbed truth, and the increments."""
-    sequence = simulate(replace(DRIVE, duration_s=2.0), 2)
-    model, rng = motion_model(sequence.noise, sequence.gravity_world), np.random.default_rng(5)
-    graph, start = model.hold(model.initial_belief(sequence.prior), 0), gtsam.Values()
-    increments = {}
-    for k, packet in enumerate(sequence.packets()):
-        at = gtsam.Pose3(sequence.truth.T_world_imu[k]).retract(0.02 * rng.standard_normal(6)).matrix()
-        model.insert(start, Estimate(packet.frame.t_ns, at, bias=np.zeros(6)), k)
-        if packet.motion is not None:
-            increments[k] = model.integrate(packet.motion, np.zeros(6))
-            graph.push_back(increments[k].factors(k))
-        for factor in StereoFactors(sequence.rig).of(packet.frame, k):
-            graph.add(factor)
-        points = triangulate_world(packet.frame.uvs_px, at, sequence.rig)
-        for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
-            if not start.exists(L(track_id)):
-                start.insert(L(track_id), point)
-    return graph, start, increments
+    problem = Problem(DRIVE)
+    return problem.graph, problem.start, problem.increments
 
 
 def test_errors_and_linearisations_are_the_graphs_own():

@@ -16,6 +16,7 @@ from filters.kalman import joint_landmarks
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import AcceptedTracks, WindowPoses, WindowTracks, accepted_tracks
 from filters.msckf import Msckf
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.models.gating import FrameGate
@@ -108,8 +109,8 @@ def moved(before, after: JointBelief, first_points: Array) -> Array:
 
 @every_scenario
 @pytest.mark.parametrize("kept", [0, 5])
-def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
-    recording = oracle.recorded(scenario, 1.0)
+def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept):
+    recording = recorded(scenario, 1.0)
     window = window_of(recording)
     joint, (sightings, points, _, H, residuals) = window
     step = GaussNewtonStep(window, recording)
@@ -123,7 +124,7 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
     mean[len(mean) - 3 * kept :] -= step_to_least_squares(linearised).ravel()
     assert np.abs(moved(before, joint, points[:kept]) - mean).max() < 1e-7
     assert np.abs(mean).max() > 1e-3, "there was something to agree on"
-    oracle.assert_covariances_agree(joint.cov[6:, 6:], cov, 1e-6)
+    assert_covariances_agree(joint.cov[6:, 6:], cov, 1e-6)
 
 
 def test_what_many_rows_are_compressed_to_is_the_same_in_products_from_either_side():
@@ -139,8 +140,8 @@ def test_what_many_rows_are_compressed_to_is_the_same_in_products_from_either_si
 
 @pytest.mark.parametrize("rows", [5, 60])
 @pytest.mark.parametrize("first", [0, 2], ids=["of all clones", "of the newest"])
-def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(oracle, rows, first):
-    joint, *_ = window_of(oracle.recorded(SCENARIOS[1], 1.0))
+def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(rows, first):
+    joint, *_ = window_of(recorded(SCENARIOS[1], 1.0))
     rng = np.random.default_rng(6)
     begin, end = joint.clone_columns.start + 6 * first, joint.clone_columns.stop
     H, residuals = 100.0 * rng.normal(size=(rows, end - begin)), rng.normal(size=rows)
@@ -173,13 +174,12 @@ SIZES = {"in view": (9, 0, 7), "one window": (9, 0, 10), "every landmark kept": 
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
-@pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
+@pytest.mark.parametrize(("at", "weight"), [(AtFirstEstimates(), 1.0), (AtLatestEstimates(), 0.25)])
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("weight", [1.0, 0.25])
-def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, size, weight, oracle):
+def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, size, weight):
     """Errors of 1e-6 of the stated noise: the gates are open and second orders out of sight."""
     clones, landmarks, frames = SIZES[size]
-    recording = oracle.recorded(scenario_of(scenario, frames), 1e-6)
+    recording = recorded(scenario_of(scenario, frames), 1e-6)
     rig = replace(recording.sequence.rig, track_weight=weight)
     recording = replace(recording, sequence=replace(recording.sequence, rig=rig))
     # A pose leaves in the frame in which it is older than the window.
@@ -192,7 +192,7 @@ def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, siz
     used = seen_twice(recording.sequence)
     assert len(used) > 20
     assert size != "in view" or len(msckf.landmarks().track_ids) < len(used) / 2
-    mean, cov = oracle.batch(recording, used).state(packet.index)
+    mean, cov = BatchAtTruth(recording, used).state(packet.index)
     # The corrections are a millionth of centimetres; the second order is a millionth of that.
     assert np.abs(recording.error_of(estimate, packet.index) - mean).max() < 1e-3 * np.abs(mean).max()
-    oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
+    assert_covariances_agree(estimate.cov, cov, 1e-6)

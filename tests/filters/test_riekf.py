@@ -4,7 +4,6 @@ The reference here is written from the definition alone: the group's matrices, t
 derivatives of the error.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -15,40 +14,18 @@ from scipy.linalg import expm
 from filters import iekf
 from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
-from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
-from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
-from filters.kalman.online_output import LandmarkMemory
-from toolkit import runner
-from toolkit.estimator import Setup
+from filters.kalman.coordinates import InvariantBelief
+from filters.kalman.joint import AtLatestEstimates, JointBelief
+from tests.filters.conftest import BELIEFS, carried, numerical_jacobian, setup_of, short
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
 from toolkit.measurements import Prior
 from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
 from toolkit.models.state import IMU_LAYOUT, Belief
-from toolkit.sequence import Sequence
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
 AT = AtLatestEstimates()
 both_kinds = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
-
-
-def recording(scenario, duration_s: float = 1.0, tracks: int = 15, seed: int = 3) -> Sequence:
-    camera = replace(scenario.camera, max_tracks=tracks)
-    return simulate(replace(scenario, duration_s=duration_s, camera=camera), seed)
-
-
-def setup_of(sequence: Sequence) -> Setup:
-    assert sequence.prior is not None
-    return runner.setup_of(sequence, sequence.prior)
-
-
-def numerical_jacobian(function: Callable[[Array], Array], size: int, step: float = 1e-3) -> Array:
-    """Five-point central differences: good to 1e-10 of values near 1."""
-    columns = []
-    for unit in step * np.eye(size):
-        near, far = function(unit) - function(-unit), function(2.0 * unit) - function(-2.0 * unit)
-        columns.append((8.0 * near - far) / (12.0 * step))
-    return np.stack(columns, axis=-1)
 
 
 def group_element(joint: JointBelief) -> Array:
@@ -85,24 +62,10 @@ def group_exponential(xi: Array, vectors: int) -> Array:
     return expm(algebra)
 
 
-def predicted(scenario, belief=InvariantBelief, frames: int = 6):
-    """Return a joint belief that has been filtered for some frames and carried to the next, that frame and its rig."""
-    sequence = recording(scenario)
-    ekf = JointEkf(setup_of(sequence), AT, belief)
-    packets = list(sequence.packets())
-    for packet in packets[:frames]:
-        ekf.step(packet)
-    joint, frame = ekf.joint, packets[frames].frame
-    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), AT, packets[frames].motion)
-    joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
-    assert len(joint.landmark_ids) > 5
-    return joint, frame, sequence.rig
-
-
 @both_kinds
 def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None:
     """xi = K r, X+ = exp(xi) X, P_xi+ = (1 - K H) P_xi; an open gate, so that all landmarks correct."""
-    joint, frame, rig = predicted(scenario)
+    joint, frame, rig = carried(scenario, BELIEFS["riekf"], 15)
     shift = np.random.default_rng(0).standard_normal(joint.cov.shape[0])
     joint.move(3.0 * np.linalg.cholesky(joint.cov) @ shift)  # there will be something to correct
     bias = joint.core.bias
@@ -136,7 +99,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
 @pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
 def test_its_error_propagates_alike_from_every_state(scenario) -> None:
     """Group-affine: but for the biases' columns the transition of xi does not know the estimate."""
-    sequence = recording(scenario)
+    sequence = short(scenario, 1.0, 15, 3)
     setup, motion = setup_of(sequence), list(sequence.packets())[3].motion
     assert motion is not None
     carry, rng = motion_model(setup.noise, setup.gravity_world), np.random.default_rng(1)
@@ -159,7 +122,7 @@ def test_its_error_propagates_alike_from_every_state(scenario) -> None:
 @both_kinds
 def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(scenario) -> None:
     """And a sighting is blind to both, wherever it is linearised."""
-    joint, frame, rig = predicted(scenario)
+    joint, frame, rig = carried(scenario, BELIEFS["riekf"], 15)
     joint.clone()
     rng = np.random.default_rng(5)
     constant = gauge(joint, turns=np.eye(3))
@@ -213,7 +176,7 @@ def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
 
 def most_information_gained(scenario, belief, correct) -> float:
     """Return by how much of the prior's the information along the gauge ever rises, at worst, in a run."""
-    sequence = recording(scenario, duration_s=3.0 if scenario is DRIVE else 2.0, tracks=20)
+    sequence = short(scenario, 3.0 if scenario is DRIVE else 2.0, 20, 3)
     setup = setup_of(sequence)
     # Without an accelerometer nothing measures the vertical either.
     turns = np.eye(3) if setup.motion_kind == "twist" else np.eye(3)[:, 2:]
@@ -232,31 +195,27 @@ def most_information_gained(scenario, belief, correct) -> float:
     return gained
 
 
-BELIEFS = {
-    "riekf": (lambda rig, core: InvariantBelief(core), joint_landmarks.correct),
-    "iekf": (lambda rig, core: AnchoredBelief(core, rig.T_imu_cam), iekf.correct),
-}
+CORRECT = {"riekf": joint_landmarks.correct, "iekf": iekf.correct}
 
 
 @both_kinds
-@pytest.mark.parametrize("name", BELIEFS)
+@pytest.mark.parametrize("name", CORRECT)
 def test_no_information_about_global_position_and_heading_is_gained(scenario, name) -> None:
     """Of the whole joint belief, landmarks included; after marginalising them less is left."""
-    belief, correct = BELIEFS[name]
     # The condition of a joint covariance is some 1e9: seven digits of the information are left.
-    assert most_information_gained(scenario, belief, correct) < 1e-6
+    assert most_information_gained(scenario, BELIEFS[name], CORRECT[name]) < 1e-6
 
 
 @both_kinds
-@pytest.mark.parametrize("correct", [joint_landmarks.correct, iekf.correct], ids=["single", "iterated"])
+@pytest.mark.parametrize("correct", CORRECT.values(), ids=["single", "iterated"])
 def test_the_plain_error_at_latest_estimates_does_gain_it(scenario, correct) -> None:
     """The test above can fail."""
-    assert most_information_gained(scenario, lambda rig, core: JointBelief(core), correct) > 0.01
+    assert most_information_gained(scenario, BELIEFS["plain"], correct) > 0.01
 
 
 def test_the_world_a_filter_starts_in_makes_no_difference() -> None:
     """Started 700 m away and turned by two radians, its relative motion and covariance are the same."""
-    sequence = recording(DRIVE)
+    sequence = short(DRIVE, 1.0, 15, 3)
     T_other_world = se3(se3_exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))[:3, :3], np.array([500.0, -490.0, 3.0]))
     assert sequence.prior is not None
     elsewhere = replace(sequence.prior, T_world_imu=T_other_world @ sequence.prior.T_world_imu)

@@ -54,20 +54,6 @@ def same(one: Run, other: Run) -> bool:
         (Outliers(batch_cut_probability=0.3), {"batch"}, {"isam2"}),
         (Outliers(batch_last_huber=0.5), {"batch"}, {"isam2"}),
     ],
-    ids=[
-        "lag",
-        "most states",
-        "landmarks",
-        "gate",
-        "smoothers' gate",
-        "joint huber",
-        "filter huber",
-        "smoother huber",
-        "batch huber",
-        "batch cauchy",
-        "batch cut",
-        "batch last huber",
-    ],
 )
 def test_a_setting_moves_the_estimators_it_is_for_alone(part, moved, unmoved):
     assert {name for name in moved | unmoved if not same(answer(name), answer(name, part))} == moved

@@ -101,13 +101,6 @@ def test_point_steps_complete_the_step_of_the_whole_system(scene):
     np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
 
 
-def test_global_position_and_rotation_gain_no_information(scene):
-    poses, points, seen = scene
-    information = Vision.at(poses, points, seen, CAMERA).reduced().information
-    rigid = np.concatenate([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
-    assert np.abs(information @ rigid).max() < 1e-9 * np.abs(information).max()
-
-
 def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_its_minimum(scene):
     """It starts three times as far as it is: its step to there is longer than it is away."""
     poses, points, seen = scene
@@ -132,12 +125,11 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
     np.testing.assert_allclose(far.poses, near.poses, atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", [2])
-def test_few_tracks_of_low_disparity_do_not_stall_it(run_estimator, seed):
+def test_few_tracks_of_low_disparity_do_not_stall_it(run_estimator):
     """Landmarks that overshot to behind cameras had refused every step of the window, and it drifted by 0.3 m."""
     camera = replace(FLIGHT.camera, rate_hz=8.0, max_tracks=15, loss_per_frame=0.3)
     rig = replace(FLIGHT.rig, fx_px=0.5 * FLIGHT.rig.fx_px, fy_px=0.5 * FLIGHT.rig.fy_px, baseline_m=0.077)
-    sequence = simulate(replace(FLIGHT, camera=camera, rig=rig, duration_s=5.0), seed)
+    sequence = simulate(replace(FLIGHT, camera=camera, rig=rig, duration_s=5.0), 2)
     off_m = run_estimator("smart", sequence).causal.T_world_imu[:, :3, 3] - sequence.truth.T_world_imu[:, :3, 3]
     assert np.linalg.norm(off_m, axis=1).max() < 0.1
 
@@ -150,18 +142,6 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     one, other = (Vision.at(poses, behind, s, CAMERA).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
     assert Vision.at(poses, behind, seen, CAMERA).losses.sum() > Vision.at(poses, behind, others, CAMERA).losses.sum()
-
-
-def blacked_out(sequence):
-    """Return a recording whose vision is gone for three seconds."""
-    hidden = (sequence.observations.frame >= 20) & (sequence.observations.frame < 50)
-    return replace(sequence, observations=sequence.observations.select(~hidden))
-
-
-def test_a_blackout_longer_than_the_window_does_not_end_it(run_estimator):
-    run = run_estimator("smart", blacked_out(simulate(replace(DRIVE, duration_s=7.0), 1)))
-    assert run.status == "ok", run.log
-    assert np.isfinite(run.causal.cov).all()
 
 
 def test_the_window_bounds_what_is_kept_of_the_past(run_estimator):

@@ -55,7 +55,7 @@ def thinned(sequence, window):
 
 
 # 20 frames a second: a second's window has 21.
-@pytest.mark.parametrize("most_states", [2, 3, 5, 8, 11, 20])
+@pytest.mark.parametrize("most_states", [2, 5, 20])
 def test_no_window_holds_more_states_than_its_most_and_they_are_evenly_apart(flight, most_states):
     listener, _, _ = thinned(flight, Window(lag_s=1.0, most_states=most_states))
     t_s = np.array([packet.frame.t_ns - flight.frames_t_ns[0] for packet in listener.packets]) / 1e9

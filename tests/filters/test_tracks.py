@@ -23,6 +23,7 @@ from filters.kalman.tracks import (
     camera_for_kernels,
     given_tracks_in_view,
 )
+from tests.filters.conftest import recorded, with_clones
 from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import StereoRig
 from toolkit.models import stereo
@@ -96,9 +97,9 @@ def found_of(sightings, window, rig, probability=0.95):
 
 
 @pytest.fixture(scope="module")
-def flight(window_of_clones):
+def flight():
     """A window of a flight, corrected once so that first and latest estimates differ."""
-    sequence, joint = window_of_clones(replace(FLIGHT, duration_s=1.0), 2, WIDTH)
+    sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 2, WIDTH)
     joint.update(np.eye(6, 6 * WIDTH, 6 * WIDTH - 6) * 40.0, np.full(6, 0.3), joint.clone_columns)
     return sequence.rig, joint, window_of(joint)
 
@@ -212,9 +213,9 @@ VIEWS, SOUND = 6, 12
 
 
 @pytest.fixture(scope="module")
-def scene(window_of_clones):
+def scene():
     """A window of exact clones and tracks of exact points seen from all of them, with ordinary noise."""
-    sequence, joint = window_of_clones(replace(DRIVE, duration_s=1.5), 2, VIEWS)
+    sequence, joint = with_clones(replace(DRIVE, duration_s=1.5), 2, VIEWS)
     rng = np.random.default_rng(0)
     ahead = np.stack([rng.uniform(14, 25, SOUND), rng.uniform(-6, 6, SOUND), rng.uniform(-2, 2, SOUND)], axis=1)
     points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]
@@ -322,8 +323,8 @@ def answers(recording, change=lambda frame: frame, policy="classic"):
     return joint, found
 
 
-def test_the_belief_is_left_as_it_was(oracle):
-    recording = oracle.recorded(SCENARIO, 1.0)
+def test_the_belief_is_left_as_it_was():
+    recording = recorded(SCENARIO, 1.0)
     joint, found = answers(recording)
     untouched, _ = answers(recording, lambda frame: frame.select(np.zeros(len(frame.track_ids), dtype=bool)))
     np.testing.assert_array_equal(joint.cov, untouched.cov)
@@ -331,9 +332,9 @@ def test_the_belief_is_left_as_it_was(oracle):
     assert np.linalg.det(found[-1].cov[:6, :6]) < 0.1 * np.linalg.det(joint.core.cov[:6, :6])
 
 
-def test_a_mismatched_sighting_counts_for_nothing(oracle):
+def test_a_mismatched_sighting_counts_for_nothing():
     """Not in its frame nor in later ones: the answers are those of a recording without it."""
-    recording, when = oracle.recorded(SCENARIO, 1.0), 4
+    recording, when = recorded(SCENARIO, 1.0), 4
     before, frame = [packet.frame for packet in recording.sequence.packets()][when - 1 : when + 1]
     track = frame.track_ids[np.isin(frame.track_ids, before.track_ids)][0]
 

@@ -11,9 +11,8 @@ from filters.fixed_lag import FixedLag
 from filters.smart import Smart
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
-from toolkit import runner
+from tests.filters.conftest import setup_of
 from toolkit.errors import EstimatorError
-from toolkit.estimator import Setup
 from toolkit.measurements import NS_PER_S
 from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import without_oldest
@@ -27,12 +26,6 @@ SCENARIOS = [
 ]
 LAG_S = 0.5
 GAP = (12, 25)
-
-every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-
-
-def setup_of(sequence: Sequence) -> Setup:
-    return runner.setup_of(sequence, sequence.prior)
 
 
 def with_gap(sequence: Sequence) -> Sequence:
@@ -50,6 +43,11 @@ def from_zero(sequence: Sequence) -> Sequence:
     return replace(sequence, frames_t_ns=sequence.frames_t_ns - start_ns, motion=motion, truth=None)
 
 
+every_change = pytest.mark.parametrize(
+    ("scenario", "changed"), [*((scenario, with_gap) for scenario in SCENARIOS), (SCENARIOS[0], from_zero)]
+)
+
+
 def run_through(estimator, sequence):
     for packet in sequence.packets():
         estimator.step(packet)
@@ -63,8 +61,7 @@ def assert_covs_agree(covs, expected, relative):
     np.testing.assert_allclose(covs / scale, expected / scale, atol=relative)
 
 
-@every_scenario
-@pytest.mark.parametrize("changed", [with_gap, from_zero], ids=["gap", "from-zero"])
+@every_change
 def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(scenario, changed, monkeypatch):
     sequence = changed(simulate(scenario, 3))
     motion, last = motion_model(sequence.noise, sequence.gravity_world), {}
@@ -85,8 +82,7 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
     assert_covs_agree(final.cov, np.array([last[k] for k in range(len(final))]), 1e-5)
 
 
-@every_scenario
-@pytest.mark.parametrize("changed", [with_gap, from_zero], ids=["gap", "from-zero"])
+@every_change
 def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario, changed, monkeypatch):
     sequence, last = changed(simulate(scenario, 3)), {}
     taken_in, solved = [], smart.solve_window
@@ -108,19 +104,6 @@ def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario
         to_body[:, 6:9, 6:9] = np.swapaxes(final.T_world_imu[:, :3, :3], 1, 2)
         expected = to_body @ expected @ np.swapaxes(to_body, 1, 2)
     assert_covs_agree(final.cov, expected, 1e-5)
-
-
-@every_scenario
-@pytest.mark.parametrize("kind", [FixedLag, Smart])
-def test_with_an_infinite_lag_they_are_the_marginals_of_the_whole_problem(scenario, kind, oracle):
-    """Errors a hundredth of those stated: all linearise at the truth, and no robust loss weighs anything down.
-
-    A hundredth of a sigma on a Jacobian is what is left, and the landmarks that the oracle does not leave out.
-    """
-    recording = oracle.recorded(scenario, 0.01)
-    final = run_through(kind(recording.setup, 10.0 * recording.sequence.duration_s), recording.sequence)
-    whole = oracle.batch(recording, recording.track_ids)
-    assert_covs_agree(final.cov, np.array([whole.state(k)[1] for k in range(len(final))]), 0.02)
 
 
 def test_states_that_leave_together_leave_as_one_by_one(monkeypatch):
