@@ -61,6 +61,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     own: Mapping[str, Build] | None = None,
     truth: str | Path | None = None,
     trajectories: Mapping[str, str | Path] | None = None,
+    cov_convention: str | None = None,
     max_frames: int | None = None,
     from_s: float = 0.0,
     to_s: float | None = None,
@@ -77,8 +78,9 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
 
     ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "mine.py" a
     file, "ladder" every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name.
-    ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit
-    reports and leaves alone. ``seeds`` is the number of seeds, from ``seed`` on, over which a simulated source is
+    ``truth`` is a TUM file, ``trajectories`` are files of other systems by name, final output unless they end in
+    ":causal", ``cov_convention`` is that of their covariances where they do not say it; ``keep`` names faults that the
+    audit reports and leaves alone. ``seeds`` is the number of seeds, from ``seed`` on, over which a simulated source is
     repeated. ``settings`` is a record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is
     the number of processes, one a processor by default; ``scheduler`` the address of a Dask cluster in their place.
     ``resume`` is a run directory in which every run over seeds is kept as it ends, and found by the next comparison.
@@ -88,6 +90,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
     given = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s, "to_s": to_s}
+    given |= {"cov_convention": cov_convention}
     how = {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
     plan, kept = _planned(source, estimators, own, settings, {**given, **how, "every": every, "keep": keep})
     if kept is not None and plan.settings.seeds == 1:

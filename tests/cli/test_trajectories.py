@@ -19,6 +19,8 @@ Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 WithoutPixels = Callable[[], AbstractContextManager[None]]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20", "--workers", "1")
+# What an export with covariances is written as.
+COVARIANCES = {"tum": "pos-rot/fixed", "euroc": "rot-pos/left", "openvins": "rot-pos/mixed"}
 EVO = {
     "tum": evo.read_tum_trajectory_file,
     "kitti": evo.read_kitti_poses_file,
@@ -33,11 +35,17 @@ pytestmark = pytest.mark.usefixtures("unrendered")
 def run(tmp_path_factory: pytest.TempPathFactory, without_pixels: WithoutPixels) -> Path:
     """The run directory of two estimators on the first frames of a drive, and its exports beside it; not to change."""
     directory = tmp_path_factory.mktemp("exports") / "run"
+    files = directory.parent
     with without_pixels():
         assert main([*QUICK, "--out", str(directory)]) == 0
     for name in FORMATS:
         words = ("--estimator", "ekf", "--format", name, "--out", str(directory.parent / f"ekf.{name}"))
         assert main(["export", str(directory), *words]) == 0
+    for name, convention in COVARIANCES.items():
+        words = ("--estimator", "ekf", "--format", name, "--out", str(files / f"cov.{name}"))
+        assert main(["export", str(directory), *words, "--cov-convention", convention]) == 0
+    said = (files / "cov.tum").read_text()
+    (files / "unsaid.tum").write_text("".join(line for line in said.splitlines(True) if not line.startswith("#")))
     return directory
 
 
@@ -48,7 +56,9 @@ def again(run: Path, without_pixels: WithoutPixels) -> Path:
     astray = "".join(" ".join([t, str(i * i), *rest]) + "\n" for i, (t, _, *rest) in enumerate(rows))
     (run.parent / "astray.tum").write_text(astray)
     files = {**{f"by {name}": f"ekf.{name}" for name in FORMATS}, "astray": "astray.tum"}
+    files |= {f"cov {name}": f"cov.{name}:causal" for name in COVARIANCES} | {"unsaid": "unsaid.tum"}
     words = [word for name, file in files.items() for word in ("--trajectory", f"{name}={run.parent / file}")]
+    words += ["--cov-convention", COVARIANCES["tum"]]
     # What another system made of it is not checked as a run of ours is: the exit status is that of ours alone.
     with without_pixels():
         assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
@@ -77,6 +87,25 @@ def test_an_export_scores_as_what_it_is_an_export_of(again: Path, name: str) -> 
     assert theirs.notes["nees_pose_mean"] == "the estimator states no covariance"
 
 
+@pytest.mark.parametrize("name", [*(f"cov {name}" for name in COVARIANCES), "unsaid"])
+def test_an_export_with_covariances_has_the_nees_of_the_run(again: Path, name: str) -> None:
+    by_row = {(run.estimator, run.output): run for run in read_metrics(again / "metrics.json").runs}
+    ours, theirs = by_row["ekf", "causal"].metrics, by_row[name, "final" if name == "unsaid" else "causal"].metrics
+    keys = ["nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "log_score_pose", "energy_pos_m"]
+    for key in [*keys, *(["nees_gyro_bias_mean"] if name == "cov openvins" else [])]:
+        assert theirs[key] == pytest.approx(ours[key], rel=1e-9)
+
+
+def test_the_state_of_a_run_is_exported_whole(run: Path, tmp_path: Path) -> None:
+    target = tmp_path / "state.txt"
+    words = ("export", str(run), "--estimator", "ekf", "--format", "openvins", "--out", str(target))
+    assert main([*words]) == 0
+    values = np.loadtxt(target)
+    assert values.shape == (20, 17)
+    assert np.isfinite(values[:, 11:14]).all()  # the gyro bias is estimated beside twists
+    assert main(["export", str(run), "--estimator", "truth", *words[4:], "--cov-convention", "rot-pos/right"]) == 3
+
+
 def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> None:
     report = (again / "report.md").read_text()
     assert "| by euroc | final | ok |" in re.sub(" +", " ", report)
@@ -85,7 +114,12 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
     for file in ("trajectories/by_euroc_final.tum", "figures/top_all.png"):
         assert (again / file).is_file()
     manifest = json.loads((again / "manifest.json").read_text())
-    assert manifest["references"] == ["by tum", "by kitti", "by euroc", "by openvins", "astray"]
+    assert manifest["references"] == [
+        *(f"by {name}" for name in FORMATS),
+        "astray",
+        *(f"cov {name}" for name in COVARIANCES),
+        "unsaid",
+    ]
     assert "by euroc" in {run.estimator for run in read_report(again / "report.json").runs}
     assert main(["report", str(again)]) == 0
     page = (again / "report.html").read_text()

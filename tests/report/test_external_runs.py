@@ -16,7 +16,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment import Comparison, Plan, run
 from toolkit.experiment.configuration import Configuration
-from toolkit.experiment.references import external_runs, reference_runs
+from toolkit.experiment.references import ExternalFile, external_runs, reference_runs
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
 from toolkit.metrics import cost, score_run
@@ -48,7 +48,7 @@ def read_as_run(
     path = folder / f"other.{name}"
     path.write_text(FORMATS[name].text(trajectory))
     sequence = recording if frames is None else recording.truncated(frames)
-    (run,) = external_runs({"other": read_poses(path)}, recording, sequence)
+    (run,) = external_runs({"other": ExternalFile(read_poses(path))}, recording, sequence)
     return run
 
 

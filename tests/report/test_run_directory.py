@@ -41,6 +41,9 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert {"metrics.json", "report.md", "manifest.json"} <= files
     assert {f"trajectories/{name}.tum" for name in ("steady_causal", "steady_final", "late_final")} <= files
     assert "trajectories/late_causal.tum" not in files
+    given = [(row, trajectory) for row in comparison.rows if (trajectory := row.run.trajectory(row.output)) is not None]
+    stated = [row for row, trajectory in given if trajectory.cov is not None and not row.repeats_causal]
+    assert {name for name in files if "states/" in name} == {f"states/{r.estimator}_{r.output}.txt" for r in stated}
     assert {f"landmarks/{run.estimator}.csv" for run in comparison.runs} <= files
     drawn = ("top_all", "errors_over_time")
     assert {f"figures/{name}.png" for name in drawn} == {name for name in files if name.startswith("figures/")}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from toolkit.cli.arguments import (
+    COV_CONVENTION,
     PART,
     REPAIR,
     SETTINGS,
@@ -87,13 +88,14 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE"),
     arg(
         "--trajectory NAME=FILE",
-        "another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the estimators; "
-        "may be repeated; with exactly one SEQUENCE",
+        "another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the estimators, "
+        "as final or, with FILE:causal, as causal output; may be repeated; with exactly one SEQUENCE",
         named_file,
         action="append",
         dest="trajectories",
         default=[],
     ),
+    COV_CONVENTION,
     arg(
         "--out DIR",
         "run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the same "

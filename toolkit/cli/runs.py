@@ -8,7 +8,7 @@ from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import WORKERS, UsageError, arg, choice, command, flag, names, output
+from toolkit.cli.arguments import COV_CONVENTIONS, WORKERS, UsageError, arg, choice, command, flag, names, output
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -55,6 +55,11 @@ def report(options: argparse.Namespace) -> int:
     arg("--estimator NAME", "an estimator, or truth (default: the only one there is)"),
     choice("--output", ("causal", "final"), "default: final, where there is one"),
     choice("--format", FORMATS, "of the file; KITTI has no stamps"),
+    arg(
+        "--cov-convention NAME",
+        f"write the covariances as well, in this convention ({', '.join(COV_CONVENTIONS)}; see docs/conventions.md)",
+        choices=COV_CONVENTIONS,
+    ),
     arg("--out FILE", "the file to write", Path),
     arg(
         "--bundle FILE.zip",
@@ -71,16 +76,19 @@ def export(options: argparse.Namespace) -> int:
     """Write a trajectory of a run directory as a TUM, KITTI, EuRoC or OpenVINS file. Poses are those of the IMU in
     the estimator's world; nothing is aligned. Or bundle what others need to repeat the run.
     """
-    from toolkit.report.export import export, write_bundle
+    from toolkit.datasets.trajectories.covariances import convention_called
+    from toolkit.report.export import Wanted, export, write_bundle
 
     if options.bundle is not None:
-        if options.format or options.out or options.estimator or options.output:
-            raise UsageError("--bundle goes without --format, --out, --estimator and --output: it has everything")
+        if any((options.format, options.out, options.estimator, options.output, options.cov_convention)):
+            raise UsageError("--bundle goes without any other option: it has everything")
         print(printable(f"{options.bundle}: {write_bundle(options.run, options.bundle)}"))
         return 0
     if options.format is None or options.out is None:
         raise UsageError("give --format and --out for a trajectory, or --bundle (see vislam export --help)")
-    written = export(options.run, options.estimator, options.output, options.format, options.out)
+    convention = None if options.cov_convention is None else convention_called(options.cov_convention)
+    wanted = Wanted(options.estimator, options.output, options.format, convention)
+    written = export(options.run, wanted, options.out)
     print(printable(f"{options.out}: {written}"))
     return 0
 

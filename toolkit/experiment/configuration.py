@@ -38,6 +38,7 @@ class Request(Struct, frozen=True):
     every: Annotated[int, Meta(ge=1)] = 1
     keep: tuple[str, ...] = ()
     keep_trajectories: bool = False
+    cov_convention: str | None = None
 
 
 class SweepRequest(Struct, frozen=True):
@@ -104,6 +105,7 @@ def plan_of(
 
     ``own`` are further estimators as functions by name. Raises SettingsError for what does not go together.
     """
+    from toolkit.datasets.trajectories.covariances import convention_called
     from toolkit.experiment.pipeline import Plan
     from toolkit.experiment.recording import Part
     from toolkit.registry import defaults
@@ -122,6 +124,7 @@ def plan_of(
         workers=workers,
         keep_trajectories=request.keep_trajectories,
         scheduler=scheduler,
+        cov_convention=None if request.cov_convention is None else convention_called(request.cov_convention),
         part=Part(request.from_s, request.to_s, request.every),
     )
 

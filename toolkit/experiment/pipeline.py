@@ -7,15 +7,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
-from toolkit.datasets.trajectories import read_poses
-from toolkit.datasets.trajectories.formats import PosesFile
+from toolkit.datasets.trajectories.covariances import CovConvention
 from toolkit.errors import DataError
 from toolkit.estimator import Build
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
-from toolkit.experiment.references import check_file_names, check_names, external_runs, reference_runs
+from toolkit.experiment.references import (
+    ExternalFile,
+    check_file_names,
+    check_names,
+    external_runs,
+    read_external,
+    reference_runs,
+)
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
@@ -32,7 +38,8 @@ class Plan:
 
     ``sources`` are paths, built-in names or sequences; ``estimators`` are names, files of one's own (``my_filter.py``),
     or the word for the whole ladder; ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is
-    a TUM file and ``trajectories`` are files of other systems by name, both for a single source. ``keep`` names the
+    a TUM file and ``trajectories`` are files of other systems by name, as FILE, FILE:causal or FILE:final, both for a
+    single source; ``cov_convention`` is that of their covariances where they do not say it. ``keep`` names the
     faults that the audit reports but leaves as they are. ``workers`` is the number of processes, one a processor where
     it is None. ``keep_trajectories`` writes those of every seed; of a single one they always are. ``scheduler`` is the
     address of a Dask cluster that does the work instead. ``part`` is what is used of each source, ``max_frames`` the
@@ -50,6 +57,7 @@ class Plan:
     keep_trajectories: bool = False
     scheduler: str | None = None
     part: Part = WHOLE
+    cov_convention: CovConvention | None = None
 
     def __post_init__(self) -> None:
         if not (self.estimators or self.own or self.trajectories):
@@ -116,7 +124,7 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
     for entry in entries.values():
         entry.check_usable(plan.settings)
     check_file_names(plan.trajectories, {*entries, *plan.own})
-    files = {name: read_poses(path) for name, path in plan.trajectories.items()}
+    files = {name: read_external(path, plan.cov_convention) for name, path in plan.trajectories.items()}
     for source in plan.sources:
         _check_seeds(plan, source)
     recordings = [plan.recording(source, plan.seeds[0]) for source in plan.sources]
@@ -140,7 +148,7 @@ def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress
         yield result
 
 
-def _with_references(plan: Plan, case: Prepared, files: Mapping[str, PosesFile]) -> Prepared:
+def _with_references(plan: Plan, case: Prepared, files: Mapping[str, ExternalFile]) -> Prepared:
     """Return a prepared source with what other systems estimated from it."""
     source, sequence = case.source, case.sequence
     brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)

@@ -1,9 +1,14 @@
 """Estimates of other systems from a recording, as runs that were not made here."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from toolkit.answers import Output, Run
 from toolkit.audit.truth import steps_beside_camera
+from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     check_axes,
@@ -14,17 +19,25 @@ from toolkit.datasets.trajectories.belonging import (
     other_axes,
     range_s,
 )
+from toolkit.datasets.trajectories.covariances import CovConvention, StatedCovariances
 from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import TRUTH, plain_name
-from toolkit.metrics.parts.against_truth import associate, median_period_ns, poses_at
+from toolkit.geometry import Array
+from toolkit.metrics.parts.against_truth import STAMP_TOLERANCE_NS, associate, median_period_ns, poses_at
+from toolkit.metrics.parts.consistency import body_errors, with_covariances
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.readings import likelier_reading
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.sequence import LONGEST_NAME, Sequence, Truth
 from toolkit.settings import SettingsError
 
 _OTHER_TERMS = (
     "its start, its noise and its cost are its own, and it may have used the tracks that are withheld from the others"
 )
+_SAID = ("causal", "final")
+_NO_CONVENTION = "what its covariances mean is not said: name it with --cov-convention"
 _AS_FINAL = "it is listed as final, because a file does not show whether its poses use later measurements"
 
 
@@ -34,13 +47,32 @@ def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> 
     return tuple(_run(name, trajectory, sequence, "causal", read) for name, trajectory in references.items())
 
 
-def external_runs(files: Mapping[str, PosesFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each trajectory file, with its poses at the frames as final output.
+@dataclass(frozen=True, eq=False)
+class ExternalFile:
+    """The file of another system, and which kind of output it is, None where that is not said."""
+
+    poses: PosesFile
+    output: Output | None = None
+
+
+def read_external(given: Path, cov_convention: CovConvention | None = None) -> ExternalFile:
+    """Read FILE, FILE:causal or FILE:final; ``cov_convention`` is that of its covariances where it does not say it.
+
+    Raises DataError as :func:`~toolkit.datasets.trajectories.read_poses`.
+    """
+    name, _, last = str(given).rpartition(":")
+    if name and last in _SAID and not given.exists():
+        return ExternalFile(read_poses(Path(name), cov_convention), "causal" if last == "causal" else "final")
+    return ExternalFile(read_poses(given, cov_convention))
+
+
+def external_runs(files: Mapping[str, ExternalFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
+    """Return a run for each trajectory file, with its poses at the frames as final output, or as it is said to be.
 
     ``recording`` is the whole of it, of which ``sequence`` may be a part. Raises DataError where a file
     is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
     """
-    return tuple(_external(name, poses, recording, sequence) for name, poses in files.items())
+    return tuple(_external(name, file, recording, sequence) for name, file in files.items())
 
 
 def check_file_names(names: Iterable[str], estimators: Iterable[str]) -> None:
@@ -56,7 +88,7 @@ def check_file_names(names: Iterable[str], estimators: Iterable[str]) -> None:
         taken[plain] = f"another trajectory, {name}"
 
 
-def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesFile]) -> None:
+def check_names(references: Mapping[str, Trajectory], files: Iterable[str]) -> None:
     """Raise DataError where a trajectory file is given the name of an estimate that the recording brings."""
     taken = {plain_name(name): name for name in references}
     for name in files:
@@ -64,7 +96,8 @@ def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesF
             raise DataError(f"the recording contains an estimate {taken[plain_name(name)]}; give {name} another name")
 
 
-def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequence) -> Run:
+def _external(name: str, file: ExternalFile, recording: Sequence, sequence: Sequence) -> Run:
+    poses = file.poses
     trajectory, what = _stamped(poses, recording, sequence), str(poses.path)
     reference = Reference.of_recording(recording)
     check_clock(what, reference, trajectory.t_ns)
@@ -80,7 +113,25 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
         check_axes(what, *matched)
     remarks = [] if recording.truth is not None else _of_another_scale(trajectory, sequence)
     read = f"read from {what} ({poses.format}, {len(poses)} poses)"
-    return _run(name, trajectory, sequence, "final", read, *remarks, _AS_FINAL)
+    remarks += _of_covariances(poses.covariances, trajectory, recording)
+    as_what = _AS_FINAL if file.output is None else f"it is listed as {file.output}, as was said"
+    return _run(name, trajectory, sequence, file.output or "final", read, *remarks, as_what)
+
+
+def _of_covariances(stated: StatedCovariances | None, trajectory: Trajectory, recording: Sequence) -> list[str]:
+    """Remark on covariances whose convention is not said, or another one by an independent truth."""
+    if stated is None:
+        return []
+    unsaid = [_NO_CONVENTION] if stated.convention is None else []
+    if recording.truth is None or not recording.truth.independent:
+        return unsaid
+    run = Run("", "ok", None, trajectory, Landmarks.none(), timings=None)
+    try:
+        errors = body_errors(Evaluation(run, "final", recording))
+    except Unavailable:
+        return unsaid
+    likelier = likelier_reading(stated, trajectory.T_world_imu, lambda cov: with_covariances(errors, cov))
+    return ["; ".join((*unsaid, likelier))] if likelier else unsaid
 
 
 def _of_another_scale(trajectory: Trajectory, sequence: Sequence) -> list[str]:
@@ -95,7 +146,7 @@ def _of_another_scale(trajectory: Trajectory, sequence: Sequence) -> list[str]:
 def _stamped(poses: PosesFile, recording: Sequence, sequence: Sequence) -> Trajectory:
     """Return the poses with their stamps, which are the frames' where the format has none."""
     if poses.t_ns is not None:
-        return Trajectory(poses.t_ns, poses.T_world_imu)
+        return poses.trajectory(poses.t_ns)
     counts = dict.fromkeys((recording.frame_count, sequence.frame_count))
     if len(poses) not in counts:
         expected = " or ".join(map(str, counts))
@@ -104,16 +155,26 @@ def _stamped(poses: PosesFile, recording: Sequence, sequence: Sequence) -> Traje
             f"{expected}; write a pose for each, or a format with stamps"
         )
     frames = recording if len(poses) == recording.frame_count else sequence
-    return Trajectory(frames.frames_t_ns, poses.T_world_imu)
+    return poses.trajectory(frames.frames_t_ns)
 
 
 def _run(name: str, whole: Trajectory, sequence: Sequence, output: Output, read: str, *remarks: str) -> Run:
-    """Return the run with a pose for every frame that the rule of association reaches."""
+    """Return the run with a pose for every frame that the rule of association reaches.
+
+    Velocities, biases and covariances are those of the frame's own stamp, and NaN where a pose is interpolated.
+    """
     frames_t_ns = sequence.frames_t_ns
     reached, poses = poses_at(whole.t_ns, whole.T_world_imu, frames_t_ns, median_period_ns(frames_t_ns))
     log = [f"{read}, not run here: {_OTHER_TERMS}", *remarks]
     if not reached.any():
         log.append(f"none of its poses ({range_s(whole.t_ns)}) reaches one of the frames ({range_s(frames_t_ns)})")
-    at_frames = Trajectory(frames_t_ns[reached], poses)
+    at_ns = frames_t_ns[reached]
+    row = np.clip(np.searchsorted(whole.t_ns, at_ns - STAMP_TOLERANCE_NS), 0, len(whole) - 1)
+    same = np.abs(whole.t_ns[row] - at_ns) <= STAMP_TOLERANCE_NS
+
+    def there(values: Array | None) -> Array | None:
+        return None if values is None else np.where(same.reshape(-1, *[1] * (values.ndim - 1)), values[row], np.nan)
+
+    at_frames = Trajectory(at_ns, poses, there(whole.v_world), there(whole.bias), there(whole.cov))
     causal, final = (at_frames, None) if output == "causal" else (None, at_frames)
     return Run(name, "ok", causal, final, Landmarks.none(), timings=None, log=tuple(log))

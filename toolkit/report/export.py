@@ -9,19 +9,22 @@ import zipfile
 import zlib
 from importlib.metadata import distributions
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from msgspec import UNSET, Meta, Struct
 
 from toolkit.answers import Output
-from toolkit.datasets.trajectories import FORMATS, tum
+from toolkit.datasets.trajectories import FORMATS, read_poses, tum
+from toolkit.datasets.trajectories.covariances import CovConvention
+from toolkit.datasets.trajectories.formats import Stamped
 from toolkit.errors import DataError, did_you_mean
+from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import TRUTH
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
 from toolkit.files.reading import open_input
 from toolkit.files.writing import replaced_file, write_text
-from toolkit.report.report_json import Report
+from toolkit.report.report_json import Report, states_file
 from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
 BUNDLE, LOCK = "bundle.json", "requirements.txt"
@@ -33,11 +36,23 @@ _REMEDY = "make it again with vislam export --bundle"
 _DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
 
 
-def export(directory: Path, estimator: str | None, output: Output | None, format_name: str, target: Path) -> str:
+class Wanted(NamedTuple):
+    """A trajectory in a run directory, and how it is written.
+
+    Without an estimator there must be only one; ``truth`` is the ground truth. Without an output it is the final one,
+    where there is one. Covariances are written where a convention for them is given.
+    """
+
+    estimator: str | None
+    output: Output | None
+    format_name: str
+    cov_convention: CovConvention | None = None
+
+
+def export(directory: Path, wanted: Wanted, target: Path) -> str:
     """Write a trajectory of a run directory as a file and return in words which it is.
 
-    Without an estimator there must be only one; ``truth`` is the ground truth. Without an output it is the final
-    one, where there is one. Raises DataError where there is no such trajectory or the format cannot hold it,
+    Raises DataError where there is no such trajectory or the format cannot hold it,
     OutputError where the file cannot be written.
     """
     run = read_run(directory)
@@ -45,24 +60,39 @@ def export(directory: Path, estimator: str | None, output: Output | None, format
         raise DataError(
             f"{directory} is a comparison over seeds and holds no trajectories; run one seed without --seeds"
         )
-    what, name = _chosen(directory, run.report, estimator, output)
+    what, name, states = _chosen(directory, run.report, wanted.estimator, wanted.output)
     trajectory = tum.read(directory / name, "a run that diverged may leave no finite pose")
+    if states is not None and (directory / states).is_file():
+        trajectory = read_poses(directory / states).trajectory(trajectory.t_ns)
     frames = run.scores.sequence.frames
-    if format_name == "kitti" and len(trajectory) != frames:
+    if wanted.format_name == "kitti" and len(trajectory) != frames:
         raise DataError(
             f"{what} has {len(trajectory)} poses for {frames} frames, and KITTI's rows are the frames; "
             "choose a format with stamps"
         )
-    write_text(target, FORMATS[format_name].text(trajectory))
+    write_text(target, _text(trajectory, wanted, what))
     return f"{what}, {len(trajectory)} poses"
 
 
-def _chosen(directory: Path, report: Report, estimator: str | None, output: Output | None) -> tuple[str, str]:
-    """Return in words which trajectory is meant, and its file in the run directory."""
+def _text(trajectory: Trajectory, wanted: Wanted, what: str) -> str:
+    one, convention = FORMATS[wanted.format_name], wanted.cov_convention
+    if convention is None:
+        return one.text(trajectory)
+    if not isinstance(one, Stamped):
+        raise DataError(f"a {wanted.format_name} file has no place for covariances; choose another format")
+    if trajectory.cov is None:
+        raise DataError(f"no covariances of {what} are in the run directory; leave out --cov-convention")
+    return one.text_with_covariances(trajectory, convention)
+
+
+def _chosen(
+    directory: Path, report: Report, estimator: str | None, output: Output | None
+) -> tuple[str, str, str | None]:
+    """Return in words which trajectory is meant, its file in the run directory, and the one that has its states."""
     if estimator == TRUTH:
         if report.truth is None:
             raise DataError(f"{directory} has no ground truth")
-        return TRUTH, report.truth
+        return TRUTH, report.truth, None
     files = {(run.estimator, run.output): run.trajectory for run in report.runs if run.trajectory}
     names = list(dict.fromkeys(name for name, _ in files))
     there = ", ".join([*names, *([TRUTH] if report.truth is not None else [])])
@@ -75,7 +105,8 @@ def _chosen(directory: Path, report: Report, estimator: str | None, output: Outp
     wanted = outputs[-1] if output is None else output
     if wanted not in outputs:
         raise DataError(f"{directory} has no {wanted} trajectory of {name}, only a {outputs[0]} one")
-    return f"{name} {wanted}", files[name, wanted]
+    repeats = any(run.repeats_causal for run in report.runs if (run.estimator, run.output) == (name, wanted))
+    return f"{name} {wanted}", files[name, wanted], states_file(name, "causal" if repeats else wanted)
 
 
 class BundleRecord(Struct, frozen=True, kw_only=True):

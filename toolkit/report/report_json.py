@@ -301,6 +301,11 @@ def trajectory_file(estimator: str, output: Output) -> str:
     return f"trajectories/{plain_name(estimator)}_{output}.tum"
 
 
+def states_file(estimator: str, output: Output) -> str:
+    """Return where in a run directory the states of an estimator's output are, with their covariances."""
+    return f"states/{plain_name(estimator)}_{output}.txt"
+
+
 def landmarks_file(estimator: str) -> str:
     """Return where in a run directory the landmarks of an estimator are."""
     return f"landmarks/{plain_name(estimator)}.csv"

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import UNSET
 
 from toolkit.answers import Output
-from toolkit.datasets.trajectories import tum
+from toolkit.datasets.trajectories import openvins, tum
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 REPORT_TEXT, PAGE = "report.md", "report.html"
-FOLDERS = ("figures", "landmarks", "trajectories")
+FOLDERS = ("figures", "landmarks", "states", "trajectories")
 
 
 def check_run_directory(target: Path) -> None:
@@ -206,13 +206,16 @@ def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFram
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:
-    for folder in ("trajectories", "landmarks"):
+    for folder in ("trajectories", "states", "landmarks"):
         (directory / folder).mkdir()
     _write_truth(comparison, directory)
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
             _write_text(directory / report_json.trajectory_file(row.estimator, row.output), tum.text(trajectory))
+        if trajectory is not None and trajectory.cov is not None and not row.repeats_causal:
+            states = openvins.text_with_covariances(trajectory)
+            _write_text(directory / report_json.states_file(row.estimator, row.output), states)
     for run in comparison.runs:
         _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
 

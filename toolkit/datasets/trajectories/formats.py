@@ -205,6 +205,11 @@ class PosesFile:
     def __len__(self) -> int:
         return len(self.T_world_imu)
 
+    def trajectory(self, t_ns: IntArray) -> Trajectory:
+        """Return the states on some stamps (N,), with covariances where their convention is known."""
+        cov = None if self.covariances is None else self.covariances.of(self.T_world_imu)
+        return Trajectory(t_ns, self.T_world_imu, self.v_world, self.bias, cov)
+
     def with_convention(self, unless_said: CovConvention | None) -> "PosesFile":
         """Return the file with a convention for its covariances, where it has some and does not say it."""
         stated = self.covariances
