@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.documents import Record, readable
@@ -38,7 +38,7 @@ class Request(Struct, frozen=True):
     every: Annotated[int, Meta(ge=1)] = 1
     keep: tuple[str, ...] = ()
     keep_trajectories: bool = False
-    cov_convention: str | None = None
+    cov_convention: str | UnsetType = UNSET
 
 
 class SweepRequest(Struct, frozen=True):
@@ -124,7 +124,7 @@ def plan_of(
         workers=workers,
         keep_trajectories=request.keep_trajectories,
         scheduler=scheduler,
-        cov_convention=None if request.cov_convention is None else convention_called(request.cov_convention),
+        cov_convention=None if request.cov_convention is UNSET else convention_called(request.cov_convention),
         part=Part(request.from_s, request.to_s, request.every),
     )
 
