@@ -176,7 +176,7 @@ def test_metrics_are_those_of_the_rows_and_of_the_mean_over_seeds(result: Result
     assert list(result.metrics) == [(row.estimator, row.output) for row in result.comparison.rows]
     assert set(result.metrics["ekf", "causal"]) == set(describe())
     assert [result.metrics[row.estimator, row.output]["ate_se3_m"] for row in result.comparison.rows] == ate(result)
-    values = [record.value for record in over.records() if record[3:5] == ("final", "ate_se3_m")]
+    values = [record.value for record in over.records() if record[3:5] == ("both", "ate_se3_m")]
     assert over.metrics["dead-reckoning", "final"]["ate_se3_m"] == pytest.approx(np.mean(values))  # type: ignore[arg-type]
     with pytest.raises(
         VislamError, match=r"there is no \('batch', 'final'\); there are \('dead-reckoning', 'causal'\)"
@@ -186,16 +186,38 @@ def test_metrics_are_those_of_the_rows_and_of_the_mean_over_seeds(result: Result
         result.metrics["ekf", "final"]["ate_se3"]
 
 
-def test_records_are_a_row_of_every_value(result: Result, over: Result) -> None:
+def test_records_are_a_row_of_every_value_and_those_of_a_filter_are_there_once(result: Result, over: Result) -> None:
     rows = list(over.records())
     assert {(row.sequence, row.seed, row.estimator, row.output) for row in rows} == {
-        ("drive", seed, "dead-reckoning", output) for seed in (1, 2) for output in ("causal", "final")
+        ("drive", seed, "dead-reckoning", "both") for seed in (1, 2)
     }
-    assert len(rows) == 2 * 2 * len(describe())
+    assert len(rows) == 2 * len(describe())
     by_key = {row[1:5]: row.value for row in result.records()}
-    for line in result.comparison.rows:
+    for line in result.comparison.lines:
         for key in describe():
-            assert by_key[0, line.estimator, line.output, key] == line.value(key)
+            assert by_key[0, line.estimator, line.label, key] == line.value(key)
+
+
+def test_a_frame_of_pandas_has_the_records(result: Result) -> None:
+    frame = result.to_pandas()
+    assert list(frame.columns) == ["sequence", "seed", "estimator", "output", "metric", "value"]
+    ate_m = frame[(frame.metric == "ate_se3_m") & (frame.estimator == "ekf")].value
+    assert list(ate_m) == [result.metrics["ekf", "causal"]["ate_se3_m"]]
+
+
+def test_without_pandas_one_line_says_what_to_install(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(VislamError, match=r'pandas; pip install "vislam-toolkit\[pandas\]"$'):
+        result.to_pandas()
+
+
+def test_a_table_for_a_paper_has_every_line_and_its_terms(result: Result) -> None:
+    text = result.to_latex("ate_se3_m")
+    assert text.startswith("% drive: ")
+    assert text.count(r"\\") == 1 + len(result.comparison.lines)
+    assert r"\bottomrule" in text
+    with pytest.raises(SettingsError, match="a column is an int"):
+        result.to_latex(3)  # type: ignore[arg-type]
 
 
 def test_seeds_are_repeated_from_the_first(over: Result) -> None:

@@ -10,6 +10,7 @@
     result.metrics["batch", "final"]      # every metric of one line of the table
 """
 
+import importlib.util
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,7 +29,8 @@ from toolkit.experiment.configuration import Configuration, Request, plan_of, re
 from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.progress import silent
 from toolkit.registry import find_all
-from toolkit.report.comparison_table import comparison_table, requested_columns
+from toolkit.report.comparison_table import Columns, comparison_table, requested_columns
+from toolkit.report.comparison_text import comparison_latex
 from toolkit.report.sweep import sweep_document, sweep_table, sweep_text, write_sweep
 from toolkit.report.text import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
@@ -37,6 +39,7 @@ from toolkit.settings.reading import settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
     from toolkit.report.figures import FigureChoice, FigureFormat
 
@@ -214,10 +217,7 @@ class Result:
 
     def table(self, *columns: str) -> "ShownTable":
         """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
-        strange = [column for column in columns if not isinstance(column, str)]
-        if strange:
-            raise SettingsError(f"a column is {type_of(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
-        return ShownTable(comparison_table(self.comparison, requested_columns(columns)))
+        return ShownTable(comparison_table(self.comparison, _checked_columns(columns)))
 
     @cached_property
     def figures(self) -> Mapping[str, "Figure"]:
@@ -246,8 +246,23 @@ class Result:
         return {run.estimator: run for run in self.comparison.runs}
 
     def records(self) -> Iterator[Record]:
-        """Yield every value as sequence, seed, estimator, output, metric, value: a table for pandas and its kin."""
+        """Yield every value once as sequence, seed, estimator, output, metric, value: a table for pandas and its kin.
+
+        The output is "both" for a filter's, whose final output repeats the causal one.
+        """
         return self.comparison.records()
+
+    def to_pandas(self) -> "DataFrame":
+        """Return :meth:`records` as a DataFrame; raises VislamError where pandas is not installed."""
+        if importlib.util.find_spec("pandas") is None:
+            raise VislamError('to_pandas needs the package pandas; pip install "vislam-toolkit[pandas]"')
+        import pandas as pd
+
+        return pd.DataFrame(list(self.records()), columns=Record._fields)
+
+    def to_latex(self, *columns: str) -> str:
+        """Return :meth:`table` for a paper, after comments with recording and rules; it needs the package booktabs."""
+        return comparison_latex(self.comparison, _checked_columns(columns))
 
     def save(
         self, directory: str | Path, figures: "FigureChoice" = "few", figure_format: "FigureFormat" = "png"
@@ -311,6 +326,14 @@ class SweepResult:
 
     def _repr_markdown_(self) -> str:
         return self.table()._repr_markdown_()
+
+
+def _checked_columns(columns: tuple[str, ...]) -> Columns:
+    """Return the columns that names ask for; raises SettingsError for what is no name, VislamError for an unknown."""
+    strange = [column for column in columns if not isinstance(column, str)]
+    if strange:
+        raise SettingsError(f"a column is {type_of(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
+    return requested_columns(columns)
 
 
 @dataclass(frozen=True)

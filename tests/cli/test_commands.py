@@ -1,5 +1,7 @@
 """What the subcommands do when all is well: what they write, where, and what they print."""
 
+import csv
+import io
 import json
 import re
 from collections.abc import Callable
@@ -52,6 +54,21 @@ def test_the_command_and_a_start_from_the_truth_are_labelled(vislam: Vislam, cap
     assert manifest["command"].endswith("--out 'with space' --seed 2")
     assert manifest["seeds"] == {"sequence": 2}
     assert "started from the truth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("form", ["csv", "latex", "markdown"])
+def test_a_table_is_printed_in_the_form_that_was_asked_for(vislam: Vislam, capsys: Captured, form: str) -> None:
+    assert vislam("compare", "drive", *QUICK, "--format", form) == 0
+    text = capsys.readouterr().out
+    if form == "csv":
+        (values,) = csv.DictReader(io.StringIO(text))
+        assert [values[key] for key in ("estimator", "output", "runs", "ok")] == ["dead-reckoning", "both", "1", "1"]
+        assert 0.0 < float(values["ate_se3_m"]) < 1.0
+    else:
+        assert ("dead-reckoning & both & ok" if form == "latex" else "| dead-reckoning | both") in " ".join(
+            text.split()
+        )
+        assert "results:" not in text
 
 
 def test_json_prints_the_document_and_quiet_nothing(vislam: Vislam, capsys: Captured) -> None:

@@ -35,8 +35,10 @@ from toolkit.errors import VislamError, printable
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from toolkit.experiment.comparison import Comparison
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
+    from toolkit.report.comparison_table import Columns
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
@@ -122,6 +124,7 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         "format of the figures; pdf and svg are vector graphics, for a paper",
         default="png",
     ),
+    choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text"),
     output("what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"),
     SCHEDULER,
     examples=("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",),
@@ -135,10 +138,8 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.experiment.configuration import plan_of
     from toolkit.files.documents import to_line
     from toolkit.report.comparison_table import requested_columns
-    from toolkit.report.comparison_text import comparison_text
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
     from toolkit.report.scores import scores_document
-    from toolkit.report.text import width_of_output
 
     columns = requested_columns(options.columns)
     requested = requested_configuration(options)
@@ -154,18 +155,33 @@ def compare(options: argparse.Namespace) -> int:
         for comparison, directory in zip(coming, directories, strict=True):
             try:
                 if not (options.json or options.quiet):
-                    print_above(comparison_text(comparison, columns, width_of_output()))
+                    print_above(_shown(comparison, columns, options.format, first=directory == directories[0]))
             finally:  # before the files, which take seconds to draw, and which a reader that goes away must not cost
                 with progress_for(f"{comparison.name}: figures and report"):
                     write_run(comparison, directory, made_by)
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())
-            elif not options.quiet:
+            elif not options.quiet and options.format == "text":
                 where, found = printable(str(directory)), stores[directory].found if stores else 0
                 there = f" ({found} of {len(comparison.outcomes)} runs were there)" if found else ""
                 print_above(f"results: {where}{there}; as a page: vislam report {shlex.quote(where)}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
+
+
+def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) -> str:
+    """Return a comparison in the form that was asked for; of CSV only the first has a heading."""
+    from toolkit.report import comparison_text as texts
+    from toolkit.report.text import width_of_output
+
+    if form == "csv":
+        text = texts.comparison_csv(comparison)
+        return text if first else text.partition("\n")[2]
+    if form == "latex":
+        return texts.comparison_latex(comparison, columns) + "\n"
+    if form == "markdown":
+        return texts.comparison_markdown(comparison, columns) + "\n"
+    return texts.comparison_text(comparison, columns, width_of_output())
 
 
 def requested_configuration(options: argparse.Namespace) -> Configuration:

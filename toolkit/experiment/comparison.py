@@ -239,12 +239,16 @@ class Row:
 
 
 class Record(NamedTuple):
-    """One value of one metric, as a long table has it."""
+    """One value of one metric, as a long table has it.
+
+    ``output`` is "both" for a filter's, whose final output repeats the causal one: what a document of scores has under
+    causal and again under final is then there once, and what belongs to causal output alone is among it.
+    """
 
     sequence: str
     seed: int
     estimator: str
-    output: Output
+    output: Output | Literal["both"]
     metric: str
     value: float | None
 
@@ -322,11 +326,14 @@ class Comparison:
         return tuple(known.get(seed) for seed in self.seeds)
 
     def records(self) -> Iterator[Record]:
-        """Yield every value of every metric: a row of sequence, seed, estimator, output, metric and value."""
+        """Yield every value of every metric once: a row of sequence, seed, estimator, output, metric and value."""
         for outcome in self.outcomes:
+            repeats = outcome.final_is_causal
             for output, scored in outcome.outputs.items():
+                if repeats and output == "final":
+                    continue
                 for key, value in scored.scores.values.items():
-                    yield Record(self.name, outcome.seed, outcome.estimator, output, key, value)
+                    yield Record(self.name, outcome.seed, outcome.estimator, "both" if repeats else output, key, value)
 
     def _rows_of(self, estimator: str) -> list[Row]:
         outcomes = tuple(outcome for outcome in self.outcomes if outcome.estimator == estimator)

@@ -3,11 +3,14 @@
 Below the table stand the verdict and the most harmful notes; the report has everything needed to read the table.
 """
 
+import csv
+import io
 from collections.abc import Mapping
 
 from toolkit.audit import Audit, Finding
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
+from toolkit.metrics import known_metrics
 from toolkit.report.card import card_lines
 from toolkit.report.comparison_table import Columns, comparison_table, explained_metrics, header_lines, sequence_line
 from toolkit.report.messages import (
@@ -24,6 +27,7 @@ from toolkit.report.text import (
     WIDTH,
     Table,
     Width,
+    as_latex,
     as_markdown,
     as_text,
     filled,
@@ -95,6 +99,32 @@ def _most_harmful(notes: list[str], above: str) -> list[str]:
 
 def _line_count(entries: list[str]) -> int:
     return "\n".join(section("notes", entries, WIDTH)).count("\n") + 1
+
+
+def comparison_markdown(comparison: Comparison, columns: Columns = None) -> str:
+    """Return the recording, the rules, the table and the verdict as Markdown; raises VislamError as the table does."""
+    table = as_markdown(comparison_table(comparison, columns))
+    lines = [in_markdown(line) + "." for line in header_lines(comparison, columns)]
+    return "\n\n".join([*lines, table, in_markdown(verdict(comparison))])
+
+
+def comparison_latex(comparison: Comparison, columns: Columns = None) -> str:
+    """Return the table for a paper, after comments with recording and rules; the package booktabs is needed."""
+    comments = [f"% {printable(line)}" for line in header_lines(comparison, columns)]
+    return "\n".join([*comments, as_latex(comparison_table(comparison, columns))])
+
+
+def comparison_csv(comparison: Comparison) -> str:
+    """Return a line a row of the table with every metric in full: over seeds means over the runs that are ok."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    keys = [metric.key for metric in known_metrics()]
+    writer.writerow(["sequence", "estimator", "output", "runs", "ok", *keys])
+    for row in comparison.lines:
+        values = [row.value(key) for key in keys]
+        texts = ["" if value is None else repr(value) for value in values]
+        writer.writerow([comparison.name, row.estimator, row.label, len(row.outcomes), row.counts["ok"], *texts])
+    return out.getvalue().rstrip("\n")
 
 
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
