@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from toolkit.answers import Output
 from toolkit.audit import faults
@@ -126,14 +127,14 @@ class Effect(NamedTuple):
     cpu_ms: float | None
 
 
-class Breaking(NamedTuple):
+class Breaking(Struct, frozen=True):
     """The dose at which an estimator passes three times its clean error, on a side of the clean one, with its interval.
 
     None is beyond the largest dose, ``tried``, that was run; a ``dose`` is between two that were.
     """
 
     estimator: str
-    axis: Axis
+    axis: str
     tried: float
     dose: float | None
     low: float | None
@@ -217,7 +218,7 @@ class Sweep:
             crossing(doses, (1.0, *(ratio[end] for _, ratio in known)), place)
             for end, place in ((2, 0.0), (0, 0.5), (1, 1.0))
         )
-        return Breaking(estimator, axis, side[-1], dose, low, high)
+        return Breaking(estimator, axis.name, side[-1], dose, low, high)
 
 
 def run_sweep(

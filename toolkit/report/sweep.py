@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 from toolkit.errors import DataError
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.statistics import Interval
-from toolkit.experiment.sweep import BREAKS_AT, Axis, Effect, Sweep
+from toolkit.experiment.sweep import BREAKS_AT, Axis, Breaking, Effect, Sweep
 from toolkit.files.documents import number as finite
 from toolkit.files.documents import of_attributes, read, to_text
 from toolkit.files.reading import read_input
@@ -75,17 +75,6 @@ class EffectRecord(Struct, frozen=True, kw_only=True):
     cpu_ms: Annotated[float | None, Meta(description="of a frame")]
 
 
-class BreakingRecord(Struct, frozen=True, kw_only=True):
-    """The dose at which an estimator passes three times its clean error; null is beyond the largest, ``tried``."""
-
-    estimator: str
-    axis: str
-    tried: float
-    dose: float | None
-    low: float | None
-    high: float | None
-
-
 class SweepRecord(Struct, frozen=True, kw_only=True):
     """What a sweep found."""
 
@@ -100,7 +89,7 @@ class SweepRecord(Struct, frozen=True, kw_only=True):
     intervals: Annotated[Literal["seeds", "stretches"], Meta(description="what they are over")]
     axes: tuple[AxisRecord, ...]
     effects: tuple[EffectRecord, ...]
-    breaking: tuple[BreakingRecord, ...]
+    breaking: Annotated[tuple[Breaking, ...], Meta(description="null is beyond the largest dose that was tried")]
     figures: Annotated[dict[str, str], Meta(description="caption by file")]
     files: Annotated[tuple[str, ...], Meta(description="that the sweep wrote, relative to its directory")]
 
@@ -127,7 +116,7 @@ def sweep_document(
         intervals="seeds" if sweep.over_seeds else "stretches",
         axes=tuple(_axis(sweep, axis) for axis in sweep.axes),
         effects=tuple(map(_effect, sweep.effects.values())),
-        breaking=tuple(of_attributes(BreakingRecord, one, axis=one.axis.name) for one in sweep.breaking),
+        breaking=sweep.breaking,
         figures=dict(figures or {}),
         files=tuple(files),
     )
@@ -196,7 +185,7 @@ def in_words(interval: IntervalRecord | None) -> str:
     return value if low == high == "inf" else f"{value} ({low}-{high})"
 
 
-def _breaking(one: BreakingRecord, axis: AxisRecord) -> str:
+def _breaking(one: Breaking, axis: AxisRecord) -> str:
     is_below = isinstance(axis.clean, str) or axis.clean is None or one.tried < axis.clean
     beyond = f"{'<' if is_below else '>'}{number(one.tried)}"
     dose, low, high = (beyond if end is None else number(end) for end in (one.dose, one.low, one.high))

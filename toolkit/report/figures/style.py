@@ -53,12 +53,7 @@ class NamedFigure(NamedTuple):
 
 def colour_of(comparison: Comparison, estimator: str) -> str:
     """Return the colour an estimator has in every figure of every run."""
-    return colour_among(comparison.estimators, estimator)
-
-
-def colour_among(estimators: Iterable[str], estimator: str) -> str:
-    """Return the colour of an estimator, given all that are shown."""
-    return _COLOURS[look_numbers(estimators)[estimator] % COLOURS]
+    return stroke_among(comparison.estimators, estimator)["color"]
 
 
 def line_of(output: Output) -> Dashes:
@@ -78,9 +73,13 @@ def stroke_of(comparison: Comparison, estimator: str, output: Output) -> Stroke:
 
     Both outputs keep the estimator's colour, so that thrice as many estimators as there are colours are told apart.
     """
-    styles = _LINE_OF[output]
-    dashes = styles[look_numbers(comparison.estimators)[estimator] // COLOURS % len(styles)]
-    return Stroke(color=colour_of(comparison, estimator), linestyle=dashes)
+    return stroke_among(comparison.estimators, estimator, output)
+
+
+def stroke_among(estimators: Iterable[str], estimator: str, output: Output = "final") -> Stroke:
+    """Return colour and dashes of one kind of output of an estimator, given all that are shown."""
+    number, styles = look_numbers(estimators)[estimator], _LINE_OF[output]
+    return Stroke(color=_COLOURS[number % COLOURS], linestyle=styles[number // COLOURS % len(styles)])
 
 
 def shown_as(row: Row) -> Output:

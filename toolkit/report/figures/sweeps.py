@@ -19,11 +19,11 @@ from toolkit.report.figures.style import (
     ZERO_COLOUR,
     Entry,
     NamedFigure,
-    colour_among,
     columns_for,
     legend_below,
     new_figure,
     scale_by_decades,
+    stroke_among,
     style_axes,
 )
 from toolkit.report.sweep import metric_of, shown_value
@@ -110,13 +110,12 @@ def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> N
     values = [min(one.value, _MOST) for line in lines.values() for _, one in line if math.isfinite(one.value)]
     low, high = 0.7 * min([0.9, *values]), 1.5 * max([BREAKS_AT, *values])
     for name, line in lines.items():
-        colour, place = colour_among(tuple(lines), name), [place for place, _ in line]
+        stroke, place = stroke_among(lines, name), [place for place, _ in line]
         value, below, above = (np.clip([one[end] for _, one in line], low, high) for end in range(3))
-        axes.fill_between(place, below, above, color=colour, alpha=0.13, linewidth=0.0)
-        axes.plot(place, value, color=colour, linewidth=1.3, marker="o", markersize=2.5)
-        bad = [(place, high) for place, one in line if math.isinf(one.value)]
-        if bad:
-            axes.plot(*zip(*bad, strict=True), color=colour, linestyle="", marker="x", markersize=6.0, clip_on=False)
+        axes.fill_between(place, below, above, color=stroke["color"], alpha=0.13, linewidth=0.0)
+        axes.plot(place, value, linewidth=1.3, marker="o", markersize=2.5, **stroke)
+        bad = [place for place, one in line if math.isinf(one.value)]
+        axes.scatter(bad, [high] * len(bad), color=stroke["color"], marker="x", clip_on=False)
     scale_by_decades(axes, low, high)
 
 
@@ -157,13 +156,13 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     reached = {name: _reached(sweep, axis, name) for name in sweep.estimators}
     everywhere = [at for points in reached.values() for at in points.values()]
     for name, points in reached.items():
-        colour = colour_among(sweep.estimators, name)
+        stroke = stroke_among(reached, name)
         line = [at for point, at in points.items() if point]
-        axes.plot(*np.reshape(line, (-1, 2)).T, color=colour, linewidth=1.0, alpha=0.6)
+        axes.plot(*np.reshape(line, (-1, 2)).T, linewidth=1.0, alpha=0.6, **stroke)
         for point, at in points.items():
             on_front = not any(_dominates(other, at) for other in everywhere)
-            face = colour if on_front else "white"
-            axes.plot(*at, color=colour, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face)
+            face = stroke["color"] if on_front else "white"
+            axes.plot(*at, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face, **stroke)
             word = shown_value(point[0][1]) if point else _word(axis)
             axes.annotate(word, at, (4, 4), textcoords="offset points", fontsize=SMALL_PT, color=MUTED_COLOUR)
     cpu_ms, errors = np.reshape(everywhere, (-1, 2)).T
@@ -192,7 +191,8 @@ def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, fl
 
 
 def _entries(sweep: Sweep) -> list[Entry]:
-    return [Entry.of_line(name, colour_among(sweep.estimators, name)) for name in sweep.estimators]
+    strokes = {name: stroke_among(sweep.estimators, name) for name in sweep.estimators}
+    return [Entry.of_line(name, stroke["color"], stroke["linestyle"]) for name, stroke in strokes.items()]
 
 
 def _dominates(other: tuple[float, float], one: tuple[float, float]) -> bool:
