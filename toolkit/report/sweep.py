@@ -189,7 +189,7 @@ def _breaking(one: Breaking, axis: AxisRecord) -> str:
     is_below = isinstance(axis.clean, str) or axis.clean is None or one.tried < axis.clean
     beyond = f"{'<' if is_below else '>'}{number(one.tried)}"
     dose, low, high = (beyond if end is None else number(end) for end in (one.dose, one.low, one.high))
-    return beyond if dose == low == high else f"{dose} ({low}-{high})"
+    return beyond if dose == low == high else f"{dose} ({low} to {high})"
 
 
 def _under(sweep: SweepRecord) -> Iterator[str]:
