@@ -47,7 +47,7 @@ from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kin
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.settings.records import Outliers
+from toolkit.settings.records import DEFAULTS, Outliers
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"
@@ -95,8 +95,7 @@ class Batch:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        window_s = setup.settings.window.seconds("twist")
-        self._causal_pass = Msckf(setup, AtFirstEstimates(), window_s=window_s)
+        self._causal_pass = Msckf(setup, AtFirstEstimates(), window_s=DEFAULTS.window.seconds("twist"))
         self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []

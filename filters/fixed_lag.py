@@ -7,37 +7,99 @@ the window. Three faults are recovered from, and the log lists them:
 - a landmark that has fallen behind the camera is dropped and started again from its next sighting;
 - a variable that makes the window's system indeterminate is held at its value;
 - a landmark whose gate has rejected more sightings than it was built from is started again, if the rejected ones agree.
+
+With other ``marginals`` than those at first estimates, or without their cross-covariances, the window is not GTSAM's
+but ``relinearised_window``: what left it is linearised at the estimates of every frame, as in a Kalman filter.
 """
 
+from collections.abc import Collection
 from dataclasses import replace
+from typing import Protocol
 
 import gtsam
 
 from filters.kalman.thinning import Thinned
 from filters.smoothing.fixed_lag_tree import FixedLagTree
-from filters.smoothing.graph_builder import GraphBuilder
+from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery
+from filters.smoothing.relinearised_window import (
+    AT_FIRST,
+    Coordinates,
+    InBody,
+    InWorld,
+    Kept,
+    RelinearisedWindow,
+    whole,
+    without_cross_covariances,
+)
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet
 from toolkit.models.factors import points_of
+from toolkit.settings.records import Scalar
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
+OPTIONS = {"marginals": ("first", "latest", "invariant"), "cross_covariances": (True, False)}
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "past poses",
+    "long-lived landmarks",
+    "relinearisation",
+)
+WITHOUT = {
+    "cross-covariances": {"cross_covariances": False},
+    "consistent linearisation": {"marginals": "latest"},
+    "past poses": {"window.most_states": 1},
+}
+
+
+class Window(Protocol):
+    """The graph of a window, solved at every packet; variables older than its lag are marginalised."""
+
+    def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
+        """Add a packet's factors and values at a time, and solve; return the recoveries."""
+
+    def drop(self, track_ids: Collection[int]) -> Recovery:
+        """Remove landmarks and their sightings in the window."""
+
+    def values(self) -> gtsam.Values:
+        """Return the latest values of the window."""
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
+        """Return the joint marginal of some variables of the window."""
+
+    def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
+        """Recover from the refusal of a covariance; raise it again where nothing helps."""
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, FixedLag(setup, setup.settings.window.seconds(setup.motion_kind)))
+    lag_s = setup.settings.window.seconds(setup.motion_kind)
+    return Thinned(setup, FixedLag(setup, lag_s, window_of(setup, round(lag_s * NS_PER_S))))
+
+
+def window_of(setup: Setup, lag_ns: int) -> Window:
+    """Return the window that the options ask for; by default GTSAM's incremental one."""
+    in_body = InBody(setup.rig.T_imu_cam)
+    marginals: dict[Scalar, Coordinates] = {"first": AT_FIRST, "latest": InWorld(), "invariant": in_body}
+    kept: dict[Scalar, Kept] = {True: whole, False: without_cross_covariances}
+    coordinates, kept_of = setup.choice("marginals", marginals), setup.choice("cross_covariances", kept)
+    if coordinates is AT_FIRST and kept_of is whole:
+        return FixedLagTree(lag_ns)
+    return RelinearisedWindow(lag_ns, coordinates, kept_of)
 
 
 class FixedLag:
-    """Adds a packet to the window, has GTSAM relinearise it, and reads the states in it."""
+    """Adds a packet to the window, has it solved, and reads the states in it; the window is GTSAM's by default."""
 
-    def __init__(self, setup: Setup, lag_s: float) -> None:
+    def __init__(self, setup: Setup, lag_s: float, window: Window | None = None) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
-        self._tree = FixedLagTree(self._lag_ns)
+        self._tree = window or FixedLagTree(self._lag_ns)
         self._builder = GraphBuilder(setup)
         self._stamps_ns: list[int] = []
         # The window when it was last read: the values of its variables, and its landmarks (3,) m.

@@ -46,7 +46,7 @@ WRONG: list[tuple[str, int, str]] = [
     # Settings, and files of them.
     ("compare drive --set window.lag=3", 2, "there is no setting window.lag; did you mean window.lag_s?"),
     ("compare drive --set window.lag_s", 2, "--set takes KEY=VALUE"),
-    ("compare drive --set window.most_states=1", 2, "window.most_states: expected integer >= 2"),
+    ("compare drive --set window.most_states=0", 2, "window.most_states: expected integer >= 1"),
     ("compare drive --window 1e-9", 2, "window.lag_s: expected number >= 0.001"),
     ("compare drive --set estimators.ekff.gain=1", 5, "did you mean ekf?"),
     ("compare drive --estimators ekf --set estimators.ekf.gain=2", 5, "estimator ekf has no option gain"),

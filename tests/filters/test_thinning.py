@@ -96,10 +96,11 @@ def test_frames_without_a_state_are_carried_on_from_the_state_before_them(flight
         assert grown.all()
 
 
+@pytest.mark.parametrize("most_states", [1, 5])
 @pytest.mark.parametrize("name", WINDOWED)
-def test_windowed_filters_and_smoothers_answer_for_every_frame_under_a_cap(name):
+def test_windowed_filters_and_smoothers_answer_for_every_frame_under_a_cap(name, most_states):
     sequence = simulate(replace(DRIVE, duration_s=2.0, camera=replace(DRIVE.camera, max_tracks=30)), 3)
-    settings = Settings(window=Window(lag_s=1.0, most_states=5))
+    settings = Settings(window=Window(lag_s=1.0, most_states=most_states))
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.status == "ok", run.log
     for trajectory in (run.causal, run.final):

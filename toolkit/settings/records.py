@@ -103,14 +103,21 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = None
     most_states: Annotated[
-        int, _about("most states in the window; if there are more frames, states are thinned evenly", ge=2, le=10_000)
+        int,
+        _about(
+            "most states in the window; if there are more frames, states are thinned evenly; 1: the newest alone",
+            ge=1,
+            le=10_000,
+        ),
     ] = 50
     landmarks: Annotated[
         int, _about("landmarks msckf-slam keeps in its state for as long as they are seen", ge=0, le=500)
     ] = 50
 
     def seconds(self, motion_kind: str) -> float:
-        """Return how long the window is for a kind of motion: "imu", "twist" or "none"."""
+        """Return how long the window is for a kind of motion: "imu", "twist" or "none"; 0 for one state."""
+        if self.most_states == 1:
+            return 0.0
         if self.lag_s is not None:
             return self.lag_s
         return _LAG_WITH_IMU_S if motion_kind == "imu" else _LAG_S
@@ -118,8 +125,11 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
     def interval(self, since_ns: int, motion_kind: str) -> int:
         """Return the number of the interval that a time after the first frame is in; one frame of each has a state.
 
-        Intervals are so long that the window never holds more than its largest number of states.
+        Intervals are so long that the window never holds more than its largest number of states. A window of the newest
+        state alone moves on with every frame.
         """
+        if self.most_states == 1:
+            return since_ns
         return int(since_ns * (self.most_states - 1) // round(self.seconds(motion_kind) * _NS_PER_S))
 
 

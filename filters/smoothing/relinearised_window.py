@@ -1,0 +1,299 @@
+"""The window of a fixed-lag smoother that is linearised anew at every frame, with what it marginalises.
+
+GTSAM's incremental tree (``fixed_lag_tree``) makes one step a frame and keeps the linearisation of what has left the
+window, with the linearisation points of all variables that this concerns. Here a frame is iterated to convergence, and
+states leave before it corrects: the window of the newest state alone is the iterated Kalman filter (Bell & Cathey
+1993). What leaves becomes a Gaussian on the oldest state of the window and on the landmarks seen before it. Two things
+are chosen outside: the coordinates in which it is Gaussian, and which of its covariances are kept.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import gtsam
+import numpy as np
+
+from filters.kalman.coordinates import inverse_depth, inverse_depth_jacobian
+from filters.smoothing.graph_builder import GraphExtension
+from filters.smoothing.indeterminate import LAST, Recovery, variable_named
+from toolkit.errors import EstimatorError
+from toolkit.geometry import Array, se3_inverse, se3_right_jacobian, skew, transform
+from toolkit.models.factors import L, kind_of, linear_factor
+
+# A step that lowers the error, half a sum of squares in sigma, by no more than this is the last.
+_NEGLIGIBLE = 1e-6
+_MOST_STEPS, _MOST_HALVINGS = 10, 6
+_UNIT = gtsam.noiseModel.Unit.Create(1)
+
+
+class Coordinates(Protocol):
+    """What the errors of a Gaussian on one state and some landmarks are measured in.
+
+    Keys are in the order pose, (velocity,) bias, landmarks.
+    """
+
+    @property
+    def is_fixed(self) -> bool:
+        """Say whether variables keep the linearisation points they had when they came into it; a frame is one step."""
+
+    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
+        """Return the errors (n,) of values against others, and their Jacobian (n, n) in GTSAM's tangent spaces."""
+
+    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
+        """Take note that the Gaussian is on another state from now on; ``landmarks`` are all that are in it then."""
+
+
+@dataclass(frozen=True)
+class InWorld:
+    """GTSAM's own tangent spaces: velocities and landmarks in the axes of the world."""
+
+    is_fixed: bool = False
+
+    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
+        """Return the errors (n,), and as their Jacobian the identity, which it is to first order."""
+        error = np.asarray(at.localCoordinates(values).vector(keys))
+        return error, np.eye(error.size)
+
+    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
+        """Change nothing."""
+
+
+AT_FIRST = InWorld(is_fixed=True)
+
+
+@dataclass
+class InBody:
+    """Velocity and landmarks in the axes of the state, which a turned or displaced world leaves as they are.
+
+    Heading and position of the whole therefore stay unobservable at changing estimates, as in the right-invariant error
+    (Barrau & Bonnabel 2017), from which these differ by a constant matrix. Landmarks are (x / z, y / z, 1 / z) of the
+    camera that saw them first, which moves with the state (Civera, Davison & Montiel 2008), as in `iekf`.
+    """
+
+    T_imu_cam: Array
+    is_fixed: bool = False
+    _anchors: dict[int, Array] = field(default_factory=dict)
+
+    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
+        """Return the errors (n,) and their exact Jacobian (n, n)."""
+        before, after = at.atPose3(keys[0]).matrix(), values.atPose3(keys[0]).matrix()
+        error = np.asarray(at.localCoordinates(values).vector(keys))
+        to_body, H = after[:3, :3].T, np.eye(error.size)
+        H[:6, :6] = np.linalg.inv(se3_right_jacobian(error[:6]))
+        if kind_of(keys[1]) == "v":
+            v_body = to_body @ values.atVector(keys[1])
+            error[6:9] = v_body - before[:3, :3].T @ at.atVector(keys[1])
+            H[6:9, :3], H[6:9, 6:9] = skew(v_body), to_body
+        landmarks = [key for key in keys if kind_of(key) == "l"]
+        if landmarks:
+            first, anchors = error.size - 3 * len(landmarks), np.array([self._anchors[key] for key in landmarks])
+            seen = transform(se3_inverse(after), np.array([values.atPoint3(key) for key in landmarks]))
+            old = transform(se3_inverse(before), np.array([at.atPoint3(key) for key in landmarks]))
+            to_anchors = se3_inverse(anchors)
+            now, then = transform(to_anchors, seen), transform(to_anchors, old)
+            error[first:] = (inverse_depth(now) - inverse_depth(then)).reshape(-1)
+            by_seen = inverse_depth_jacobian(now) @ to_anchors[:, :3, :3]
+            H[first:, :3], H[first:, 3:6] = (by_seen @ skew(seen)).reshape(-1, 3), -by_seen.reshape(-1, 3)
+            for i, by_point in enumerate(by_seen @ to_body):
+                H[first + 3 * i : first + 3 * i + 3, first + 3 * i : first + 3 * i + 3] = by_point
+        return error, H
+
+    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
+        """Leave the cameras where they are in the world; landmarks that are new were seen first from the old state."""
+        T_new_old = new.between(old).matrix()
+        self._anchors = {key: T_new_old @ self._anchors.get(key, self.T_imu_cam) for key in landmarks}
+
+
+class Gaussian(NamedTuple):
+    """A Gaussian of errors e (n,) in some coordinates about values.
+
+    The residuals ``root e - told`` have unit covariance: ``root`` is (m, n), ``told`` (m,).
+    """
+
+    keys: list[int]
+    at: gtsam.Values
+    root: Array
+    told: Array
+    coordinates: Coordinates
+
+    def linear(self, values: gtsam.Values) -> gtsam.GaussianFactor:
+        """Return the factor linearised at some values."""
+        error, H = self.coordinates.errors(self.at, values.extract(self.keys), self.keys)
+        sizes = self.at.dims()
+        columns = np.split(self.root @ H, np.cumsum([sizes[key] for key in self.keys])[:-1], axis=1)
+        return linear_factor(list(zip(self.keys, columns, strict=True)), self.told - self.root @ error)
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return half the sum of squares."""
+        error, _ = self.coordinates.errors(self.at, values.extract(self.keys), self.keys)
+        return 0.5 * float(np.square(self.root @ error - self.told).sum())
+
+
+Kept = Callable[[Array, Array, int], tuple[Array, Array]]
+"""Changes a Gaussian, given by its root (m, n) and what it told (m,); the first ``size`` errors are the state's."""
+
+
+def whole(root: Array, told: Array, size: int) -> tuple[Array, Array]:
+    """Return the Gaussian as it is."""
+    return root, told
+
+
+def without_cross_covariances(root: Array, told: Array, size: int) -> tuple[Array, Array]:
+    """Return the Gaussian as if the state and the landmarks were independent."""
+    information = root.T @ root
+    cov, mean = np.linalg.inv(information), np.linalg.solve(information, root.T @ told)
+    cov[:size, size:], cov[size:, :size] = 0.0, 0.0
+    root = np.linalg.inv(np.linalg.cholesky(cov))
+    return root, root @ mean
+
+
+class RelinearisedWindow:
+    """Adds factors and values with their stamps; variables older than the lag are marginalised."""
+
+    def __init__(self, lag_ns: int, coordinates: Coordinates, kept: Kept) -> None:
+        self._lag_ns, self._coordinates, self._kept = lag_ns, coordinates, kept
+        self._factors: list[gtsam.NonlinearFactor] = []
+        self._left: Gaussian | None = None
+        self._values, self._at = gtsam.Values(), gtsam.Values()
+        # The states in the order of time, each with its keys, and the landmarks: both with their last stamps.
+        self._states: list[tuple[int, list[int]]] = []
+        self._landmarks: dict[int, int] = {}
+        self._tree = gtsam.GaussianBayesTree()
+
+    def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
+        """Add a packet's factors and values at a time, and solve; return the recoveries.
+
+        Raises EstimatorError where the system does not determine a state.
+        """
+        self._states.append((t_ns, sorted(extension.state_keys, key=_place)))
+        self._landmarks |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
+        self._factors += [extension.factors.at(i) for i in range(extension.factors.size())]
+        self._values.insert(extension.values)
+        self._at.insert(extension.values)
+        oldest_ns = t_ns - self._lag_ns
+        while self._states[0][0] < oldest_ns:
+            self._marginalise(self._states.pop(0)[1])
+        self._marginalise([key for key, seen_ns in self._landmarks.items() if seen_ns < oldest_ns])
+        return self._solved()
+
+    def drop(self, track_ids: Collection[int]) -> Recovery:
+        """Remove landmarks and their sightings in the window; the others keep what older sightings told of them."""
+        leaving = {L(i) for i in track_ids}
+        self._factors = [factor for factor in self._factors if leaving.isdisjoint(factor.keys())]
+        self._marginalise(sorted(leaving))
+        return self._solved()
+
+    def values(self) -> gtsam.Values:
+        """Return the latest values of the window."""
+        return self._values
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
+        """Return the joint marginal of some variables of the window."""
+        return self._tree.jointMarginalCovariance(keys)
+
+    def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
+        """Raise the refusal of a covariance again: every frame is solved anew, nothing is left to rebuild."""
+        raise refusal
+
+    def _marginalise(self, leaving: list[int]) -> None:
+        """Marginalise landmarks, or the variables of the state before the oldest one; what they told stays."""
+        gone, values, state = set(leaving), self._at, self._states[0][1]
+        touched = [factor for factor in self._factors if not gone.isdisjoint(factor.keys())]
+        linear = gtsam.GaussianFactorGraph()
+        for factor in touched:
+            linear.push_back(factor.linearize(values.extract(factor.keys())))
+        if self._left is not None:
+            linear.push_back(self._left.linear(values))
+        known = set(linear.keyVector())
+        if gone & known:
+            self._factors = [factor for factor in self._factors if gone.isdisjoint(factor.keys())]
+            _, rest = linear.eliminatePartialSequential(_ordering(key for key in leaving if key in known))
+            landmarks = sorted(key for key in known - gone if kind_of(key) == "l")
+            before = leaving[0] if kind_of(leaving[0]) == "x" else state[0]
+            self._coordinates.pass_on(values.atPose3(before), values.atPose3(state[0]), landmarks)
+            keys = [*state, *landmarks]
+            at = values.extract(keys)
+            root, told = self._kept(*rest.jacobian(_ordering(keys)), at.extract(state).dim())
+            _, H = self._coordinates.errors(at, at, keys)
+            self._left = Gaussian(keys, at, np.asarray(np.linalg.solve(H.T, root.T).T), told, self._coordinates)
+        for key in leaving:
+            self._landmarks.pop(key, None)
+            if values.exists(key):
+                self._values.erase(key)
+                self._at.erase(key)
+
+    def _solved(self) -> Recovery:
+        """Iterate to the minimum; landmarks that are indeterminate are dropped."""
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self._factors:
+            graph.add(factor)
+        try:
+            self._iterate(graph)
+        except RuntimeError as refusal:
+            key = variable_named(refusal)
+            if kind_of(key) != "l":
+                raise EstimatorError(f"{gtsam.Symbol(key).string()} is indeterminate in the window") from refusal
+            track_id = gtsam.Symbol(key).index()
+            line = f"landmark {track_id} made the system indeterminate and was dropped"
+            again = self.drop([track_id])
+            return Recovery([line, *again.log], {track_id} | again.dropped)
+        return Recovery([], set())
+
+    def _iterate(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Take Gauss-Newton steps, halved until the error falls, until one would lower it negligibly."""
+        ordering, error = self._order(), self._error(graph, self._at)
+        for _ in range(1 if self._coordinates.is_fixed else _MOST_STEPS):
+            linear = self._linear(graph)
+            self._tree = linear.eliminateMultifrontal(ordering)
+            step = self._tree.optimize()
+            gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
+            if self._coordinates.is_fixed or gain <= _NEGLIGIBLE:
+                self._move(self._at.retract(step))
+                return
+            for halvings in range(_MOST_HALVINGS + 1):
+                there = self._at.retract(step.scale(0.5**halvings))
+                now = self._error(graph, there)
+                if now < error:
+                    break
+            else:
+                return
+            self._move(there)
+            error = now
+
+    def _move(self, there: gtsam.Values) -> None:
+        """Take values, and linearise there from now on what may move."""
+        self._values, at = there, gtsam.Values(there)
+        if self._coordinates.is_fixed and self._left is not None:
+            at.update(self._left.at)
+        self._at = at
+
+    def _linear(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.GaussianFactorGraph:
+        linear = graph.linearize(self._at)
+        if self._left is not None:
+            linear.push_back(self._left.linear(self._at))
+        # As in the incremental tree, so that the state before the newest has a clique of its own (``indeterminate``).
+        for key in self._states[-1][1]:
+            size = self._at.extract([key]).dim()
+            linear.add(gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), _UNIT))
+        return linear
+
+    def _error(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> float:
+        return graph.error(values) + (0.0 if self._left is None else self._left.error(values))
+
+    def _order(self) -> gtsam.Ordering:
+        """Return the elimination order: landmarks, those that the Gaussian connects last, then states in time."""
+        connected = set() if self._left is None else set(self._left.keys)
+        landmarks = sorted(self._landmarks, key=lambda key: (key in connected, key))
+        return _ordering([*landmarks, *(key for _, keys in self._states for key in keys), LAST])
+
+
+def _place(key: int) -> int:
+    return "xvb".index(kind_of(key))
+
+
+def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering

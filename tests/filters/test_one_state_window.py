@@ -1,0 +1,74 @@
+"""The window of `fixed-lag` at its one end: the newest state alone is the iterated Kalman filter (4 s).
+
+At its other end, with all states in it, it is the batch: test_infinite_lag.py.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from filters import fixed_lag, iekf
+from toolkit import runner
+from toolkit.settings import Settings
+from toolkit.settings.records import POLICIES, Window
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+# Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
+SCENARIOS = [
+    replace(DRIVE, duration_s=2.0),
+    replace(FLIGHT, duration_s=0.8, motion=replace(FLIGHT.motion, rate_hz=1000.0)),
+]
+SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=20)) for s in SCENARIOS]
+ONE_STATE = Window(most_states=1)
+
+
+def last_answer(recording, marginals):
+    """Return the causal answer of a window of one state at the last frame of a recording."""
+    setup = replace(recording.setup, settings=Settings(window=ONE_STATE), options={"marginals": marginals})
+    estimator = fixed_lag.build(setup)
+    return [estimator.step(packet) for packet in recording.sequence.packets()][-1]
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+@pytest.mark.parametrize("marginals", fixed_lag.OPTIONS["marginals"])
+def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, marginals, oracle):
+    """As a joint Kalman filter: wherever it linearises, forgetting loses nothing. Errors and bounds are as there."""
+    recording = oracle.recorded(scenario, 1e-4)
+    last = recording.sequence.frame_count - 1
+    mean, _ = oracle.batch(recording, recording.track_ids).state(last)
+    assert np.abs(recording.error_of(last_answer(recording, marginals), last) - mean).max() < 1e-8
+    assert np.abs(mean).max() > 1e-6, "there was something to agree on"
+    exact = oracle.recorded(scenario, 1e-7)
+    _, cov = oracle.batch(exact, exact.track_ids).state(last)
+    oracle.assert_covariances_agree(last_answer(exact, marginals).cov, cov, 1e-5)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Return a function that runs estimators over a flight of full noise, without gates and losses."""
+    sequence = simulate(replace(FLIGHT, duration_s=1.0, camera=replace(FLIGHT.camera, max_tracks=20)), 3)
+
+    @cache
+    def run(build, **options):
+        settings = Settings(outliers=POLICIES["none"], window=ONE_STATE, estimators={"one": options})
+        return runner.run("one", build, sequence, sequence.prior, settings=settings).causal
+
+    return run
+
+
+def test_in_flight_the_newest_state_alone_with_invariant_marginals_is_the_iterated_filter(flown):
+    """Held equal but for the velocity's coordinates, to second order. The filter stops at 1e-4 standard deviations."""
+    filtered, smoothed = flown(iekf.build), flown(fixed_lag.build, marginals="invariant")
+    sigma = np.sqrt(np.diagonal(filtered.cov, axis1=1, axis2=2))
+    assert np.abs(smoothed.positions - filtered.positions).max() < 1e-3 * sigma[:, 3:6].max()
+    np.testing.assert_allclose(np.sqrt(np.diagonal(smoothed.cov, axis1=1, axis2=2)), sigma, rtol=1e-3)
+
+
+def test_marginals_at_the_latest_estimates_gain_information_that_nothing_measured(flown):
+    """Of the attitude, whose heading no camera observes; and without cross-covariances of the position as well."""
+    sound, latest = (flown(fixed_lag.build, marginals=kind).cov[-1] for kind in ("invariant", "latest"))
+    decoupled = flown(fixed_lag.build, cross_covariances=False).cov[-1]
+    assert np.linalg.det(latest[:3, :3]) < 0.5 * np.linalg.det(sound[:3, :3])
+    assert np.trace(decoupled[3:6, 3:6]) < 0.1 * np.trace(sound[3:6, 3:6])
