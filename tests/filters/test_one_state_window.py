@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from filters import fixed_lag, iekf
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
 from toolkit import runner
 from toolkit.settings import Settings
 from toolkit.settings.records import POLICIES, Window
@@ -33,16 +34,16 @@ def last_answer(recording, marginals):
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 @pytest.mark.parametrize("marginals", fixed_lag.OPTIONS["marginals"])
-def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, marginals, oracle):
+def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, marginals):
     """As a joint Kalman filter: wherever it linearises, forgetting loses nothing. Errors and bounds are as there."""
-    recording = oracle.recorded(scenario, 1e-4)
+    recording = recorded(scenario, 1e-4)
     last = recording.sequence.frame_count - 1
-    mean, _ = oracle.batch(recording, recording.track_ids).state(last)
+    mean, _ = BatchAtTruth(recording, recording.track_ids).state(last)
     assert np.abs(recording.error_of(last_answer(recording, marginals), last) - mean).max() < 1e-8
     assert np.abs(mean).max() > 1e-6, "there was something to agree on"
-    exact = oracle.recorded(scenario, 1e-7)
-    _, cov = oracle.batch(exact, exact.track_ids).state(last)
-    oracle.assert_covariances_agree(last_answer(exact, marginals).cov, cov, 1e-5)
+    exact = recorded(scenario, 1e-7)
+    _, cov = BatchAtTruth(exact, exact.track_ids).state(last)
+    assert_covariances_agree(last_answer(exact, marginals).cov, cov, 1e-5)
 
 
 @pytest.fixture(scope="module")
