@@ -30,6 +30,19 @@ def test_sightings_are_those_not_missing_in_all_four_coordinates(course: Course,
     np.testing.assert_array_equal(observations.uv_px[:2], [[400.0, 380.0, 201.0]] * 2)
 
 
+def test_features_of_zeros_are_unseen_and_counted(course: Course, tmp_path: Path) -> None:
+    """As of np.zeros that were never filled, in tracks that are never used too."""
+    unseen = (course["features"] == -1.0).all(axis=0)
+    features = np.where(unseen, 0.0, course["features"])
+    features = np.concatenate([features, np.zeros((4, 3, features.shape[2]))], axis=1)
+    zeros = load_sequence(str(written(tmp_path, {**course, "features": features})))
+    np.testing.assert_array_equal(
+        zeros.observations.uv_px, load_sequence(str(written(tmp_path, course))).observations.uv_px
+    )
+    count = int(unseen.sum()) + 3 * features.shape[2]
+    assert zeros.provenance.facts == (f"{count} features are 0 in every coordinate: unseen, as those that are -1",)
+
+
 def test_a_sighting_that_lacks_the_right_image_has_the_row_of_the_left_one(course: Course, tmp_path: Path) -> None:
     course["features"][2:, 0, 0] = -1.0
     course["features"][1, 0, 0] = 207.0

@@ -149,7 +149,11 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
         lambda d: (d / "times.txt").write_text("0.5\n" * FRAMES),
         "all 8 images have one and the",
     ),
-    ("names", lambda d: rename(d, lambda p: f"frame_{p.name}"), "image_0: frame_000000.png is no number; name"),
+    (
+        "names",
+        lambda d: rename(d, lambda p: f"{p.stem}_left{p.suffix}"),
+        "image_0: 000000_left.png has no number; name",
+    ),
     (
         "exchanged",
         lambda d: [(d / a).rename(d / b) for a, b in (("image_0", "x"), ("image_1", "image_0"), ("x", "image_1"))],
@@ -207,3 +211,9 @@ def test_the_real_beginning_of_06_is_found_from_images_alone(
     end, true = (np.linalg.norm(poses[-1, :3, 3]) for poses in (run.final.T_world_imu, truth.T_world_imu))
     # nearly all of the drift is a scale error of 1.6 %, which a stereo pair alone cannot see
     assert abs(end / true - 1.0) < 0.025
+
+
+def test_images_are_numbered_by_the_end_of_their_names_where_these_are_no_numbers(drive: Path) -> None:
+    before = load_sequence(str(drive)).observations.uv_px
+    rename(drive, lambda path: f"frame{path.name}")
+    np.testing.assert_array_equal(load_sequence(str(drive)).observations.uv_px, before)

@@ -210,3 +210,60 @@ def test_an_empty_cell_of_the_right_image_is_none(tmp_path: Path) -> None:
     (folder / "tracks.csv").write_text("\n".join([header, *lines]))
     uv_px = own_tables.load(folder).observations.uv_px
     np.testing.assert_array_equal(is_left_only(uv_px), np.arange(len(uv_px)) == 3)
+
+
+@pytest.mark.parametrize(
+    ("names", "stamp"),
+    [
+        (("acc_x", "acc_y", "acc_z", "gyro_x", "gyro_y", "gyro_z"), "timestamp [ns]"),
+        (("ax", "ay", "az", "wx", "wy", "wz"), "t_ns"),
+        (
+            (
+                "linear_acceleration.x",
+                "linear_acceleration.y",
+                "linear_acceleration.z",
+                "omega_x",
+                "omega_y",
+                "omega_z",
+            ),
+            "#ns",
+        ),
+    ],
+)
+def test_columns_of_an_imu_go_by_many_names(tmp_path: Path, names: tuple[str, ...], stamp: str) -> None:
+    original = recorded("imu")
+    folder = written(original, tmp_path / "own")
+    table = folder / "imu.csv"
+    table.write_text("\n".join([",".join([stamp, *names]), *table.read_text().splitlines()[1:]]) + "\n")
+    np.testing.assert_array_equal(own_tables.load(folder).motion.values, original.motion.values)
+    assert own_tables.read("own", folder / "tracks.csv", table, folder / "rig.toml").unused == ()
+
+
+@pytest.mark.parametrize("empty", ["", "nan"])
+def test_sensors_with_rows_of_their_own_are_joined_at_the_gyros_stamps(tmp_path: Path, empty: str) -> None:
+    original = recorded("imu")
+    folder = written(original, tmp_path / "own")
+    rows = [row.split(",") for row in (folder / "imu.csv").read_text().splitlines()]
+    apart = [rows[0]]
+    for t, *values in rows[1:]:
+        apart.append([t, *[empty] * 3, *values[3:]])
+        apart.append([str(int(t) + 2_000_000), *values[:3], *[empty] * 3])
+    (folder / "imu.csv").write_text("\n".join(",".join(row) for row in apart) + "\n")
+    read = own_tables.load(folder)
+    np.testing.assert_array_equal(read.motion.values[:, 3:], original.motion.values[1:, 3:])
+    accel = original.motion.values[:, :3]
+    np.testing.assert_allclose(read.motion.values[:, :3], 0.4 * accel[:-1] + 0.6 * accel[1:], atol=1e-2)
+    assert "samples of the accelerometer are interpolated at the" in read.provenance.facts[-1]
+
+
+@pytest.mark.parametrize("unseen", [0.0, -1.0])
+def test_rows_of_nothing_are_left_out_and_counted(unseen: float) -> None:
+    sequence = recorded("twist")
+    tables = tables_of(sequence)
+    tables["tracks"] = {
+        name: np.append(column, [column[0] if name == "t_ns" else 999 if name == "track_id" else unseen])
+        for name, column in tables["tracks"].items()
+    }
+    read = own_tables.read("own", **tables, rig=rig_of(sequence)).sequence
+    np.testing.assert_array_equal(read.observations.uv_px, sequence.observations.uv_px)
+    assert any(fact.startswith("1 rows of tracks are 0 or -1") for fact in read.provenance.facts)

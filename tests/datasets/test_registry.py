@@ -1,6 +1,7 @@
 """Finding the reader of a recording by its content, and saying what there is where none is found."""
 
 import errno
+import gzip
 import io
 import shutil
 import subprocess
@@ -89,3 +90,35 @@ def test_a_path_that_is_not_there_in_a_folder_that_cannot_be_listed_is_reported_
     monkeypatch.setattr(Path, "iterdir", refused)
     with pytest.raises(DataError, match=r"no such file or directory; check the path$"):
         load_sequence(tmp_path / "drive.npz")
+
+
+def test_a_recording_here_is_read_in_the_place_of_a_built_in_one_and_anything_else_is_told(
+    openvins: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive").mkdir()
+    built_in = load_sequence("drive")
+    assert built_in.provenance.facts[-1] == "what is called drive here is no recording and is not read"
+    (tmp_path / "drive").rmdir()
+    shutil.copytree(openvins, tmp_path / "drive")
+    here = load_sequence("drive")
+    assert here.content_hash() == load_sequence(str(openvins)).content_hash()
+    assert here.provenance.facts[-1].startswith("the recording here is read, and not the built-in sequence drive")
+
+
+def test_what_is_packed_is_told_how_to_unpack_and_is_read_then(course: dict[str, Any], tmp_path: Path) -> None:
+    folder = tmp_path / "packed"
+    folder.mkdir()
+    np.savez(folder / "run.npz", **course)
+    packed = folder / "run.npz.gz"
+    packed.write_bytes(gzip.compress((folder / "run.npz").read_bytes()))
+    (folder / "run.npz").unlink()
+    with pytest.raises(
+        DataError, match=r"unpack run.npz.gz with gunzip and remove what was packed"
+    ):
+        load_sequence(str(folder))
+    (folder / "run.npz").write_bytes(gzip.decompress(packed.read_bytes()))
+    packed.unlink()
+    with pytest.raises(DataError, match=r"is not a recording, but contains some: name run.npz in it"):
+        load_sequence(str(folder))
+    assert load_sequence(str(folder / "run.npz")).frame_count > 1

@@ -249,8 +249,12 @@ def test_images_outside_the_time_of_the_imu_are_reported(asl: Path) -> None:
 YAML = "mav0/cam{}/sensor.yaml"
 REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("folders exchanged", lambda d: exchange(d / "mav0/cam0/data", d / "mav0/cam1/data"), "images are exchanged"),
-    ("no right yaml", lambda d: (d / YAML.format(1)).unlink(), "cam1/sensor.yaml: cannot be read"),
-    ("no imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "imu0/sensor.yaml: cannot be read"),
+    (
+        "no right yaml",
+        lambda d: (d / YAML.format(1)).unlink(),
+        "mav0: missing cam1/sensor.yaml, and there is",
+    ),
+    ("no imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "mav0: missing imu0/sensor.yaml"),
     ("other model", lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
     ("other lens", lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
     ("no focal", lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
@@ -308,9 +312,10 @@ def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: 
     for camera in (0, 1):
         for path in reversed(images(asl, camera)):
             path.rename(path.with_stem(str(int(path.stem) + 7)))
-    assert load_sequence(str(asl)).provenance.facts[-1].startswith("0.0 % of the camera's stamps have both images")
+    simulated = "the tracks are simulated although 10 images lie in cam0: none of the 10 image pairs of the tables is"
+    assert load_sequence(str(asl)).provenance.facts[-1].startswith(simulated)
     (asl / "truth.tum").unlink()
-    with pytest.raises(DataError, match=r"no ground truth .* 0\.0 % of the camera's stamps have both images"):
+    with pytest.raises(DataError, match=r"no ground truth .* none of the 10 image pairs of the tables is there"):
         load_sequence(str(asl))
     with pytest.raises(DataError, match=r"none of the 10 image pairs .* is there, as 1403.*\.png in cam0/data"):
         load_sequence(str(asl), 0, Frontend(tracks="images"))
@@ -374,6 +379,110 @@ def test_a_camchain_that_is_of_no_use_says_why(asl: Path, old: str, new: str, co
     edit(asl / "camchain-imucam.yaml", old, new)
     with pytest.raises(DataError, match=complaint):
         load_sequence(str(asl))
+
+
+def camchain(root: Path, more: str = "", of_both: str = "") -> None:
+    """Put Kalibr's files in the place of sensor.yaml, with more of cam0, and of both cameras."""
+    T_left_imu = se3_inverse(load_sequence(str(root), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
+    T_right_left = _right_left(root)
+    kalibr(
+        root,
+        lambda c: (
+            of_both + more + as_rows("T_cam_imu", T_left_imu)
+            if c == 0
+            else of_both + as_rows("T_cn_cnm1", T_right_left)
+        ),
+    )
+
+
+@pytest.mark.parametrize(("shift_s", "frames"), [(0.0, 10), (0.0052, 9), (-0.0208, 9)])
+def test_the_time_shift_that_kalibr_found_is_applied_and_told(asl: Path, shift_s: float, frames: int) -> None:
+    """A frame at an end of the motion may fall out of it."""
+    before = load_sequence(str(asl)).frames_t_ns
+    camchain(asl, of_both=f"  timeshift_cam_imu: {shift_s}\n")
+    after = load_sequence(str(asl))
+    assert after.frame_count >= frames
+    assert np.isin(after.frames_t_ns - round(shift_s * 1e9), before).all()
+    told = [fact for fact in after.provenance.facts if "timeshift_cam_imu" in fact]
+    assert told == (
+        [f"{1e3 * shift_s:+.3f} ms are added to the stamps of images: timeshift_cam_imu in camchain-imucam.yaml"]
+        if shift_s
+        else []
+    )
+
+
+def test_a_time_shift_of_one_camera_alone_and_one_beyond_the_recording_are_told(asl: Path) -> None:
+    camchain(asl)
+    edit(asl / "camchain-imucam.yaml", "cam0:\n", "cam0:\n  timeshift_cam_imu: 0.004\n")
+    edit(asl / "camchain-imucam.yaml", "cam1:\n", "cam1:\n  timeshift_cam_imu: 0.009\n")
+    facts = load_sequence(str(asl)).provenance.facts
+    assert any("states another timeshift_cam_imu for cam1, +9.000 ms; cam0's is that of both" in fact for fact in facts)
+    edit(asl / "camchain-imucam.yaml", "0.004", "500.0")
+    with pytest.raises(DataError, match=r"timeshift_cam_imu, 500 s, is added to the images'"):
+        load_sequence(str(asl))
+
+
+def test_what_a_calibration_states_and_nobody_uses_is_named(asl: Path) -> None:
+    camchain(asl, more="  line_delay: 1.0e-5\n")
+    edit(
+        asl / "imu0.yaml",
+        "update_rate",
+        "T_i_b: [[1.0, 0.0], [0.0, 1.0]]\ntime_offset: 0.0\ngyro_skew: 0.1\nupdate_rate",
+    )
+    unused = [fact for fact in load_sequence(str(asl)).provenance.facts if fact.startswith("not used of")]
+    assert unused == [
+        "not used of camchain-imucam.yaml: cam0.line_delay",
+        f"not used of {asl.name}/imu0.yaml: gyro_skew",
+    ]
+    (asl / "imu0.yaml").unlink()
+    assert any("that of a MEMS unit in motion is assumed" in fact for fact in load_sequence(str(asl)).provenance.facts)
+
+
+OTHERS = {
+    "calibration.json": ('{"value0": {"T_imu_cam": []}}', "calibration.json of Basalt is not read"),
+    "stereo.yaml": ("body_T_cam0: 1", "stereo.yaml of VINS is not read"),
+    "orb.yaml": ("Camera1.fx: 50.0", "orb.yaml of ORB-SLAM3 is not read"),
+    "notes.yaml": ("author: me", "notes.yaml is not read"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_calibration_of_another_system_is_named_beside_what_is_read(asl: Path, name: str) -> None:
+    for sensor in ("cam0", "cam1", "imu0"):
+        (asl / "mav0" / sensor / "sensor.yaml").unlink()
+    content, words = OTHERS[name]
+    (asl / name).write_text(content)
+    with pytest.raises(DataError, match=rf"missing cam0/sensor.yaml, .*\*camchain\*.yaml.*; {re.escape(words)}; write"):
+        load_sequence(str(asl))
+
+
+def test_who_takes_the_tables_away_as_told_has_the_images_read(asl: Path) -> None:
+    """Tables that name images by rounded stamps, which is told where the tracks are simulated."""
+    for camera in (0, 1):
+        table = asl / f"mav0/cam{camera}/data.csv"
+        table.write_text(re.sub(r"(\d{15})\d{4}\.png", r"\g<1>0000.png", table.read_text()))
+        for path in images(asl, camera):
+            path.rename(path.with_stem(str(int(path.stem) // 10_000 * 10_000 + 5_584)))
+    assert "or none, where their names are stamps" in load_sequence(str(asl)).provenance.facts[-1]
+    for camera in (0, 1):
+        (asl / f"mav0/cam{camera}/data.csv").unlink()
+    assert load_sequence(str(asl)).frame_count == FRAMES
+
+
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "#timestamp [ns],wx, wy, wz, ax, ay, az",
+        "timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z",
+        "#t_ns,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z",
+        "%time,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
+        "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z",
+    ],
+)
+def test_an_imu_is_read_by_the_names_of_its_columns(asl: Path, heading: str) -> None:
+    before, table = load_sequence(str(asl)).motion.values, asl / "mav0/imu0/data.csv"
+    table.write_text("\n".join([heading, *table.read_text().splitlines()[1:]]) + "\n")
+    np.testing.assert_array_equal(load_sequence(str(asl)).motion.values, before)
 
 
 def _right_left(root: Path) -> Any:

@@ -300,7 +300,7 @@ def outside_motion(evidence: Evidence) -> Symptom | None:
         return None
     if sequence.frame_count - count < LEAST_FRAMES:
         frames_s, motion_s = (
-            f"{(t.min() - motion_t_ns.min()) / NS_PER_S:.6g} to {(t.max() - motion_t_ns.min()) / NS_PER_S:.6g} s"
+            f"{(t.min() - motion_t_ns.min()) / NS_PER_S:.3f} to {(t.max() - motion_t_ns.min()) / NS_PER_S:.3f} s"
             for t in (frames_t_ns, motion_t_ns)
         )
         return Symptom(

@@ -12,6 +12,7 @@ A package of another distribution is found where it is announced under the entry
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 from numbers import Real
@@ -193,9 +194,9 @@ def load_sequence(
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise DataError(f"{source}: seed is {seed!r}, expected a whole number from 0 on")
     source = str(source)
-    if source in built_ins():
+    if is_built_in(source):
         check_built_in(source, frontend)
-        return built_ins()[source](seed)
+        return _told_of_both(built_ins()[source](seed), source)
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
     _check_topics(source, reader, frontend)
@@ -212,7 +213,25 @@ def load_sequence(
             raise ExtensionError(f"{source}: load in {file} returned {type_of(sequence)}; it must return a Sequence")
         _check_types(sequence)
         check_stated(sequence)
-    return sequence
+    return _told_of_both(sequence, source)
+
+
+def is_built_in(source: str) -> bool:
+    """Say whether a source is a built-in sequence: by its name, unless a recording of that name is here."""
+    if source not in built_ins():
+        return False
+    path = Path(source)
+    return not (path.exists() and any(reader.recognises(path) for reader in _readers().values()))
+
+
+def _told_of_both(sequence: Sequence, source: str) -> Sequence:
+    """Return a sequence whose facts say what else is called as its source: a built-in one, or a file or folder here."""
+    if source not in built_ins() or not Path(source).exists():
+        return sequence
+    other = f"what is called {source} here is no recording and is not read"
+    if not is_built_in(source):
+        other = f"the recording here is read, and not the built-in sequence {source}; go elsewhere for that"
+    return replace(sequence, provenance=replace(sequence.provenance, facts=(*sequence.provenance.facts, other)))
 
 
 def check_built_in(source: str, frontend: Frontend) -> None:
@@ -287,7 +306,7 @@ def load_references(source: str) -> dict[str, Trajectory]:
 def _found_at(source: str) -> tuple[Path, RecordingFormat | None]:
     """Return the path of a source and the module that reads it, None of a built-in one; raise DataError where none."""
     path = Path(source).expanduser()
-    return path, None if source in built_ins() else _reader_of(path, source)
+    return path, None if is_built_in(source) else _reader_of(path, source)
 
 
 def _reader_of(path: Path, source: str) -> RecordingFormat:

@@ -16,7 +16,7 @@ import numpy as np
 
 from toolkit.datasets.io import bag_reader, ros_values
 from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Message, Topic, choose
-from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.fields import check_frame_count, joined_imu
 from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
 from toolkit.datasets.io.ros_values import Mounted, Recorded, mounted, recorded
 from toolkit.datasets.io.truth import truth_near, with_truth
@@ -105,7 +105,7 @@ def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress)
         camera = mounted(source, motion)
         truth, whose = _truth(source)
         unstamped = _spool_images(bag, chosen, spool, progress)
-    listed = pairs_of_asl(spool.folder)
+    listed = pairs_of_asl(spool.folder).shifted(camera.shift_s)
     within = listed.within(motion.t_ns)
     if not within.pairs:
         raise DataError(f"{path}: {_why_no_pairs(chosen, listed, motion)}")
@@ -246,17 +246,13 @@ def _joined(source: Recorded, gyro: tuple[Topic, IntArray, Array], accel: Topic)
     """Return the samples of a gyro with the accelerometer's, which has other stamps, interpolated at its own."""
     imu, gyro_t_ns, rates = gyro
     t_ns, values = _measured(source, accel, "acceleration")
-    order = np.argsort(t_ns, kind="stable")
-    t_ns, values = t_ns[order], values[order]
     T_gyro_accel = source.tree.between(source.frame_of(imu), source.frame_of(accel))
     values = values if T_gyro_accel is None else values @ T_gyro_accel[:3, :3].T
-    within = (gyro_t_ns >= t_ns[0]) & (gyro_t_ns <= t_ns[-1])
-    if not within.any():
+    joined = joined_imu((gyro_t_ns, rates), (t_ns, values))
+    if joined is None:
         raise DataError(f"{source.path}: {imu.name} and {accel.name} have no time in common; name {_NAME_ANOTHER}")
-    at_ns = gyro_t_ns[within]
-    at_gyro = np.stack([np.interp(at_ns - t_ns[0], t_ns - t_ns[0], column) for column in values.T], axis=1)
-    fact = f"{t_ns.size} samples of {accel.name} are interpolated at the {at_ns.size} of {imu.name}"
-    return ImuSamples(at_ns, at_gyro, rates[within]), (fact,)
+    fact = f"{t_ns.size} samples of {accel.name} are interpolated at the {joined.t_ns.size} of {imu.name}"
+    return joined, (fact,)
 
 
 def _messages_of(source: Recorded, topic: Topic) -> Sequence[Message]:

@@ -70,7 +70,7 @@ def load(path: Path) -> Sequence:
     if not isinstance(features, np.ndarray):
         nothing = np.empty(0, dtype=np.int64)
         return _sequence(parts, _rig(parts), Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,))
-    return _sequence(parts, _rig(parts), _sightings(parts, features), ())
+    return _sequence(parts, _rig(parts), *_sightings(parts, features))
 
 
 def uses_images(path: Path, tracks: Tracks) -> bool:
@@ -182,10 +182,11 @@ def _turned(fields: Fields) -> Iterator[str]:
         yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
-def _sightings(parts: _Parts, features: np.ndarray) -> Observations:
+def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple[str, ...]]:
+    """Return the sightings, and what to know of them."""
     sparse = sparse_array(parts.path, _FEATURES, features, (4, None, parts.t_ns.size), _NOT_SEEN)
-    frame, track, corners_px = corners_of(sparse)
-    return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px))
+    frame, track, corners_px, facts = corners_of(sparse)
+    return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px)), facts
 
 
 def _as_one_camera(parts: _Parts, corners_px: Array) -> Array:

@@ -48,13 +48,12 @@ def load(path: Path) -> Sequence:
         t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
         check_frame_count(path, t_ns.size)
         _check_features_named(path, archive.keys)
-        seen, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
+        seen, facts = _sightings(path, archive, t_ns.size)
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
     w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
     if "angular_velocity" in fields and "rotational_velocity" in fields:
         other = fields.array("rotational_velocity", 3, t_ns.size).T
         _check_alike(fields, "angular_velocity", w_radps, "rotational_velocity", other)
-    facts = () if has_features else (NO_FEATURES,)
     return Sequence(
         name=path.stem,
         rig=_rig(fields),
@@ -90,9 +89,10 @@ def _check_alike(fields: Fields, one: str, of_one: Array, other: str, of_other: 
         raise DataError(f"{fields.path}: it has both {one} and {other}, and they differ: delete the one that is wrong")
 
 
-def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> Observations:
+def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> tuple[Observations, tuple[str, ...]]:
+    """Return the sightings, and what to know of them."""
     if "features" not in archive.keys:
         nothing = np.empty(0, dtype=np.int64)
-        return Observations(nothing, nothing, np.empty((0, 3)))
-    features = archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN)
-    return rectified_observations(path, *corners_of(features))
+        return Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,)
+    frame, track, corners_px, facts = corners_of(archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN))
+    return rectified_observations(path, frame, track, corners_px), facts

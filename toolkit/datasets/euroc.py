@@ -26,6 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import (
+    Listed,
     check_both_cameras,
     check_one_clock,
     check_one_trigger,
@@ -36,6 +37,7 @@ from toolkit.datasets.io.image_pairs import (
 )
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
+from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified
@@ -56,7 +58,6 @@ SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 ALL_SIMULATED = "simulated IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
-_KALIBR_IMU = tuple(f"{name}_{axis}" for name in ("alpha", "omega") for axis in "xyz")
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
 # With fewer of its images a recording is cut short or a sample: tracks from them would be of another recording.
 _NEARLY_ALL = 0.9
@@ -132,7 +133,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         *seen.facts,
         *remarks,
         *(() if choice is None else (choice.reason,)),
-        *(calibration.source, calibration.noise_source),
+        *(calibration.source, calibration.noise_source, *calibration.shifted, *calibration.unused),
     )
     simulated = is_simulated(layout.root)
     sequence = Sequence(
@@ -174,7 +175,10 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         provenance=Provenance(
             "euroc",
             f"{path}: {ALL_SIMULATED if is_simulated(layout.root) else SIMULATED}, seed {seed}",
-            (_how_simulated(layout), choice.reason, calibration.source, calibration.noise_source, *_few_images(layout)),
+            (
+                *(_how_simulated(layout), choice.reason, calibration.source, calibration.noise_source),
+                *(*calibration.unused, *_few_images(layout)),
+            ),
         ),
         truth=truth,
     )
@@ -193,7 +197,7 @@ def _imu(layout: _Layout) -> ImuSamples:
             f"{layout.imu}: cannot be read, and there is no imu0.csv of Kalibr's: name the folder that has mav0, or "
             "rectify images without an IMU and lay them out as KITTI's image_0, image_1 and calib.txt"
         )
-    columns = _KALIBR_IMU if _KALIBR_IMU[0] in columns_of(layout.imu) else _ACCEL + _GYRO
+    columns = imu_columns(columns_of(layout.imu)) or _ACCEL + _GYRO
     table = read_table(layout.imu, columns)
     return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
 
@@ -204,8 +208,12 @@ def _few_images(layout: _Layout) -> Iterator[str]:
         return
     share = _share_with_images(layout.mav0, layout.stamps)
     if share < _NEARLY_ALL:
-        what = "uses those there are" if share > 0.0 else "says why"
-        yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images {what}"
+        if share > 0.0:
+            yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images uses those there are"
+            return
+        count = len(images_in(image_folder(layout.mav0 / "cam0")))
+        lacking = _no_pair_is_there(layout.mav0, pairs_of_asl(layout.mav0))
+        yield f"the tracks are simulated although {count} images lie in cam0: {lacking}"
 
 
 def _with_images(layout: _Layout) -> Path:
@@ -226,17 +234,27 @@ def _filmed(
     check_one_trigger(mav0, named)
     listed = named.existing(_NEARLY_ALL)
     if named.pairs and not listed.pairs:
-        first = named.pairs[0].left
-        raise DataError(
-            f"{mav0}: none of the {len(named.pairs)} image pairs of the tables is there, as {first.name} in "
-            f"{first.parent.relative_to(mav0)}; take these images' own data.csv, or none, where their names are stamps"
-        )
+        raise DataError(f"{mav0}: {_no_pair_is_there(mav0, named)}")
     check_frame_count(layout.root, len(listed.pairs))
-    check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, "the samples of the IMU")
+    listed = listed.shifted(calibration.shift_s)
+    shifted = f" (timeshift_cam_imu, {calibration.shift_s:g} s, is added to the images')" if calibration.shift_s else ""
+    samples = f"the samples of the IMU{shifted}"
+    check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, samples)
     within = listed.within(imu.t_ns)
     check_frame_count(layout.root, len(within.pairs))
     rig = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
     return ImageRecording(within.pairs, rig), within.remarks
+
+
+def _no_pair_is_there(mav0: Path, named: Listed) -> str:
+    """Return what is wrong with tables none of whose images is there, and what to do."""
+    if not named.pairs:
+        return "no image of cam0 has one of cam1 by its name or its table; write cam0/data.csv and cam1/data.csv"
+    first = named.pairs[0].left
+    return (
+        f"none of the {len(named.pairs)} image pairs of the tables is there, as {first.name} in "
+        f"{first.parent.relative_to(mav0)}; take these images' own data.csv, or none, where their names are stamps"
+    )
 
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:

@@ -37,6 +37,7 @@ from toolkit.datasets.io.image_pairs import (
     image_size,
     images_in,
     images_only,
+    numbered,
     pairs_by_name,
     pairs_by_stamps,
     pinhole_of,
@@ -251,7 +252,7 @@ def _listed_by_number(layout: _Layout) -> Listed:
         numbers = _numbers(layout)
         if not numbers:
             name = images_in(layout.left)[0].name
-            raise DataError(f"{layout.left}: {name} is no number; name the images of an instant alike, as 000000.png")
+            raise DataError(f"{layout.left}: {name} has no number; name the images of an instant alike, as 000000.png")
         raise DataError(
             f"{layout.root}: no image has a stamp: they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has "
             f"{stamps.size}, from number 0 on; cut both or neither"
@@ -280,7 +281,7 @@ def _seconds(file: Path, number: int, line: str) -> float:
 
 def _numbers(layout: _Layout) -> list[int]:
     """Return the numbers of the left images, in order."""
-    return sorted(int(path.stem) for path in images_in(layout.left) if path.stem.isdecimal())
+    return sorted(numbered(layout.left))
 
 
 def _count(layout: _Layout) -> int:

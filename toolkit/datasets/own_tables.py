@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from toolkit.datasets import vislam_recording
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, joined_imu, observations
 from toolkit.datasets.io.tables import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file, find_table
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
+from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, did_you_mean
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -38,6 +39,9 @@ _NOISE = "noise"
 _IMU_NOISE = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
 _TWIST_NOISE = ("velocity_noise_density", "gyro_noise_density", "gyro_random_walk")
 _FILES = ("tracks.csv", ("imu.csv", "twist.csv"), "rig.toml", "truth.tum")
+
+# From this share of rows on that have one sensor's values only, each has rows of its own.
+_MOST_APART = 0.5
 
 Table = str | PathLike[str] | Mapping[str, Any]
 
@@ -87,9 +91,9 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     """Return the recording that tables describe, as :func:`save` takes them; raises DataError as it does."""
     sightings, measured = _columns("tracks", tracks), _columns("motion", motion)
     place, calibration = _calibration(rig)
-    frames_t_ns, observations = _observations(sightings)
-    samples, noise = _motion(measured, place, calibration.get(_NOISE, {}))
-    facts = () if _has_two_rows(sightings) else (ONE_ROW_FOR_BOTH,)
+    frames_t_ns, observations, unseen = _observations(sightings)
+    samples, noise, joined = _motion(measured, place, calibration.get(_NOISE, {}))
+    facts = (*(() if _has_two_rows(sightings) else (ONE_ROW_FOR_BOTH,)), *unseen, *joined)
     sequence = Sequence(
         name=name,
         rig=_rig(place, calibration, 2 if TWO_ROWS[0] in sightings.values else 1),
@@ -102,7 +106,9 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     )
     if truth is not None:
         sequence = with_truth(sequence, _truth(truth))
-    return Read(sequence, (*_unused(sightings, (*TRACKS, *ONE_ROW, *TWO_ROWS)), *_unused(measured, (*IMU, *TWIST))))
+    return Read(
+        sequence, (*_unused(sightings, (*TRACKS, *ONE_ROW, *TWO_ROWS)), *_unused(measured, (*_imu(measured), *TWIST)))
+    )
 
 
 def _columns(what: str, given: Table) -> Columns:
@@ -117,8 +123,8 @@ def _has_two_rows(table: Columns) -> bool:
     return any(name in table.values for name in TWO_ROWS)
 
 
-def _observations(table: Columns) -> tuple[IntArray, Observations]:
-    """Return the stamps of the frames (K,) and the sightings in them."""
+def _observations(table: Columns) -> tuple[IntArray, Observations, tuple[str, ...]]:
+    """Return the stamps of the frames (K,), the sightings in them, and what to know of rows that are none."""
     rows = TWO_ROWS if _has_two_rows(table) else ONE_ROW
     table.require("|".join(_STAMPS), *TRACKS, *rows)
     frames_t_ns, frame = np.unique(table.stamps(), return_inverse=True)
@@ -138,7 +144,11 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
     if twice.size:
         row = int(order[twice[0] + 1])
         raise DataError(f"{table.what}: {table.at(row)}: track {track_id[row]} is there twice in its frame; remove one")
-    return frames_t_ns, observations(frame, track_id, corners_px)
+    # As -1 or 0 in every coordinate a sighting is written that is none.
+    seen = ~((corners_px == corners_px[:, :1]).all(axis=1) & (corners_px[:, 0] <= 0.0))
+    count = int((~seen).sum())
+    facts = (f"{count} rows of {table.what} are 0 or -1 in every coordinate: unseen, and left out",) if count else ()
+    return frames_t_ns, observations(frame[seen], track_id[seen], corners_px[seen]), facts
 
 
 def _is_filler(left_px: Array, right_px: Array) -> BoolArray:
@@ -150,26 +160,55 @@ def _is_filler(left_px: Array, right_px: Array) -> BoolArray:
     return np.asarray((u_right == v_right) & (u_right <= 0.0) & (left_px[:, 0] != u_right))
 
 
-def _motion(table: Columns, place: Path, noise: Mapping[str, Any]) -> tuple[MotionSamples, MotionNoise]:
-    """Return the samples, of an IMU or of body twists, as the columns say."""
-    of_twist, of_imu = (len(set(columns) & set(table.names)) for columns in (TWIST, IMU))
+def _motion(
+    table: Columns, place: Path, noise: Mapping[str, Any]
+) -> tuple[MotionSamples, MotionNoise, tuple[str, ...]]:
+    """Return the samples, of an IMU or of body twists, as the columns say, their noise, and what to know of them."""
+    imu = _imu(table)
+    of_twist, of_imu = (len(set(columns) & set(table.names)) for columns in (TWIST, imu))
     if of_twist == of_imu:
         lacks = f"{', '.join(IMU)} of an IMU, or {', '.join(TWIST)} of a twist"
         raise DataError(f"{table.what}: missing column {lacks}; it has {', '.join(table.names)}")
     is_twist = of_twist > of_imu
-    columns, known = (TWIST, _TWIST_NOISE) if is_twist else (IMU, _IMU_NOISE)
+    columns, known = (TWIST, _TWIST_NOISE) if is_twist else (imu, _IMU_NOISE)
     table.require("|".join(_STAMPS), *columns)
-    t_ns, values = table.stamps(), table.numbers(*columns)
     _check_known(place, f"{_NOISE}.", noise, known)
+    t_ns = table.stamps()
     if is_twist:
-        return TwistSamples(t_ns, values[:, :3], values[:, 3:]), _twist_noise(place, t_ns, values, noise)
+        values = table.numbers(*columns)
+        return TwistSamples(t_ns, values[:, :3], values[:, 3:]), _twist_noise(place, t_ns, values, noise), ()
     missing = [key for key in known if key not in noise]
     if missing:
         raise DataError(
             f"{place}: missing {', '.join(f'{_NOISE}.{key}' for key in missing)}; an IMU's data sheet has them"
         )
     fields = _fields(place, noise)
-    return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**{key: fields.positive(key) for key in known})
+    samples, facts = _imu_samples(table, t_ns, columns)
+    return samples, ImuNoise(**{key: fields.positive(key) for key in known}), facts
+
+
+def _imu(table: Columns) -> tuple[str, ...]:
+    """Return the columns of an IMU by the names they have here."""
+    of_twist = set(table.names) >= set(TWIST)
+    return IMU if of_twist else imu_columns(table.names) or IMU
+
+
+def _imu_samples(table: Columns, t_ns: IntArray, columns: tuple[str, ...]) -> tuple[ImuSamples, tuple[str, ...]]:
+    """Return the samples of an IMU; where both sensors have rows of their own, at the gyro's stamps."""
+    values = table.numbers_or_none(*columns)
+    of_accel, of_gyro = (np.isfinite(values[:, part]).all(axis=1) for part in (slice(0, 3), slice(3, 6)))
+    empty = np.isnan(values[:, :3]).all(axis=1) | np.isnan(values[:, 3:]).all(axis=1)
+    apart = (of_accel ^ of_gyro) & empty
+    if apart.sum() < _MOST_APART * len(values) or not (of_accel.sum() > 1 and of_gyro.any()):
+        values = table.numbers(*columns)  # names what is empty
+        return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ()
+    joined = joined_imu((t_ns[of_gyro], values[of_gyro, 3:]), (t_ns[of_accel], values[of_accel, :3]))
+    if joined is None:
+        raise DataError(f"{table.what}: accelerometer and gyro have no time in common; correct the stamps of one")
+    counts = (
+        f"{int(of_accel.sum())} samples of the accelerometer are interpolated at the {joined.t_ns.size} of the gyro"
+    )
+    return joined, (f"{counts}: each has rows of its own",)
 
 
 def _twist_noise(place: Path, t_ns: IntArray, values: Array, noise: Mapping[str, Any]) -> TwistNoise:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
+from toolkit.datasets import is_built_in, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories.covariances import CovConvention
 from toolkit.errors import DataError
 from toolkit.estimator import Build
@@ -255,7 +255,7 @@ def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) ->
 
 def located(source: str | Recorded) -> str | Recorded:
     """Return a path as an absolute path, anything else unchanged."""
-    if isinstance(source, Recorded) or source in built_ins():
+    if isinstance(source, Recorded) or is_built_in(source):
         return source
     return str(Path(source).expanduser().absolute())
 

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from toolkit.answers import Output, Run, Status
-from toolkit.datasets import built_ins
+from toolkit.datasets import is_built_in
 from toolkit.errors import EstimatorError, VislamError
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import (
@@ -64,7 +64,7 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
 
 def located(source: str) -> str:
     """Return the absolute path of a source (:func:`place_of`); a built-in name, or a path to nothing, unchanged."""
-    place = None if source in built_ins() else place_of(source)
+    place = None if is_built_in(source) else place_of(source)
     return source if place is None else str(place.absolute())
 
 

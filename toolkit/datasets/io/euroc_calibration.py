@@ -13,16 +13,21 @@ filter on V1_01_easy is 25. So every recording's white densities are multiplied 
 ends of those ranges; the walks stay as stated. A simulated IMU errs as it states.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from toolkit.datasets.io.fields import Fields, read_fields, rigid
 from toolkit.errors import DataError, printable
+from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import ImuNoise, StereoRig
+from toolkit.models.noise import mems_imu
 from toolkit.simulation.filming import is_simulated
 from toolkit.simulation.scenarios import stereo_cov_px2
 
@@ -63,6 +68,21 @@ _LENSES: dict[str, tuple[Distortion, tuple[int, ...]]] = {
     **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4"), ("equidistant", (4,))),
     "none": ("none", ()),
 }
+NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
+_SHIFT, _SAME_SHIFT_S = "timeshift_cam_imu", 1e-3
+_USED = {
+    *("T_BS", "T_cam_imu", "T_cn_cnm1", "camera_model", "distortion_model", "distortion_coefficients"),
+    *("distortion_coeffs", "intrinsics", "resolution", _SHIFT, *_DENSITIES.values()),
+}
+_OF_NO_EFFECT = {"rostopic", "cam_overlaps", "comment", "sensor_type", "rate_hz", "update_rate", "model"}
+# Whose calibration a file is, by names in it, and how much of it is looked at; files that are named.
+_SYSTEMS = {
+    "Basalt": (b'"T_imu_cam"', b'"value0"'),
+    "VINS": (b"body_T_cam0", b"cam0_calib"),
+    "ORB-SLAM3": (b"Camera1.fx", b"Camera.fx", b"ORBextractor"),
+    "OpenVINS": (b"relative_config_imucam",),
+}
+_LOOKED_AT, _NAMED, _KINDS = 1 << 16, 3, ("*.yaml", "*.yml", "*.json")
 _COEFFICIENTS = "distortion_coefficients|distortion_coeffs"
 
 
@@ -71,7 +91,8 @@ class AslCalibration:
     """The rig of simulated tracks, the image size, the IMU's noise, and where all this is from.
 
     ``cameras`` are those of real images, None where they are not known; ``T_right_left`` (4, 4) takes coordinates of
-    the left one to the right one, ``T_imu_left`` to the IMU.
+    the left one to the right one, ``T_imu_left`` to the IMU. ``shift_s`` is added to stamps of images, and ``shifted``
+    says so; ``unused`` says which keys of the files are not used.
     """
 
     rig: StereoRig
@@ -82,6 +103,9 @@ class AslCalibration:
     T_imu_left: Array
     T_right_left: Array
     cameras: tuple[Camera, Camera] | None = None
+    shift_s: float = 0.0
+    shifted: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
 
 def published() -> AslCalibration:
@@ -105,38 +129,105 @@ def read_calibration(root: Path, mav0: Path) -> AslCalibration:
     Extrinsics are made relative to the IMU. Raises DataError where a file is missing, damaged or incomplete, or the
     right camera is not right of the left one.
     """
-    chain = next((path for path in _chains(root, mav0)), None)
-    return _of_sensor_files(mav0, is_simulated(root)) if chain is None else _of_kalibr(chain, root, mav0)
+    camchain = next((path for path in _chains(root, mav0)), None)
+    return _of_sensor_files(mav0, is_simulated(root)) if camchain is None else _of_kalibr(camchain, root, mav0)
 
 
 def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
     if (mav0 / "cam0").is_dir() and not (mav0 / "cam1").is_dir():
         raise DataError(f"{mav0 / 'cam1/sensor.yaml'}: cannot be read: there is cam0 and no cam1; stereo needs both")
-    left, right, imu = (read_fields(mav0 / sensor / "sensor.yaml") for sensor in ("cam0", "cam1", "imu0"))
+    files = [mav0 / sensor / "sensor.yaml" for sensor in ("cam0", "cam1", "imu0")]
+    lacking = [file for file in files if not is_regular(file)]
+    if lacking:
+        raise DataError(_no_calibration(mav0, lacking))
+    left, right, imu = map(read_fields, files)
     left.require("T_BS.data", "intrinsics", "resolution")
     stated = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
     _check_right(right.path, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
     noise = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
-    return _calibration(left, right, (T_imu_left, T_left_right), noise, "the folder's sensor.yaml files")
+    found = _calibration(left, right, (T_imu_left, T_left_right), noise, "the folder's sensor.yaml files")
+    return replace(found, unused=tuple(chain.from_iterable(map(_unused, (left, right, imu)))))
 
 
-def _of_kalibr(chain: Path, root: Path, mav0: Path) -> AslCalibration:
+def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
+    """Return the message for a folder without calibration: what was looked for, and what lies there instead."""
+    missing = ", ".join(str(file.relative_to(mav0)) for file in lacking)
+    there = [
+        file for folder in (mav0.parent, mav0) for kind in ("*.yaml", "*.yml", "*.json") for file in folder.glob(kind)
+    ]
+    others = [f"{printable(file.name)}{_of_system(file)} is not read" for file in sorted(set(there))[:_NAMED]]
+    return (
+        f"{mav0}: missing {missing}, and there is no *camchain*.yaml of Kalibr's that states it{'; ' if others else ''}"
+        f"{', '.join(others)}; write the calibration as docs/images.md describes"
+    )
+
+
+def _of_system(file: Path) -> str:
+    """Return whose calibration a file is, by the names in it; empty where none is known."""
+    with open_input(file) as opened:
+        content = opened.read(_LOOKED_AT)
+    return next((f" of {system}" for system, names in _SYSTEMS.items() if any(n in content for n in names)), "")
+
+
+def _unused(sensor: Fields, name: str = "") -> Iterator[str]:
+    """Yield a remark on keys of a sensor that state something which is not used: more than zeros or the identity."""
+    known = _USED | _OF_NO_EFFECT
+    others = {
+        key.partition(".")[0]: array for key, array in sensor.arrays.items() if key.partition(".")[0] not in known
+    }
+    states = [key for key, array in others.items() if not _is_nothing(array)]
+    if states:
+        prefix = f"{name}." if name else ""
+        where = sensor.path.name if name else f"{sensor.path.parent.name}/{sensor.path.name}"
+        yield f"not used of {where}: {', '.join(prefix + printable(key) for key in states)}"
+
+
+def _is_nothing(array: npt.NDArray[np.generic]) -> bool:
+    if array.dtype.kind not in "fiu":
+        return False
+    return not array.any() or (array.ndim == 2 and np.array_equal(array, np.eye(len(array))))
+
+
+def _shift(left: Fields, right: Fields) -> tuple[float, tuple[str, ...]]:
+    """Return the time from the cameras' clock to the IMU's that Kalibr states, and what to know of it."""
+    stated = [side.number(_SHIFT) if _SHIFT in side else None for side in (left, right)]
+    shift_s = next((one for one in stated if one is not None), 0.0)
+    remarks = []
+    if shift_s:
+        remarks.append(f"{1e3 * shift_s:+.3f} ms are added to the stamps of images: {_SHIFT} in {left.path.name}")
+    if None not in stated and abs(float(stated[1] or 0.0) - shift_s) > _SAME_SHIFT_S:
+        other = f"{1e3 * float(stated[1] or 0.0):+.3f} ms"
+        remarks.append(f"{left.path.name} states another {_SHIFT} for cam1, {other}; cam0's is that of both")
+    return shift_s, tuple(remarks)
+
+
+def _of_kalibr(camchain: Path, root: Path, mav0: Path) -> AslCalibration:
     """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
-    fields = read_fields(chain)
+    fields = read_fields(camchain)
     _check_camchain(fields)
     left, right = (_part(fields, name) for name in ("cam0", "cam1"))
     T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
     mounted = "T_cam_imu" in right
     T_right_left = right.rigid("T_cam_imu") @ T_imu_left if mounted else right.rigid("T_cn_cnm1")
-    imu = next((path for folder in (chain.parent, root, mav0) for path in sorted(folder.glob("imu*.yaml"))), None)
-    noise = _stated_noise(
-        read_fields(mav0 / "imu0/sensor.yaml" if imu is None else imu), "" if imu is None else "imu0."
-    )
+    noise, unused = _noise_beside(camchain, root, mav0)
     T_left_right = se3_inverse(T_right_left)
-    _check_right(chain, T_left_right, None)
-    return _calibration(left, right, (T_imu_left, T_left_right), (noise, _AS_STATED), str(chain.relative_to(root)))
+    _check_right(camchain, T_left_right, None)
+    found = _calibration(left, right, (T_imu_left, T_left_right), noise, str(camchain.relative_to(root)))
+    return replace(found, unused=(*_unused(left, "cam0"), *_unused(right, "cam1"), *unused))
+
+
+def _noise_beside(camchain: Path, root: Path, mav0: Path) -> tuple[tuple[ImuNoise, str], tuple[str, ...]]:
+    """Return the noise of Kalibr's IMU file or of sensor.yaml with its source, else a MEMS unit's, and unused keys."""
+    kalibrs = [(path, "imu0.") for folder in (camchain.parent, root, mav0) for path in sorted(folder.glob("imu*.yaml"))]
+    files = [*kalibrs, *(((mav0 / "imu0/sensor.yaml"), "") for _ in range(is_regular(mav0 / "imu0/sensor.yaml")))]
+    if not files:
+        return (mems_imu(), NO_NOISE), ()
+    fields, prefix = read_fields(files[0][0]), files[0][1]
+    nested = any(key.startswith(prefix) for key in fields.arrays) if prefix else False
+    inner = _part(fields, "imu0") if nested else fields
+    return (_stated_noise(fields, prefix), _AS_STATED), tuple(_unused(inner, "imu0" if nested else ""))
 
 
 def _check_camchain(fields: Fields) -> None:
@@ -203,11 +294,14 @@ def _calibration(
     rig = _simulated_rig(_pinhole_of(left), float(np.linalg.norm(T_left_right[:3, 3])), T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
     cameras = (_camera_of(left), _camera_of(right)) if whole else None
+    shift_s, shifted = _shift(left, right)
     return AslCalibration(
         *(rig, (int(width_px), int(height_px)), noise[0], f"calibration from {source}", noise[1]),
         T_imu_left=T_imu_left,
         T_right_left=se3_inverse(T_left_right),
         cameras=cameras,
+        shift_s=shift_s,
+        shifted=shifted,
     )
 
 

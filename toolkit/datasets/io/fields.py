@@ -21,6 +21,7 @@ from toolkit.errors import DataError, printable
 from toolkit.files.reading import read_text_input
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
+from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations
 
 # How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.
@@ -262,6 +263,21 @@ def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:
     steps = np.diff(np.unique(t_ns))
     step = float(np.median(steps)) if steps.size else np.inf
     return next((name for below, name in _UNITS_OF_NS if step < below), None)
+
+
+def joined_imu(gyro: tuple[IntArray, Array], accel: tuple[IntArray, Array]) -> ImuSamples | None:
+    """Return samples of a gyro with those of an accelerometer, which has other stamps, interpolated at its own.
+
+    Both are stamps (N,) ns and values (N, 3). None where they have no time in common.
+    """
+    order = np.argsort(accel[0], kind="stable")
+    t_ns, values = accel[0][order], accel[1][order]
+    within = (gyro[0] >= t_ns[0]) & (gyro[0] <= t_ns[-1])
+    if not within.any():
+        return None
+    at_ns = gyro[0][within]
+    at_gyro = np.stack([np.interp(at_ns - t_ns[0], t_ns - t_ns[0], column) for column in values.T], axis=1)
+    return ImuSamples(at_ns, at_gyro, gyro[1][within])
 
 
 def check_rows(path: Path, corners_px: Array) -> None:

@@ -3,6 +3,7 @@
 Checks before any image is read: both cameras are there, stamps differ, and they lie in the motion's time.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import ImageRecording, ImageTracks, Pinhole, RectifiedPair, StampedPair, size_of
 from toolkit.geometry import Array, IntArray
-from toolkit.measurements import StereoRig
+from toolkit.measurements import NS_PER_S, StereoRig
 from toolkit.models.noise import pixel_covariance
 from toolkit.progress import Progress
 from toolkit.sequence import Observations
@@ -26,6 +27,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 UNPACK_IMAGES = f"unpack them there ({', '.join(SUFFIXES)} are read)"
 # Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
 _SAME_INSTANT_NS = 1_000_000
+# A name that ends in a number, as frame000123.
+_NUMBER = re.compile(r"(.*\D)(\d+)")
 # Pairs left out that are listed by name, and images that are opened to find the size of all.
 _NAMED, _OPENED = 10, 10
 
@@ -52,6 +55,11 @@ class Listed:
             return self
         remark = f"{len(self.pairs) - len(pairs)} of {len(self.pairs)} image pairs lack a file and are left out"
         return replace(self, pairs=pairs, remarks=(*self.remarks, remark))
+
+    def shifted(self, shift_s: float) -> "Listed":
+        """Return the pairs with a time added to their stamps: that from the cameras' clock to the motion's."""
+        shift_ns = round(shift_s * NS_PER_S)
+        return replace(self, pairs=tuple(replace(pair, t_ns=pair.t_ns + shift_ns) for pair in self.pairs))
 
     def within(self, motion_t_ns: IntArray) -> "Listed":
         """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out."""
@@ -123,7 +131,7 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said. Either
     camera may write its numbers with other leading zeros or another suffix.
     """
-    lefts, rights = _numbered(left), _numbered(right)
+    lefts, rights = numbered(left), numbered(right)
     numbers = lefts.keys() | rights.keys()
     stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
     remarks = []
@@ -153,7 +161,7 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     in_order = all((np.diff([stamps[n] for n in sorted(stamps)]) > 0).all() for stamps in (t_ns, right_t_ns))
     if not in_order or all(number == other for number, other in partner.items()):
         return pairs_by_name(left, right, t_ns)
-    lefts, rights = _numbered(left), _numbered(right)
+    lefts, rights = numbered(left), numbered(right)
     paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
     remarks = ["the cameras' images are numbered differently and paired by their stamps"]
     if len(paired) < len(lefts):
@@ -162,9 +170,14 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     return Listed(pairs, len(lefts), tuple(remarks))
 
 
-def _numbered(folder: Path) -> dict[int, Path]:
-    """Return the images of a folder whose names are numbers, by number."""
-    return {int(path.stem): path for path in images_in(folder) if path.stem.isdecimal()}
+def numbered(folder: Path) -> dict[int, Path]:
+    """Return the images of a folder by the numbers that are their names, or stand at the end of all of them."""
+    images = images_in(folder)
+    plain = {int(path.stem): path for path in images if path.stem.isdecimal()}
+    ends = [_NUMBER.fullmatch(path.stem) for path in images]
+    if plain or None in ends or len({end[1] for end in ends if end}) != 1:
+        return plain
+    return {int(end[2]): path for end, path in zip(ends, images, strict=True) if end}
 
 
 def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:

@@ -119,8 +119,17 @@ def _sparse(what: str, layout: _Layout, chunks: Iterator[npt.NDArray[Any]], fill
     return SparseArray(layout.shape, indices, value)
 
 
-def corners_of(features: SparseArray) -> tuple[IntArray, IntArray, Array]:
-    """Return frame (N,), track (N,) and uL, vL, uR, vR (N, 4) px of features (4, M, T).
+class Corners(NamedTuple):
+    """Frame (N,), track (N,) and uL, vL, uR, vR (N, 4) px of sightings, and what to know of those that are none."""
+
+    frame: IntArray
+    track: IntArray
+    corners_px: Array
+    facts: tuple[str, ...]
+
+
+def corners_of(features: SparseArray) -> Corners:
+    """Return the sightings of features (4, M, T), without those that are 0 in every coordinate, as none is.
 
     A sighting that lacks a coordinate has NaN there: both of the right image, or one, for the audit to find.
     """
@@ -129,7 +138,10 @@ def corners_of(features: SparseArray) -> tuple[IntArray, IntArray, Array]:
     cell, row = np.unique(frame * tracks + track, return_inverse=True)
     corners_px: Array = np.full((cell.size, 4), np.nan)
     corners_px[row, coordinate] = features.value
-    return cell // tracks, cell % tracks, corners_px
+    seen = corners_px.any(axis=1)  # NaN is something
+    unseen = int((~seen).sum())
+    facts = (f"{unseen} features are 0 in every coordinate: unseen, as those that are -1",) if unseen else ()
+    return Corners(cell[seen] // tracks, cell[seen] % tracks, corners_px[seen], facts)
 
 
 # Archives -----------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from toolkit.datasets.io.bag_reader import (
     Message,
     Topic,
 )
-from toolkit.datasets.io.euroc_calibration import kalibr_noise, lens_of, read_calibration
+from toolkit.datasets.io.euroc_calibration import NO_NOISE, kalibr_noise, lens_of, read_calibration
 from toolkit.datasets.io.fields import camera_matrix
 from toolkit.datasets.io.image_pairs import pinhole_of
 from toolkit.errors import DataError, printable
@@ -74,7 +74,6 @@ _COLOURS |= {
 }
 _PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
 Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-_NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is assumed (noise.motion_scale scales it)"
 _STATED = "the noise of the IMU is as its file states it"
 _PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
 
@@ -262,7 +261,8 @@ class Tree:
 class Mounted:
     """The pair of cameras, where the left one stands on the body, the motion's noise, and where all this is from.
 
-    ``as_they_are`` is the pair that images make which come rectified already, where that is possible.
+    ``as_they_are`` is the pair that images make which come rectified already, where that is possible; ``shift_s`` is
+    added to the stamps of images.
     """
 
     pair: RectifiedPair
@@ -270,6 +270,7 @@ class Mounted:
     noise: MotionNoise
     facts: tuple[str, ...]
     as_they_are: RectifiedPair | None = None
+    shift_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,15 +346,16 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
         if calibration.cameras is None:
             raise DataError(f"{mav0}: the calibration lacks distortion_model or intrinsics of a camera; add them")
         pair = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
-        notes = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
-        return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes)
+        noise = () if twist else (calibration.noise_source,)
+        notes = (f"{calibration.source}, beside the bag", *noise, *calibration.shifted, *calibration.unused)
+        return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes, shift_s=calibration.shift_s)
     T_imu_left, left = source.T_imu_left, source.frame_of(source.chosen.left)
     # An IMU does not have the axes of a camera: if both name the same frame, the name is wrong for one of them.
     if T_imu_left is None or (source.chosen.imu is not None and source.body == left):
         raise DataError(_not_joined(source))
     pair, as_they_are, how = _pair(source)
     stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
-    noise = () if twist else (_NO_NOISE if stated is None else _STATED,)
+    noise = () if twist else (NO_NOISE if stated is None else _STATED,)
     tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
     notes = (f"calibration from {how} and {tf}", *noise)
     return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.trajectories.headings import stamp_unit_ns
 from toolkit.errors import DataError, nearest, printable
 from toolkit.files.reading import GZIP_MAGIC, is_regular, open_input, read_text_input, read_unzipped
 from toolkit.geometry import Array, IntArray
@@ -251,7 +252,7 @@ def columns_of_file(path: Path) -> Columns:
     separator = max(_SEPARATORS, key=heading.count)
     if separator not in heading and len(heading.split()) > 1:
         raise DataError(f"{path}: its columns are separated by blanks; separate them by commas, semicolons or tabs")
-    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in _cells(heading, separator)]
+    names = _canonical(_cells(heading, separator))
     kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
     if len(set(kept)) < len(kept):
         raise DataError(f"{path}: a column name is there twice in {printable(heading)[:200]}; rename or remove one")
@@ -263,6 +264,18 @@ def columns_of_file(path: Path) -> Columns:
         raise DataError(f"{path}: holds no rows; its first line names the columns, the others hold them")
     values = dict(zip(kept, zip(*rows, strict=True), strict=False))
     return Columns(path, values, "line", tuple(number for number, _ in lines))
+
+
+def _canonical(heading: Sequence[str]) -> list[str]:
+    """Return the names of columns without comments and units; that of stamps is t or t_ns where it says the unit."""
+    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in heading]
+    if SECONDS in names or NANOSECONDS in names:
+        return names
+    units = {NS_PER_S: SECONDS, 1: NANOSECONDS}
+    at = next((at for at, name in enumerate(heading) if stamp_unit_ns(name) in units), None)
+    if at is not None:
+        names[at] = units[stamp_unit_ns(heading[at]) or 1]
+    return names
 
 
 def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:

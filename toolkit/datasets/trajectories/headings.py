@@ -1,10 +1,10 @@
-"""Which columns of a table are its stamps, positions and quaternions, by the names that its heading gives them.
+"""Which columns of a table are stamps, positions, quaternions or an IMU's, by the names that its heading gives them.
 
 Programs name them alike but for words around the axis: ``qx``, ``q_RS_x``, ``quat_x``, ``field.pose.orientation.x``.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 _UNITS_NS = {
@@ -16,6 +16,8 @@ _UNITS_NS = {
 _STAMPS = ("t", "time", "timestamp", "stamp", "ts", "sec", "secs", "seconds", "nsec", "ns")
 _POSITIONS = ("", "p", "pos", "position", "t", "trans", "translation", "location", "xyz")
 _QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rot", "rotation")
+_ACCELERATIONS = ("arss", "alpha", "a", "acc", "accel", "acceleration", "accelerometer", "linearacceleration")
+_RATES = ("wrss", "omega", "w", "g", "gyr", "gyro", "gyroscope", "angularvelocity")
 _IN_BRACKETS, _BETWEEN_WORDS = re.compile(r"[\[(](.*?)[\])]"), re.compile(r"[^a-z0-9]+")
 
 
@@ -40,10 +42,32 @@ def named_columns(names: Sequence[str]) -> Named | None:
     position = _axes(words, "xyz", _POSITIONS)
     if not stamps or len(position) != 3:
         return None
-    at = stamps[0]
-    in_brackets = _IN_BRACKETS.search(names[at])
-    unit = (in_brackets[1].strip().lower() if in_brackets else "") or words[at][-1]
-    return Named(at, _UNITS_NS.get(unit), position, _axes(words, "xyzw", _QUATERNIONS))
+    return Named(stamps[0], _unit_ns(names[stamps[0]]), position, _axes(words, "xyzw", _QUATERNIONS))
+
+
+def stamp_unit_ns(name: str) -> int | None:
+    """Return the unit of the stamps in a column of this name, ns; None where it names no stamp, or not their unit."""
+    words = _words(name)
+    return _unit_ns(name) if words and _stem(words)[-1] in _STAMPS else None
+
+
+def _unit_ns(name: str) -> int | None:
+    in_brackets = _IN_BRACKETS.search(name)
+    return _UNITS_NS.get((in_brackets[1].strip().lower() if in_brackets else "") or _words(name)[-1])
+
+
+def imu_columns(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of accelerations and of rates of rotation, x y z each, whatever a program calls them, or none.
+
+    ``a_RS_S_x``, ``alpha_x`` (Kalibr), ``ax``, ``acc_x`` and ``linear_acceleration.x`` are one and the same, as are
+    ``w_RS_S_x``, ``omega_x``, ``wx``, ``gx``, ``gyro_x`` and ``angular_velocity.x``.
+    """
+    plain = {"".join(_words(name)).removeprefix("field"): name for name in names}
+    found: list[str] = []
+    for kinds in (_ACCELERATIONS, _RATES):
+        sets = ([plain.get(f"{kind}{axis}", "") for axis in "xyz"] for kind in kinds)
+        found += next((one for one in sets if all(one)), [])
+    return tuple(found) if len(found) == 6 else ()
 
 
 def _words(name: str) -> list[str]:
