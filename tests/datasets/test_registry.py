@@ -113,9 +113,7 @@ def test_what_is_packed_is_told_how_to_unpack_and_is_read_then(course: dict[str,
     packed = folder / "run.npz.gz"
     packed.write_bytes(gzip.compress((folder / "run.npz").read_bytes()))
     (folder / "run.npz").unlink()
-    with pytest.raises(
-        DataError, match=r"unpack run.npz.gz with gunzip and remove what was packed"
-    ):
+    with pytest.raises(DataError, match=r"unpack run.npz.gz with gunzip and remove what was packed"):
         load_sequence(str(folder))
     (folder / "run.npz").write_bytes(gzip.decompress(packed.read_bytes()))
     packed.unlink()

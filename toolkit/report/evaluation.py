@@ -47,7 +47,10 @@ _USUAL = (
     *("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "rpe_100m_percent", "kitti_t_percent"),
     *("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
 )
-_OF_ORIENTATION = "ate_se3_deg"
+_OF_ORIENTATION = (
+    *("ate_none_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent"),
+    *("kitti_r_deg_per_m", "end_drift_percent"),
+)
 # What a terminal shows of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
@@ -196,13 +199,16 @@ def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURE
 def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
-    scored = {metric.key for metric in evaluation.scored_metrics}
+    scored = [metric.key for metric in evaluation.scored_metrics]
     remarks: dict[str, _RemarkScope] = {}
     for run in evaluation.runs:
         # Whatever the file's orientations lack is told, though nothing that needs them has a value. Why a run failed is
         # listed already.
-        told = {run.notes.get(key) for key in (*scored, _OF_ORIENTATION)} - {None, *run.log}
-        for key in (metric.key for metric in METRICS if run.notes.get(metric.key) in told):
+        lacks = run.notes.get("ate_se3_deg")
+        told = [key for key in scored if run.notes.get(key)] + [
+            k for k in _OF_ORIENTATION if lacks and run.notes.get(k) == lacks
+        ]
+        for key in (key for key in dict.fromkeys(told) if run.notes[key] not in run.log):
             text = run.notes[key] if run.metrics.get(key) is not None else f"no value: {run.notes[key]}"
             about = remarks.setdefault(text, _RemarkScope({}, {}))
             about.keys[key] = about.whose[f"{run.estimator} on {run.sequence}"] = None
