@@ -157,13 +157,13 @@ def draw_over_seeds(over: Comparison) -> Iterator[NamedFigure]:
 def _errors(over: Comparison) -> NamedFigure:
     figure, panels = panels_of(over.estimators)
     kinds: set[Output] = set()
-    for group in over.rows:
+    for group in over.lines:
         errors_m = group.position_m
-        if errors_m is None or _repeats(over, group):
+        if errors_m is None:
             continue
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
-        kind = _shown_as(over, group)
+        kind = shown_as(group)
         axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], colour_of(over, group.estimator)
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
@@ -184,11 +184,11 @@ def _nees(over: Comparison) -> NamedFigure:
         Drawn(
             group.estimator,
             colour_of(over, group.estimator),
-            _shown_as(over, group),
+            shown_as(group),
             Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high),
         )
-        for group in over.rows
-        if (nees := group.mean_nees) is not None and not _repeats(over, group)
+        for group in over.lines
+        if (nees := group.mean_nees) is not None
     ]
     caption = (
         f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
@@ -198,17 +198,3 @@ def _nees(over: Comparison) -> NamedFigure:
     title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
     figure = figure_with_bands(over.estimators, drawn, "pose NEES / 6", title)
     return NamedFigure("nees_over_seeds", caption, figure)
-
-
-def _repeats(over: Comparison, group: Row) -> bool:
-    """Say whether a group's errors are those of the estimator's other output, as a filter's final ones are."""
-    causal = next((g for g in over.rows if g.estimator == group.estimator and g.output == "causal"), None)
-    if causal in (None, group) or causal.position_m is None or group.position_m is None:
-        return False
-    return np.array_equal(causal.position_m, group.position_m, equal_nan=True)
-
-
-def _shown_as(over: Comparison, group: Row) -> Output:
-    """Return the output whose look a group has: a filter's only answer is drawn as a final one."""
-    both = any(g.estimator == group.estimator and _repeats(over, g) for g in over.rows)
-    return "final" if both else group.output
