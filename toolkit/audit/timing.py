@@ -578,18 +578,19 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     """Estimate which interval a twist describes, and pair the samples by the nearest of start, mean and end.
 
     With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
-    0 where the sample at the start describes the interval, 1 where that at the end does. Least squares are biased
-    towards 1/2 on noisy samples, because a mean of two has half the variance; the change of the neighbouring camera
-    rotations is an instrument that is independent of their noise.
+    0 where the sample at the start describes the interval, 1 where that at the end does: half an interval is the mean
+    of both, which has no offset of the clocks (`clocks`).
     """
     sequence, intervals = evidence.sequence, evidence.intervals
     if not isinstance(sequence.motion, TwistSamples):
         return None
     if intervals is None:
         return evidence.blind
-    lag = _lag(sequence, intervals)
-    if lag is None:
-        return Undecided("too few successive intervals have a sample at both ends and a known camera motion")
+    found = camera_offset(sequence, intervals) if is_stamped_at_frames(sequence) else None
+    if found is None:
+        return Undecided("too little change of rotation, or too few frames with a twist of the same stamp")
+    step_s = usual_step_s(sequence.motion.t_ns)
+    lag = Scalar(0.5 + found.value / step_s, found.error / step_s)
     if lag.error > LARGEST_LAG_ERROR:
         return Undecided(f"too little change of rotation: the lag is {lag.value:.1f} +- {lag.error:.1f} of an interval")
     present = sequence.motion.pairing
@@ -605,31 +606,6 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
         treatment=f'an interval is paired with the sample of its "{nearest}"',
         remedy=replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
     )
-
-
-def _lag(sequence: Sequence, intervals: Intervals) -> Scalar | None:
-    """Estimate the lag where both frames have a sample and the camera's motion is known on either side."""
-    w_camera = np.zeros((sequence.frame_count - 1, 3))
-    w_camera[intervals.interval] = intervals.w_seen_radps
-    known = np.zeros(sequence.frame_count - 1, dtype=bool)
-    known[intervals.interval] = True
-    sample, follows = _samples_at_frames(sequence)
-    middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:] & follows[1:-1])
-    if middle.size < LEAST_INTERVALS:
-        return None
-    w_samples = sequence.motion.values[:, 3:]
-    at_start, at_end = w_samples[sample[middle]], w_samples[sample[middle] + 1]
-    unexplained = w_camera[middle] - at_start
-    instrument = 0.5 * (w_camera[middle + 1] - w_camera[middle - 1])
-    return slope(instrument, at_end - at_start, unexplained - np.median(unexplained, axis=0))
-
-
-def _samples_at_frames(sequence: Sequence) -> tuple[IntArray, BoolArray]:
-    """Return the sample at or after each frame (K,), and which intervals (K - 1,) have samples at both ends only."""
-    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
-    sample = np.searchsorted(t_ns, frames_t_ns)
-    at_frame = t_ns[sample] == frames_t_ns
-    return sample, at_frame[:-1] & at_frame[1:] & (np.diff(sample) == 1)
 
 
 # An offset is reported beyond this many standard errors and beyond what is no fault. A sample of an IMU may describe
