@@ -15,8 +15,7 @@ from toolkit.measurements import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse
 from toolkit.settings.reading import settings_of
-from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
-from toolkit.simulation.faults import moving_vehicles
+from toolkit.simulation import SCENARIOS, faults, simulate
 
 FOUND = Finding("time-gap", 1, repaired=False, detail="a gap", blocking=False)
 
@@ -183,21 +182,6 @@ def test_a_budget_of_tracks_is_kept_and_reported() -> None:
         "estimators are given at most 25 tracks a frame (tracks.budget): "
     )
     assert prepared.whole.track_budget is None
-
-
-def test_what_moves_is_left_out_where_it_is_requested_and_reported() -> None:
-    among = moving_vehicles(simulate(replace(DRIVE, duration_s=2.0), 0), dose=0.4, seed=0)
-    plain = prepare(Recording(among))
-    requested = prepare(Recording(among, tracks=TrackUse(leave_out_moving=True, budget=60)))
-    assert requested.sequence.content_hash() != plain.sequence.content_hash()
-    np.testing.assert_array_equal(requested.sequence.held_out.uv_px, plain.sequence.held_out.uv_px)
-    assert np.bincount(requested.sequence.visible.frame).max() == 60
-    messages = next(fact for fact in requested.sequence.provenance.facts if "tracks.leave_out_moving" in fact)
-    gone = len(among.observations) - len(requested.sequence.observations)
-    visible = len(among.observations) - len(among.held_out)
-    assert gone > 0.1 * visible
-    assert f"{gone / visible:.1%} of the sightings, of " in messages
-    np.testing.assert_array_equal(requested.prior.T_world_imu, plain.prior.T_world_imu)
 
 
 def test_a_plan_reads_its_recordings_by_the_settings() -> None:

@@ -112,10 +112,11 @@ def test_a_card_of_version_1_is_read_as_one_whose_tracks_were_not_weighed() -> N
     assert {key: given[key] for key in json.loads(to_text(card))} == json.loads(to_text(card))
 
 
-def test_a_manifest_whose_settings_chose_the_arithmetic_is_read_and_repeated_without() -> None:
+def test_a_manifest_with_settings_of_then_that_changed_no_answer_is_read_and_repeated_without() -> None:
     path = OLD.with_name("older_documents") / "manifest-1.json"  # revision eb80bd9a, the last with compiled twins
     given = json.loads(path.read_text())
     assert given.pop("arithmetic") == {"msckf": "compiled"} and given["settings"].pop("arithmetic") == "auto"
+    assert given["settings"]["tracks"].pop("leave_out_moving") is False
     assert json.loads(to_text(read_manifest(path))) == given
     request, settings = read_configuration(path)
     repeated = configuration(request, settings, str(path))

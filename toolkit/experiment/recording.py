@@ -18,7 +18,6 @@ from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.measurements import NS_PER_S, Prior
-from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.noise import Card, MeasuredNoise, card_of, measured_noise, with_gap_twists
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, why_not_sightings
@@ -195,8 +194,6 @@ def _prepared(recording: Recording, audited: Audit) -> Prepared:
     used = with_gap_twists(used) if recording.noise.bridge_gaps else used
     sequence = _within_budget(used, recording.tracks.budget)
     prior = STARTS[recording.start](sequence)
-    if recording.tracks.leave_out_moving:
-        sequence = _within_budget(_without_moving_tracks(used, prior), recording.tracks.budget)
     findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
     return Prepared(requested, sequence, findings, prior, whole, data, audited.undecided, measured, card)
 
@@ -363,20 +360,6 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
     fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
     facts = (*sequence.provenance.facts, fact)
     return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
-
-
-def _without_moving_tracks(sequence: Sequence, prior: Prior) -> Sequence:
-    """Return the sequence without the sightings that move against the rest, recorded in the facts."""
-    at_rest, counts = without_moving_tracks(sequence, prior)
-    fact = (
-        f"not given to estimators, because they contradict the motion and most other tracks (tracks.leave_out_moving): "
-        f"{counts.sightings / max(counts.of_sightings, 1):.1%} of the sightings, of {counts.tracks} of "
-        f"{counts.of_tracks} tracks"
-    )
-    if counts.undecided_frames:
-        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to decide"
-    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
-    return replace(at_rest, provenance=provenance)
 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:

@@ -7,6 +7,6 @@ graphs), ``state_covariances`` (of all states of a graph), ``gating`` (threshold
 files that state none).
 
 States adjusted to stereo tracks whose landmarks are eliminated: ``stereo_adjustment``. From the tracks alone:
-``camera_motion``. What moves against the motion: ``moving_tracks``. To judge an estimate: ``corrections`` (its steps
-beside the measured motion, and its corrections tested against the covariance they take away).
+``camera_motion``. To judge an estimate: ``corrections`` (its steps beside the measured motion, and its corrections
+tested against the covariance they take away).
 """

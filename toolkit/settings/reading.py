@@ -30,10 +30,12 @@ _GONE = {
     "noise.match_imu": "the IMU's noise is measured once for all estimators; noise.motion_scale sets it",
     "noise.track_fit_s": "noise.measured_s is the length of the beginning on which noise is measured",
     "arithmetic": "each part of an estimator exists once, the MSCKFs' tracks compiled and all else in NumPy",
+    "tracks.leave_out_moving": "each estimator's gate and loss (outliers.policy) refuse what moves",
     "noise.disparity_scale": "no estimator has such a state any more; the audit's vision-scale reports a scale",
 }
-# Those of them that changed no answer: a document that a run wrote is read without them.
+# Those of them that changed no answer, some at one value only: a document that a run wrote is read without them.
 _CHANGED_NO_ANSWER = ("arithmetic",)
+_CHANGED_NO_ANSWER_AS = {"tracks": {"leave_out_moving": False}}
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -58,7 +60,11 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
 
 def without_removed(written: Mapping[str, Any]) -> dict[str, Any]:
     """Return the nested settings of a document, perhaps of an earlier version, without keys that changed no answer."""
-    return {key: value for key, value in written.items() if key not in _CHANGED_NO_ANSWER}
+    kept = {key: value for key, value in written.items() if key not in _CHANGED_NO_ANSWER}
+    for section, unused in _CHANGED_NO_ANSWER_AS.items():
+        if isinstance(kept.get(section), Mapping):
+            kept[section] = {key: value for key, value in kept[section].items() if (key, value) not in unused.items()}
+    return kept
 
 
 def _given(key: str, values: Mapping[str, Any]) -> str:

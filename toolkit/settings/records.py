@@ -172,9 +172,6 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[int, Meta(ge=10, le=10_000)] | None,
         _about("most tracks a frame that estimators get, spread over image and depth, the oldest first", none="all"),
     ] = None
-    leave_out_moving: Annotated[
-        bool, _about("leave out tracks that contradict the motion and most other tracks: vehicles, mismatches")
-    ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
