@@ -14,7 +14,7 @@ from toolkit.audit.robust import Scalar
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import ImuNoise, TwistChangeNoise, TwistNoise
-from toolkit.models.camera_motion import CameraMotion, triangulation_jacobian, usable_pairs
+from toolkit.models.camera_motion import CameraMotion, Neighbours, triangulation_jacobian, usable_pairs
 from toolkit.models.gating import LEAST_DEPTH_M, MAD_TO_SIGMA
 from toolkit.models.noise import white_sigma
 from toolkit.models.stereo import project, projection_jacobian, triangulate
@@ -54,17 +54,33 @@ class OneStep(NamedTuple):
 
 def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
     """Return the residuals over the intervals in which the camera's own motion is known."""
+    moved, rig = _moved(sequence, camera, moved_by(camera, sequence)), sequence.rig
+    d_point_d_uv = np.moveaxis(triangulation_jacobian(moved.before.T, rig), -1, 0)
+    d_after_d_before = moved.T_after_before[:, :3, :3] @ np.ascontiguousarray(d_point_d_uv)
+    jacobian = projection_jacobian(moved.after, rig) @ d_after_d_before
+    cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
+    return OneStep(moved.pairs.before, moved.pairs.after, moved.residual_px, cov_px2)
+
+
+class _Moved(NamedTuple):
+    """Pairs (P,) of sightings, their points (P, 3) m in both frames, motion (P, 4, 4) and residual (P, 3) px."""
+
+    pairs: Neighbours
+    before: Array
+    after: Array
+    T_after_before: Array
+    residual_px: Array
+
+
+def _moved(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> _Moved:
+    """Move points under a motion of the camera (K - 1, 4, 4) in the intervals whose own motion is known."""
     pairs, uv_px, rig = usable_pairs(sequence), sequence.observations.uv_px, sequence.rig
     pairs = pairs.select(camera.known[pairs.interval])
-    T_after_before = se3_inverse(moved_by(camera, sequence))[pairs.interval]
+    T_after_before = se3_inverse(T_before_after)[pairs.interval]
     before = triangulate(uv_px[pairs.before], rig)
     after = transform(T_after_before, before)
     after[:, 2] = np.maximum(after[:, 2], LEAST_DEPTH_M)
-    d_point_d_uv = np.ascontiguousarray(np.moveaxis(triangulation_jacobian(before.T, rig), -1, 0))
-    d_after_d_before = T_after_before[:, :3, :3] @ d_point_d_uv
-    jacobian = projection_jacobian(after, rig) @ d_after_d_before
-    cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
-    return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2)
+    return _Moved(pairs, before, after, T_after_before, uv_px[pairs.after] - project(after, rig))
 
 
 def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
@@ -92,12 +108,8 @@ def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
 
 def _one_step_px(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> tuple[IntArray, Array]:
     """Return interval (P,) and residual (P,) px under the camera's motion (K - 1, 4, 4) in the known intervals."""
-    pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
-    pairs = pairs.select(camera.known[pairs.interval])
-    points = transform(se3_inverse(T_before_after)[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
-    points[:, 2] = np.maximum(points[:, 2], 0.1)
-    residual_px = uv_px[pairs.after] - project(points, sequence.rig)
-    return pairs.interval, np.sqrt(np.mean(residual_px**2, axis=1))
+    moved = _moved(sequence, camera, T_before_after)
+    return moved.pairs.interval, np.sqrt(np.mean(moved.residual_px**2, axis=1))
 
 
 def _median(values: Array) -> float:

@@ -494,7 +494,7 @@ def exchanged_samples(evidence: Evidence) -> Symptom | None:
     sequence = evidence.sequence
     if evidence.intervals is None or not _sizes_are_off(evidence):
         return None
-    exchanged = _exchanged(sequence)
+    exchanged = _with_columns(sequence, lambda columns: columns[..., _OTHER_WAY])
     if not _fits(evidence.after(exchanged)):
         return None
     names = ("velocities", "rates of rotation")
@@ -506,20 +506,6 @@ def exchanged_samples(evidence: Evidence) -> Symptom | None:
         treatment="exchanged back",
         remedy=exchanged,
     )
-
-
-def _exchanged(sequence: Sequence) -> Sequence:
-    """Return the sequence with linear and angular columns exchanged, and the noise if it was estimated from them."""
-    motion, noise = sequence.motion, sequence.noise
-    exchanged = replace(sequence, motion=motion.of(motion.t_ns, motion.values[:, _OTHER_WAY]))
-    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
-        return exchanged
-    velocity, gyro = noise.velocity_noise_density, noise.gyro_noise_density
-    if not (
-        is_from_scatter(velocity, motion.v_mps, motion.t_ns) and is_from_scatter(gyro, motion.w_radps, motion.t_ns)
-    ):
-        return exchanged
-    return replace(exchanged, noise=replace(noise, velocity_noise_density=gyro, gyro_noise_density=velocity))
 
 
 def _sizes_are_off(evidence: Evidence) -> bool:
@@ -760,7 +746,7 @@ def _of_samples(evidence: Evidence, quantity: _Quantity) -> _WrongUnit | None:
             return _WrongUnit(f"{summary}{IN_A_PART}", None)
     scale = np.ones(6)
     scale[quantity.columns] /= factor
-    return _WrongUnit(summary, _scaled(sequence, scale))
+    return _WrongUnit(summary, _with_columns(sequence, lambda columns: columns * scale))
 
 
 def _truth(evidence: Evidence) -> _WrongUnit | None:
@@ -797,19 +783,19 @@ def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: f
     return near[0] if len(near) == 1 else None
 
 
-def _scaled(sequence: Sequence, scale: Array) -> Sequence:
-    """Return the sequence with the columns of its motion samples multiplied (6,), linear and angular ones.
+def _with_columns(sequence: Sequence, changed: Callable[[Array], Array]) -> Sequence:
+    """Return the sequence with the columns of its motion samples (S, 6), linear and angular ones, changed.
 
-    Noise that the file did not state, but a loader estimated from the scatter of the samples, is in their unit and
-    is scaled as well.
+    Noise that the file did not state, but a loader estimated from the scatter of the samples, changes with them.
     """
     motion, noise = sequence.motion, sequence.noise
-    scaled = replace(sequence, motion=motion.of(motion.t_ns, motion.values * scale))
+    now = replace(sequence, motion=motion.of(motion.t_ns, changed(motion.values)))
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
-        return scaled
-    velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
-    if is_from_scatter(velocity, motion.v_mps, motion.t_ns):
-        velocity = scale[_LINEAR] * velocity
-    if is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
-        gyro_noise = scale[_ANGULAR] * gyro_noise
-    return replace(scaled, noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise))
+        return now
+    density = stated_densities(noise)
+    density_now, halves = changed(density), (_LINEAR, _ANGULAR)
+    affected = [half for half in halves if not np.array_equal(density_now[half], density[half])]
+    if not all(is_from_scatter(density[half], motion.values[:, half], motion.t_ns) for half in affected):
+        return now
+    velocity, gyro = (density_now[half] for half in halves)
+    return replace(now, noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro))
