@@ -42,6 +42,7 @@ INGREDIENTS = (
     "biases",
     "cross-covariances",
     "consistent linearisation",
+    "invariant error",
     "inverse depth",
     "long-lived landmarks",
     "relinearisation",

@@ -27,6 +27,7 @@ INGREDIENTS = (
     "biases",
     "cross-covariances",
     "consistent linearisation",
+    "invariant error",
     "inverse depth",
     "long-lived landmarks",
 )

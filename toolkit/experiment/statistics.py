@@ -70,6 +70,23 @@ class Paired:
     error: float
 
     @property
+    def low(self) -> float:
+        """Return the lower end of the 95 % interval of the mean, by Student's t."""
+        return self.mean - float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
+
+    @property
+    def high(self) -> float:
+        """Return the upper end of that interval."""
+        return 2.0 * self.mean - self.low
+
+    @property
+    def p(self) -> float:
+        """Return the p-value of Student's paired test, two-sided: small where the mean is not zero by chance."""
+        if self.error == 0.0:
+            return float(self.mean == 0.0)
+        return 2.0 * float(stdtr(self.n - 1, -abs(self.mean) / self.error))
+
+    @property
     def is_significant(self) -> bool:
         """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
         return abs(self.mean) > float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
@@ -90,6 +107,20 @@ def paired(one: Iterable[float | None], other: Iterable[float | None]) -> Paired
         return None
     given = np.array(differences)
     return Paired(given.size, float(given.mean()), float(standard_error(given)))
+
+
+def holm(p: Iterable[float], level: float = _LEVEL) -> list[bool]:
+    """Say which of several tests find something, so that the chance of any false finding is at most ``level``.
+
+    The step-down test of Holm, "A simple sequentially rejective multiple test procedure" (Scand. J. Statist. 6, 1979).
+    """
+    given = list(p)
+    found = [False] * len(given)
+    for rank, i in enumerate(sorted(range(len(given)), key=given.__getitem__)):
+        if not given[i] <= level / (len(given) - rank):
+            break
+        found[i] = True
+    return found
 
 
 def paired_p(differences: Array, margin: float | Array = 0.0) -> Array:
