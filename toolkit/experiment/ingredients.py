@@ -36,7 +36,13 @@ class Variant:
     without: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return self.name + (f" without {' and '.join(self.without)}" if self.without else "")
+        return called(self.name, self.without)
+
+
+def called(estimator: str, without: Iterable[str]) -> str:
+    """Return how an estimator without some ingredients is called."""
+    lacking = ", ".join(f"no {one}" for one in without)
+    return f"{estimator} ({lacking})" if lacking else estimator
 
 
 class Edge(NamedTuple):

@@ -1,0 +1,295 @@
+"""An explanation in words, as a table, as ``explain.json`` (``vislam.explain/1``), and the folder that has it all."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from toolkit.answers import Output
+from toolkit.experiment.comparison import NEES
+from toolkit.experiment.contests import HELD_OUT
+from toolkit.experiment.explanation import ERROR, VARIANCE, Effect, Explanation
+from toolkit.experiment.ingredients import Variant, called
+from toolkit.experiment.statistics import Paired
+from toolkit.files.documents import Count, rounded
+from toolkit.metrics import metrics_called
+from toolkit.report.manifest import RecordingRecord, made_here, recording_record
+from toolkit.report.text import (
+    MISSING,
+    Table,
+    Width,
+    as_markdown,
+    as_text,
+    filled,
+    in_markdown,
+    listed,
+    markdown_section,
+    number,
+)
+from toolkit.settings import Settings
+
+EXPLANATION, TEXT, _FIGURES = "explain.json", "explain.md", "figures"
+# Factors of more than this stand for any larger one, which a diverged run may have.
+_MOST = 1e6
+_DIGITS = 3
+
+
+class VariantRecord(Struct, frozen=True, kw_only=True):
+    """One kind of output of an estimator, what it has, and what of it was taken away."""
+
+    estimator: str
+    output: Output
+    has: tuple[str, ...]
+    without: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return called(self.estimator, self.without)
+
+
+class FactorRecord(Struct, frozen=True, kw_only=True):
+    """How many times as large a figure is without the ingredient as with it, with its 95 % interval."""
+
+    factor: float
+    low: float
+    high: float
+
+    @property
+    def is_off(self) -> bool:
+        """Say whether the interval excludes that nothing changes."""
+        return not self.low <= 1.0 <= self.high
+
+    def inverse(self) -> "FactorRecord":
+        """Return how many times as large it is with the ingredient as without it."""
+        return FactorRecord(factor=1.0 / self.factor, low=1.0 / self.high, high=1.0 / self.low)
+
+    def range(self) -> str:
+        """Return the interval in words."""
+        return f"{number(self.low, _DIGITS)} to {number(self.high, _DIGITS)}"
+
+
+class EffectRecord(Struct, frozen=True, kw_only=True):
+    """What an ingredient brings between two variants; null is what is not known."""
+
+    less: VariantRecord
+    more: VariantRecord
+    distance: Annotated[Count, Meta(description="ingredients in which the pair differs from the estimator it tells of")]
+    runs: Count
+    ok: Annotated[Count, Meta(description="runs in which both ended well")]
+    shown: Annotated[bool, Meta(description="whether the error differs by more than chance, by Holm's test over all")]
+    error: FactorRecord | None
+    variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
+    nees: FactorRecord | None
+
+
+class PartRecord(Struct, frozen=True, kw_only=True):
+    """An ingredient: what it brings the first estimator alone, and what the second loses without it."""
+
+    ingredient: str
+    first_in: Annotated[EffectRecord | None, Meta(description="null where no two variants differ in it alone")]
+    last_in: EffectRecord | None
+    order_matters: Annotated[bool, Meta(description="whether the two differ by more than chance")]
+
+    @property
+    def effects(self) -> tuple[EffectRecord, ...]:
+        """Return the effects first in and last in, one where both are of the same pair, none where there is none."""
+        if self.first_in is None or self.last_in is None:
+            return ()
+        same = (self.first_in.less, self.first_in.more) == (self.last_in.less, self.last_in.more)
+        return (self.first_in,) if same else (self.first_in, self.last_in)
+
+
+class ExplanationRecord(Struct, frozen=True, kw_only=True):
+    """Why one estimator is more accurate than another; ``gap`` compares the two themselves."""
+
+    schema: Literal["vislam.explain/1"]
+    made: Annotated[dict[str, str], Meta(description="command, date, git_revision and cpu")]
+    sequence: RecordingRecord
+    seeds: tuple[int, ...]
+    settings: Settings
+    intervals: Annotated[Literal["seeds", "stretches"], Meta(description="what they are over")]
+    metric: Annotated[str, Meta(description="key of the error; over stretches against a truth their drift is meant")]
+    words: Annotated[str, Meta(description="the explanation in sentences")] = ""
+    gap: EffectRecord
+    parts: Annotated[tuple[PartRecord, ...], Meta(description="what brings most first")]
+    files: Annotated[tuple[str, ...], Meta(description="that were written, relative to the directory")] = ()
+
+
+def explanation_document(found: Explanation, command: str, files: tuple[str, ...] = ()) -> ExplanationRecord:
+    """Return an explanation as a record; ``files`` are those written beside it."""
+    plan = found.grid.plan
+    record = ExplanationRecord(
+        schema="vislam.explain/1",
+        made=made_here(command),
+        sequence=recording_record(found.grid.case.sequence),
+        seeds=plan.seeds,
+        settings=plan.settings,
+        intervals="seeds" if found.over_seeds else "stretches",
+        metric=found.metric,
+        gap=_effect(found.gap),
+        parts=tuple(
+            PartRecord(
+                ingredient=part.ingredient,
+                first_in=None if part.first is None else _effect(part.first),
+                last_in=None if part.last is None else _effect(part.last),
+                order_matters=part.order is not None,
+            )
+            for part in found.parts
+        ),
+        files=files,
+    )
+    return msgspec.structs.replace(record, words=in_words(record))
+
+
+def _effect(effect: Effect) -> EffectRecord:
+    by = {key: None if one is None else _factor_record(one) for key, one in effect.by.items()}
+    return EffectRecord(
+        less=_variant(effect.edge.less),
+        more=_variant(effect.edge.more),
+        distance=effect.edge.distance,
+        runs=effect.runs,
+        ok=effect.ok,
+        shown=effect.shown,
+        error=by[ERROR],
+        variance=by.get(VARIANCE),
+        nees=by.get(NEES),
+    )
+
+
+def _variant(one: Variant) -> VariantRecord:
+    return VariantRecord(estimator=one.name, output=one.output, has=tuple(sorted(one.has)), without=one.without)
+
+
+def _factor_record(one: Paired) -> FactorRecord:
+    most = math.log(_MOST)
+    factor, low, high = (rounded(math.exp(min(max(end, -most), most))) for end in (one.mean, one.low, one.high))
+    return FactorRecord(factor=factor, low=low, high=high)
+
+
+def in_words(found: ExplanationRecord) -> str:
+    """Return an explanation in plain sentences, which call only that an effect which is more than chance."""
+    return " ".join([_gap(found), *_shown(found), *_not_shown(found)])
+
+
+def _gap(found: ExplanationRecord) -> str:
+    start, goal, gap = found.gap.less, found.gap.more, found.gap.error
+    on = f"On {found.sequence.name}"
+    if gap is None:
+        ended = f"both ended well in {found.gap.ok} of {found.gap.runs} runs"
+        return f"{on} {start} and {goal} cannot be compared: {ended}, which is too few, or there are too few data."
+    if not gap.is_off:
+        return f"{on} {over(found)} show no difference of {error_of(found)} between {start} and {goal} ({gap.range()})."
+    better, worse, by = (goal, start, gap) if gap.factor > 1.0 else (start, goal, gap.inverse())
+    does = "predicts withheld tracks" if found.metric == HELD_OUT else "is"
+    claim = (
+        f"{does} {number(by.factor, _DIGITS)} times as {'well' if found.metric == HELD_OUT else 'accurate'} as {worse}"
+    )
+    return f"{on} {better} {claim} ({by.range()} with 95 % confidence; {error_of(found)}, {over(found)})."
+
+
+def over(found: ExplanationRecord) -> str:
+    """Return what the intervals are over, in words."""
+    return f"{len(found.seeds)} seeds" if found.intervals == "seeds" else "stretches of the one recording"
+
+
+def error_of(found: ExplanationRecord) -> str:
+    """Return what the error is, in words."""
+    if found.metric == HELD_OUT:
+        return "the error of withheld tracks, for there is no truth"
+    return metrics_called((found.metric,))[0].column if found.intervals == "seeds" else "drift"
+
+
+def _shown(found: ExplanationRecord) -> Iterator[str]:
+    """Yield a sentence for each ingredient that changes the error by more than chance, what brings most first."""
+    parts = [part for part in found.parts if _is_shown(part)]
+    for i, part in enumerate(parts):
+        name = part.ingredient.capitalize() + (", the largest effect" if i == 0 and len(parts) > 1 else "")
+        wheres = (f"added to {part.effects[0].less}", *(f"taken from {one.more}" for one in part.effects[1:]))
+        clauses = [_clause(one, where) for one, where in zip(part.effects, wheres, strict=True)]
+        yield f"{name}: {'; '.join(clauses)}{'; the order matters' if part.order_matters else ''}."
+
+
+def _is_shown(part: PartRecord) -> bool:
+    return any(one.shown for one in part.effects)
+
+
+def _clause(effect: EffectRecord, where: str) -> str:
+    if effect.error is None:
+        return f"{where}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
+    change = effect.error.inverse() if where.startswith("added") else effect.error
+    if not effect.shown:
+        return f"{where}, nothing is shown ({change.range()} times the error)"
+    size, by = ("larger", change) if change.factor > 1.0 else ("smaller", change.inverse())
+    return f"{where}, the error becomes {number(by.factor, _DIGITS)} times {size} ({by.range()})"
+
+
+def _not_shown(found: ExplanationRecord) -> Iterator[str]:
+    """Yield what may be chance, of which some look like more where they are tested alone, and what is not known."""
+    silent = [part for part in found.parts if part.effects and not _is_shown(part)]
+    if likely := [part for part in silent if any(one.error and one.error.is_off for one in part.effects)]:
+        does = "seems to have an effect" if len(likely) == 1 else "seem to have effects"
+        count = sum(len(part.effects) for part in found.parts)
+        these = listed(map(_with_ranges, likely))
+        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance, and more runs would tell."
+    if rest := [part for part in silent if part not in likely]:
+        yield f"Nothing that {over(found)} can show is brought by {listed(map(_with_ranges, rest))}."
+    if lacking := [part.ingredient for part in found.parts if not part.effects]:
+        yield f"What {listed(lacking)} brings cannot be measured: no two estimators differ in that alone."
+
+
+def _with_ranges(part: PartRecord) -> str:
+    known = dict.fromkeys(one.error.range() for one in part.effects if one.error)
+    return f"{part.ingredient} ({' and '.join(known) or 'too few runs ended well'})"
+
+
+def explanation_table(found: ExplanationRecord) -> Table:
+    """Return the effects of every ingredient: where it is added as near to the first estimator as there is a pair of
+    variants, and where it is taken away as near to the second.
+    """
+    names = {"error": "error", "variance": "variance", "nees": "NEES"}
+    effects = [found.gap, *(one for part in found.parts for one in part.effects)]
+    keys = [key for key in names if any(getattr(one, key) for one in effects)]
+    rows = [("all of it", f"from {found.gap.less} to {found.gap.more}", *_cells(found.gap, keys))]
+    for part in found.parts:
+        wheres = [f"added to {one.less}" if i == 0 else f"taken from {one.more}" for i, one in enumerate(part.effects)]
+        for name, one, where in zip((part.ingredient, ""), part.effects, wheres, strict=False):
+            rows.append((name, where, *_cells(one, keys)))
+        if not part.effects:
+            rows.append((part.ingredient, "no two differ in it alone", *(MISSING for _ in keys)))
+    heads = (("ingredient", "", ""), ("where", "", ""), *((names[key], "", "") for key in keys))
+    under = [
+        f"how many times as large without it as with it, with 95 % intervals over {over(found)}, paired",
+        f"error: {error_of(found)}; * more than chance, by Holm's test over all effects on the error",
+        *(["variance: of the pose, over the Cramér-Rao bound"] if "variance" in keys else []),
+    ]
+    return Table(heads, tuple(rows), labels=2, under=tuple(under))
+
+
+def _cells(effect: EffectRecord, keys: Sequence[str]) -> Iterator[str]:
+    for key in keys:
+        one: FactorRecord | None = getattr(effect, key)
+        ok = "" if effect.ok == effect.runs else f"{effect.ok} of {effect.runs} ok"
+        if one is None:
+            yield ok or MISSING
+            continue
+        factor, low, high = (number(value, _DIGITS) for value in (one.factor, one.low, one.high))
+        star = "*" if key == "error" and effect.shown else ""
+        yield f"{factor}{star} ({', '.join(filter(None, (f'{low}-{high}', ok if key == 'error' else '')))})"
+
+
+def explanation_text(found: ExplanationRecord, width: Width = None) -> str:
+    """Return an explanation as it is printed."""
+    return f"{filled(found.words, width, further='')}\n\n{as_text(explanation_table(found))}"
+
+
+def explanation_markdown(found: ExplanationRecord, captions: dict[str, str]) -> str:
+    """Return an explanation as ``explain.md``: words, figures by file name with captions, table, pairs."""
+    title = f"# From {found.gap.less} to {found.gap.more} on {in_markdown(found.sequence.name)}"
+    shown = (f"![{in_markdown(said)}]({_FIGURES}/{name})\n\n{in_markdown(said)}" for name, said in captions.items())
+    pairs = (
+        f"{part.ingredient}: {'; '.join(f'{one.less} and {one.more}' for one in part.effects) or 'none'}"
+        for part in found.parts
+    )
+    parts = [title, in_markdown(found.words), *shown, as_markdown(explanation_table(found))]
+    return "\n\n".join([*parts, *markdown_section("Pairs that differ in one ingredient", pairs)]) + "\n"
