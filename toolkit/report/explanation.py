@@ -231,7 +231,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
         does = "seems to have an effect" if len(likely) == 1 else "seem to have effects"
         count = sum(len(part.effects) for part in found.parts)
         these = listed(map(_with_ranges, likely))
-        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance, and more runs would tell."
+        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance: more runs tell."
     if rest := [part for part in silent if part not in likely]:
         yield f"Nothing that {over(found)} can show is brought by {listed(map(_with_ranges, rest))}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
