@@ -1,7 +1,7 @@
 """Compare a handwritten stereo visual-inertial EKF with a GTSAM smoother on the same measurements.
 
-``toolkit.compare("drive", ["ekf", "batch"])`` runs a comparison, ``toolkit.sweep`` many. Submodules are imported when
-first used.
+``toolkit.compare("drive", ["ekf", "batch"])`` runs a comparison, ``toolkit.sweep`` many, ``toolkit.explain`` says why
+one wins. Submodules are imported when first used.
 
 Reading order: measurements (what estimators read), sequence (the recording it comes from; its parts are motion_samples,
 track_budget) -> estimator, estimate (the output; answers checks it) -> models -> filters/ekf -> filters/batch -> runner
@@ -15,20 +15,22 @@ jackknife, geometry, threads, errors.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from toolkit.api import Result, SweepResult, compare, sweep
+    from toolkit.api import ExplainResult, Result, SweepResult, compare, explain, sweep
     from toolkit.datasets import load_sequence
     from toolkit.datasets.own_tables import save
     from toolkit.settings import Settings
 
     __version__: str
 
-__all__ = ["Result", "Settings", "SweepResult", "compare", "load_sequence", "save", "sweep"]
+__all__ = ["ExplainResult", "Result", "Settings", "SweepResult", "compare", "explain", "load_sequence", "save", "sweep"]
 
 _HOME = {
+    "ExplainResult": "toolkit.api",
     "Result": "toolkit.api",
     "Settings": "toolkit.settings",
     "SweepResult": "toolkit.api",
     "compare": "toolkit.api",
+    "explain": "toolkit.api",
     "load_sequence": "toolkit.datasets",
     "save": "toolkit.datasets.own_tables",
     "sweep": "toolkit.api",

@@ -26,13 +26,21 @@ from toolkit.estimator import Build
 from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
+from toolkit.experiment.explanation import Explanation, default_ends, run_explanation
 from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.progress import silent
-from toolkit.registry import find_all
+from toolkit.registry import discover, find_all
 from toolkit.report.comparison_table import Columns, comparison_table, requested_columns
 from toolkit.report.comparison_text import comparison_latex
+from toolkit.report.explanation import (
+    ExplanationRecord,
+    explanation_document,
+    explanation_table,
+    explanation_text,
+    write_explanation,
+)
 from toolkit.report.sweep import sweep_document, sweep_table, sweep_text, write_sweep
-from toolkit.report.text import Table, as_markdown, as_text
+from toolkit.report.text import WIDTH, Table, as_markdown, as_text, in_markdown
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
 from toolkit.settings.reading import settings_of
@@ -141,6 +149,28 @@ def sweep(
     own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
     plan, kept = _planned(source, estimators, own, settings, given)
     return SweepResult(run_sweep(plan, over, crossed=not each, directory=kept))
+
+
+def explain(
+    source: Source,
+    start: str | Path | None = None,
+    goal: str | Path | None = None,
+    *,
+    estimators: Names | None = None,
+    **options: Unpack[SweepOptions],
+) -> "ExplainResult":
+    """Say what makes the estimator ``goal`` more accurate than ``start``, ingredient by ingredient (docs/explain.md).
+
+    By default they are the lowest and highest rung of the estimators that are compared by default. ``estimators`` are
+    those whose variants may lie between the two, by default all installed ones. All else is as in :func:`compare`.
+
+    Raises as :func:`compare` does, and EstimatorError for an estimator that does not say what it has.
+    """
+    given = dict(options)
+    own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
+    usual = default_ends() if None in (start, goal) else ("", "")
+    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, own, settings, given)
+    return ExplainResult(run_explanation(plan, str(start or usual[0]), str(goal or usual[1]), kept))
 
 
 def _planned(
@@ -334,6 +364,45 @@ def _checked_columns(columns: tuple[str, ...]) -> Columns:
     if strange:
         raise SettingsError(f"a column is {type_of(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
     return requested_columns(columns)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExplainResult:
+    """Why one estimator is more accurate than another. ``explanation`` holds the values themselves."""
+
+    explanation: Explanation
+
+    @cached_property
+    def document(self) -> ExplanationRecord:
+        """What ``explain.json`` has."""
+        return explanation_document(self.explanation, "toolkit.explain")
+
+    @property
+    def words(self) -> str:
+        """The explanation in sentences."""
+        return self.document.words
+
+    def table(self) -> "ShownTable":
+        """Return the effect of every ingredient with its intervals."""
+        return ShownTable(explanation_table(self.document))
+
+    @cached_property
+    def figures(self) -> Mapping[str, "Figure"]:
+        """The figure by its name, ``waterfall``."""
+        from toolkit.report.figures.waterfall import draw_explanation
+
+        return {figure.name: figure.figure for figure in draw_explanation(self.document)}
+
+    def save(self, directory: str | Path) -> Path:
+        """Write the directory that ``vislam explain`` writes; raises OutputError where it cannot be written."""
+        write_explanation(self.explanation, Path(directory), "toolkit.explain")
+        return Path(directory)
+
+    def __repr__(self) -> str:
+        return explanation_text(self.document, WIDTH)
+
+    def _repr_markdown_(self) -> str:
+        return f"{in_markdown(self.words)}\n\n{self.table()._repr_markdown_()}"
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ CASES = {
     "diff.json": "diff-1",
     "bundle.json": "bundle-1",
     "sweep.json": "sweep-1",
+    "explain.json": "explain-1",
 }
 
 

@@ -226,6 +226,18 @@ def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None
             store.close()
 
 
+@contextmanager
+def kept_where(target: Path) -> Iterator[None]:
+    """Say after an interrupt where the outcomes are that were kept; raises Interrupted then, if there are any."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not target.exists():
+            raise
+        kept = f"what has ended is kept in {printable(str(target))}"
+        raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
+
+
 def new_run() -> Path:
     """Return a directory named by the local time that does not exist yet."""
     from datetime import datetime

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from toolkit.cli.arguments import WORKERS, UsageError, arg, command, estimators, flag, output
-from toolkit.cli.compare import HOW, SCHEDULER, Interrupted, new_run, requested_configuration
+from toolkit.cli.compare import HOW, SCHEDULER, kept_where, new_run, requested_configuration
 from toolkit.errors import printable
 
 
@@ -73,7 +73,7 @@ def sweep(options: argparse.Namespace) -> int:
         raise UsageError("name the sequence to sweep, a path or a built-in name as drive")
     target, progress_for = options.out or new_run(), of_this_process()
     check_sweep_directory(target)
-    try:
+    with kept_where(target):
         found = run_sweep(
             plan,
             axes or requested.over,
@@ -81,11 +81,6 @@ def sweep(options: argparse.Namespace) -> int:
             directory=target,
             progress_for=progress_for,
         )
-    except KeyboardInterrupt:
-        if not target.exists():
-            raise
-        kept = f"what has ended is kept in {printable(str(target))}"
-        raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
     with progress_for(f"{found.grid.case.name}: figures"):
         document = write_sweep(found, target, shlex.join(options.command_line), list(draw_sweep(found)))
     if options.json:

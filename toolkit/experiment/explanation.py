@@ -22,14 +22,14 @@ from toolkit.errors import EstimatorError
 from toolkit.experiment.comparison import NEES, Row
 from toolkit.experiment.contests import HELD_OUT, accuracy_of
 from toolkit.experiment.grid import Grid, run_grid
-from toolkit.experiment.ingredients import Compared, Edge, Variant, compared, variants_of
+from toolkit.experiment.ingredients import Edge, Pairings, Variant, compared, variants_of
 from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.recording import prepare
 from toolkit.experiment.statistics import Paired, holm
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.progress import ProgressFor, silent
-from toolkit.registry import EstimatorEntry, find, find_all
+from toolkit.registry import EstimatorEntry, defaults, find, find_all
 from toolkit.settings.records import Metrics
 
 Key = TypeVar("Key")
@@ -53,7 +53,7 @@ class Measure(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class Contribution:
     """What an ingredient brings between two variants, by measure: the logarithm of that without it over that with it.
 
     Under ``ok`` of ``runs`` seeds both ended well. ``shown`` says that it changes the error by more than chance.
@@ -72,15 +72,15 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Ingredient:
     """An ingredient's effect first in and last in; both are one effect where there is one pair, None where none.
 
     ``order`` is how much more it brings first in, None unless that is more than chance.
     """
 
     ingredient: str
-    first: Effect | None
-    last: Effect | None
+    first: Contribution | None
+    last: Contribution | None
     order: Paired | None = None
 
 
@@ -95,8 +95,8 @@ class Explanation:
     goal: Variant
     grid: Grid
     metric: str
-    gap: Effect
-    parts: tuple[Part, ...]
+    gap: Contribution
+    parts: tuple[Ingredient, ...]
 
     @property
     def over_seeds(self) -> bool:
@@ -122,6 +122,17 @@ def run_explanation(
     return explained(found, run_grid(plan, {one.trial: None for one in _all(found)}, directory, progress_for))
 
 
+def default_ends() -> tuple[str, str]:
+    """Return the lowest and the highest rung of those compared by default that declare their ingredients.
+
+    Raises EstimatorError where there are not two.
+    """
+    names = [name for name in defaults() if find(name).ingredients()]
+    if len(names) < 2:
+        raise EstimatorError("no two estimators that are compared by default declare INGREDIENTS; name the two")
+    return names[0], names[-1]
+
+
 def _is_usable(entry: EstimatorEntry) -> bool:
     try:
         entry.load()
@@ -130,13 +141,13 @@ def _is_usable(entry: EstimatorEntry) -> bool:
     return True
 
 
-def _all(found: Compared) -> tuple[Variant, ...]:
+def _all(found: Pairings) -> tuple[Variant, ...]:
     """Return every variant that is needed, each once."""
     edges = [edge for pair in found.edges.values() for edge in pair or ()]
     return tuple(dict.fromkeys([found.start, found.goal, *(one for edge in edges for one in (edge.less, edge.more))]))
 
 
-def explained(found: Compared, grid: Grid) -> Explanation:
+def explained(found: Pairings, grid: Grid) -> Explanation:
     """Return what the outcomes of all variants tell."""
     rows = {one: grid.row(one.trial, one.output) for one in _all(found)}
     metric = accuracy_of(rows.values())
@@ -149,24 +160,24 @@ def explained(found: Compared, grid: Grid) -> Explanation:
         arrays = [series[key, one] for edge in edges for one in (edge.less, edge.more)]
         return None if not all(map(len, arrays)) else _paired(np.array(arrays), measures[key])
 
-    def effect(edge: Edge) -> Effect:
+    def effect(edge: Edge) -> Contribution:
         ended = zip(rows[edge.less].outcomes, rows[edge.more].outcomes, strict=True)
         ok = [less.status == more.status == "ok" for less, more in ended]
-        return Effect(edge, len(ok), sum(ok), {key: difference(key, edge) for key in measures})
+        return Contribution(edge, len(ok), sum(ok), {key: difference(key, edge) for key in measures})
 
     pairs = {name: pair for name, pair in found.edges.items() if pair is not None}
     effects = _tested({edge: effect(edge) for pair in pairs.values() for edge in pair})
     orders = {name: difference(ERROR, *pair) for name, pair in pairs.items() if pair[0].less != pair[1].less}
     clear = _found_by_holm(orders)
     parts = [
-        Part(name, pair and effects[pair[0]], pair and effects[pair[1]], clear.get(name))
+        Ingredient(name, pair and effects[pair[0]], pair and effects[pair[1]], clear.get(name))
         for name, pair in found.edges.items()
     ]
     gap = effect(Edge("", found.start, found.goal, 0, at=True))
     return Explanation(found.start, found.goal, grid, metric, gap, tuple(sorted(parts, key=_size, reverse=True)))
 
 
-def _tested(effects: Mapping[Edge, Effect]) -> dict[Edge, Effect]:
+def _tested(effects: Mapping[Edge, Contribution]) -> dict[Edge, Contribution]:
     """Return effects with what the test over all of them shows; a pair that stands for first and last counts once."""
     by_pair = {(edge.less, edge.more): effect.on_error for edge, effect in effects.items()}
     shown = _found_by_holm(by_pair)
@@ -180,7 +191,7 @@ def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:
     return {key: one for (key, one), is_found in zip(known.items(), found, strict=True) if is_found}
 
 
-def _size(part: Part) -> float:
+def _size(part: Ingredient) -> float:
     known = [effect.on_error.mean for effect in (part.first, part.last) if effect and effect.on_error]
     return sum(known) / len(known) if known else -math.inf
 

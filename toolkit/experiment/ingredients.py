@@ -116,7 +116,7 @@ def _shared(values: Mapping[str, Any], case: Prepared) -> dict[str, Mapping[str,
     return found | {f"{_REPAIR}{one.fault}": {} for one in case.findings if one.repaired}
 
 
-class Compared(NamedTuple):
+class Pairings(NamedTuple):
     """Two estimators, and for each ingredient the pairs of variants nearest to the first and to the second of them.
 
     They are the ingredients that one of the two has and the other lacks, and those that can be taken away from both.
@@ -128,7 +128,7 @@ class Compared(NamedTuple):
     edges: Mapping[str, tuple[Edge, Edge] | None]
 
 
-def compared(start: str, goal: str, variants: Iterable[Variant]) -> Compared:
+def compared(start: str, goal: str, variants: Iterable[Variant]) -> Pairings:
     """Find the pairs of variants that tell in what two estimators differ.
 
     Raises EstimatorError for an estimator that declares nothing, and where both have the same.
@@ -147,7 +147,7 @@ def compared(start: str, goal: str, variants: Iterable[Variant]) -> Compared:
         raise EstimatorError(f"{start} and {goal} have the same ingredients: there is nothing to explain")
     edges = {name: _edges(name, ends, having) for name in sorted(ends[0].has | ends[1].has)}
     both = {name for name, pair in edges.items() if pair is not None and all(edge.at for edge in pair)}
-    return Compared(*ends, {name: pair for name, pair in edges.items() if name in differing | both})
+    return Pairings(*ends, {name: pair for name, pair in edges.items() if name in differing | both})
 
 
 def _edges(

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -10,12 +12,14 @@ from msgspec import Meta, Struct
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
-from toolkit.experiment.explanation import ERROR, VARIANCE, Effect, Explanation
+from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation
 from toolkit.experiment.ingredients import Variant, called
 from toolkit.experiment.statistics import Paired
-from toolkit.files.documents import Count, rounded
+from toolkit.files.documents import Count, read, rounded, to_text
+from toolkit.files.writing import check_replaceable
 from toolkit.metrics import metrics_called
-from toolkit.report.manifest import RecordingRecord, made_here, recording_record
+from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
+from toolkit.report.results_folder import own_files, results_section, write_results
 from toolkit.report.text import (
     MISSING,
     Table,
@@ -24,13 +28,13 @@ from toolkit.report.text import (
     as_text,
     filled,
     in_markdown,
-    listed,
     markdown_section,
     number,
 )
-from toolkit.settings import Settings
+from toolkit.settings import changes_of
 
-EXPLANATION, TEXT, _FIGURES = "explain.json", "explain.md", "figures"
+Kind = Literal["added", "taken"]
+EXPLANATION, TEXT = "explain.json", "explain.md"
 # Factors of more than this stand for any larger one, which a diverged run may have.
 _MOST = 1e6
 _DIGITS = 3
@@ -69,7 +73,7 @@ class FactorRecord(Struct, frozen=True, kw_only=True):
         return f"{number(self.low, _DIGITS)} to {number(self.high, _DIGITS)}"
 
 
-class EffectRecord(Struct, frozen=True, kw_only=True):
+class ContributionRecord(Struct, frozen=True, kw_only=True):
     """What an ingredient brings between two variants; null is what is not known."""
 
     less: VariantRecord
@@ -83,16 +87,16 @@ class EffectRecord(Struct, frozen=True, kw_only=True):
     nees: FactorRecord | None
 
 
-class PartRecord(Struct, frozen=True, kw_only=True):
+class IngredientRecord(Struct, frozen=True, kw_only=True):
     """An ingredient: what it brings the first estimator alone, and what the second loses without it."""
 
     ingredient: str
-    first_in: Annotated[EffectRecord | None, Meta(description="null where no two variants differ in it alone")]
-    last_in: EffectRecord | None
+    first_in: Annotated[ContributionRecord | None, Meta(description="null where no two variants differ in it alone")]
+    last_in: ContributionRecord | None
     order_matters: Annotated[bool, Meta(description="whether the two differ by more than chance")]
 
     @property
-    def effects(self) -> tuple[EffectRecord, ...]:
+    def effects(self) -> tuple[ContributionRecord, ...]:
         """Return the effects first in and last in, one where both are of the same pair, none where there is none."""
         if self.first_in is None or self.last_in is None:
             return ()
@@ -106,30 +110,39 @@ class ExplanationRecord(Struct, frozen=True, kw_only=True):
     schema: Literal["vislam.explain/1"]
     made: Annotated[dict[str, str], Meta(description="command, date, git_revision and cpu")]
     sequence: RecordingRecord
-    seeds: tuple[int, ...]
-    settings: Settings
+    seeds: SeedsUsed
+    settings: Annotated[dict[str, Any], Meta(description="those that differ from the defaults")]
     intervals: Annotated[Literal["seeds", "stretches"], Meta(description="what they are over")]
     metric: Annotated[str, Meta(description="key of the error; over stretches against a truth their drift is meant")]
-    words: Annotated[str, Meta(description="the explanation in sentences")] = ""
-    gap: EffectRecord
-    parts: Annotated[tuple[PartRecord, ...], Meta(description="what brings most first")]
-    files: Annotated[tuple[str, ...], Meta(description="that were written, relative to the directory")] = ()
+    words: Annotated[str, Meta(description="the explanation in sentences")]
+    gap: ContributionRecord
+    parts: Annotated[tuple[IngredientRecord, ...], Meta(description="what brings most first")]
+    figures: Annotated[dict[str, str], Meta(description="captions by file")]
+    files: Annotated[tuple[str, ...], Meta(description="that were written, relative to the directory")]
 
 
-def explanation_document(found: Explanation, command: str, files: tuple[str, ...] = ()) -> ExplanationRecord:
-    """Return an explanation as a record; ``files`` are those written beside it."""
+def read_explanation(path: Path) -> ExplanationRecord:
+    """Read an ``explain.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, ExplanationRecord, remedy="repeat vislam explain")
+
+
+def explanation_document(
+    found: Explanation, command: str = "", figures: dict[str, str] | None = None, files: tuple[str, ...] = ()
+) -> ExplanationRecord:
+    """Return an explanation as a record; ``figures`` are captions by file, ``files`` all that is written beside it."""
     plan = found.grid.plan
     record = ExplanationRecord(
         schema="vislam.explain/1",
         made=made_here(command),
         sequence=recording_record(found.grid.case.sequence),
-        seeds=plan.seeds,
-        settings=plan.settings,
+        seeds=SeedsUsed(sequence=plan.seeds[0], count=len(plan.seeds)),
+        settings=changes_of(plan.settings),
         intervals="seeds" if found.over_seeds else "stretches",
         metric=found.metric,
+        words="",
         gap=_effect(found.gap),
         parts=tuple(
-            PartRecord(
+            IngredientRecord(
                 ingredient=part.ingredient,
                 first_in=None if part.first is None else _effect(part.first),
                 last_in=None if part.last is None else _effect(part.last),
@@ -137,14 +150,15 @@ def explanation_document(found: Explanation, command: str, files: tuple[str, ...
             )
             for part in found.parts
         ),
+        figures=figures or {},
         files=files,
     )
     return msgspec.structs.replace(record, words=in_words(record))
 
 
-def _effect(effect: Effect) -> EffectRecord:
+def _effect(effect: Contribution) -> ContributionRecord:
     by = {key: None if one is None else _factor_record(one) for key, one in effect.by.items()}
-    return EffectRecord(
+    return ContributionRecord(
         less=_variant(effect.edge.less),
         more=_variant(effect.edge.more),
         distance=effect.edge.distance,
@@ -190,7 +204,7 @@ def _gap(found: ExplanationRecord) -> str:
 
 def over(found: ExplanationRecord) -> str:
     """Return what the intervals are over, in words."""
-    return f"{len(found.seeds)} seeds" if found.intervals == "seeds" else "stretches of the one recording"
+    return f"{found.seeds.count} seeds" if found.intervals == "seeds" else "stretches of the one recording"
 
 
 def error_of(found: ExplanationRecord) -> str:
@@ -205,23 +219,38 @@ def _shown(found: ExplanationRecord) -> Iterator[str]:
     parts = [part for part in found.parts if _is_shown(part)]
     for i, part in enumerate(parts):
         name = part.ingredient.capitalize() + (", the largest effect" if i == 0 and len(parts) > 1 else "")
-        wheres = (f"added to {part.effects[0].less}", *(f"taken from {one.more}" for one in part.effects[1:]))
-        clauses = [_clause(one, where) for one, where in zip(part.effects, wheres, strict=True)]
+        clauses = [_clause(one, kind) for kind, one in kinds(found, part)]
         yield f"{name}: {'; '.join(clauses)}{'; the order matters' if part.order_matters else ''}."
 
 
-def _is_shown(part: PartRecord) -> bool:
+def _is_shown(part: IngredientRecord) -> bool:
     return any(one.shown for one in part.effects)
 
 
-def _clause(effect: EffectRecord, where: str) -> str:
+def kinds(found: ExplanationRecord, part: IngredientRecord) -> Iterator[tuple[Kind, ContributionRecord]]:
+    """Yield the effects of an ingredient, each with what is done there: it is added to one or taken from another."""
+    if len(part.effects) == 1:
+        yield "taken" if part.effects[0].more == found.gap.more else "added", part.effects[0]
+    elif part.effects:
+        yield "added", part.effects[0]
+        yield "taken", part.effects[1]
+
+
+def where(kind: Kind, effect: ContributionRecord) -> str:
+    """Return what is done with an ingredient, and where."""
+    return f"added to {effect.less}" if kind == "added" else f"taken from {effect.more}"
+
+
+def _clause(effect: ContributionRecord, kind: Kind) -> str:
+    at = where(kind, effect)
     if effect.error is None:
-        return f"{where}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
-    change = effect.error.inverse() if where.startswith("added") else effect.error
-    if not effect.shown:
-        return f"{where}, nothing is shown ({change.range()} times the error)"
+        return f"{at}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
+    if not (effect.shown or effect.error.is_off):
+        return f"{at}, nothing is shown ({effect.error.range()})"
+    change = effect.error.inverse() if kind == "added" else effect.error
     size, by = ("larger", change) if change.factor > 1.0 else ("smaller", change.inverse())
-    return f"{where}, the error becomes {number(by.factor, _DIGITS)} times {size} ({by.range()})"
+    becomes = "the error becomes" if effect.shown else "the error may become (chance is not excluded)"
+    return f"{at}, {becomes} {number(by.factor, _DIGITS)} times {size} ({by.range()})"
 
 
 def _not_shown(found: ExplanationRecord) -> Iterator[str]:
@@ -230,15 +259,20 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     if likely := [part for part in silent if any(one.error and one.error.is_off for one in part.effects)]:
         does = "seems to have an effect" if len(likely) == 1 else "seem to have effects"
         count = sum(len(part.effects) for part in found.parts)
-        these = listed(map(_with_ranges, likely))
+        these = _listed(likely)
         yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance: more runs tell."
     if rest := [part for part in silent if part not in likely]:
-        yield f"Nothing that {over(found)} can show is brought by {listed(map(_with_ranges, rest))}."
+        yield f"Nothing that {over(found)} can show is brought by {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
-        yield f"What {listed(lacking)} brings cannot be measured: no two estimators differ in that alone."
+        yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
 
 
-def _with_ranges(part: PartRecord) -> str:
+def _listed(parts: Sequence[IngredientRecord]) -> str:
+    *most, last = map(_with_ranges, parts)
+    return " and ".join(filter(None, (", ".join(most), last)))
+
+
+def _with_ranges(part: IngredientRecord) -> str:
     known = dict.fromkeys(one.error.range() for one in part.effects if one.error)
     return f"{part.ingredient} ({' and '.join(known) or 'too few runs ended well'})"
 
@@ -252,9 +286,8 @@ def explanation_table(found: ExplanationRecord) -> Table:
     keys = [key for key in names if any(getattr(one, key) for one in effects)]
     rows = [("all of it", f"from {found.gap.less} to {found.gap.more}", *_cells(found.gap, keys))]
     for part in found.parts:
-        wheres = [f"added to {one.less}" if i == 0 else f"taken from {one.more}" for i, one in enumerate(part.effects)]
-        for name, one, where in zip((part.ingredient, ""), part.effects, wheres, strict=False):
-            rows.append((name, where, *_cells(one, keys)))
+        for i, (kind, one) in enumerate(kinds(found, part)):
+            rows.append(("" if i else part.ingredient, where(kind, one), *_cells(one, keys)))
         if not part.effects:
             rows.append((part.ingredient, "no two differ in it alone", *(MISSING for _ in keys)))
     heads = (("ingredient", "", ""), ("where", "", ""), *((names[key], "", "") for key in keys))
@@ -266,7 +299,7 @@ def explanation_table(found: ExplanationRecord) -> Table:
     return Table(heads, tuple(rows), labels=2, under=tuple(under))
 
 
-def _cells(effect: EffectRecord, keys: Sequence[str]) -> Iterator[str]:
+def _cells(effect: ContributionRecord, keys: Sequence[str]) -> Iterator[str]:
     for key in keys:
         one: FactorRecord | None = getattr(effect, key)
         ok = "" if effect.ok == effect.runs else f"{effect.ok} of {effect.runs} ok"
@@ -283,13 +316,51 @@ def explanation_text(found: ExplanationRecord, width: Width = None) -> str:
     return f"{filled(found.words, width, further='')}\n\n{as_text(explanation_table(found))}"
 
 
-def explanation_markdown(found: ExplanationRecord, captions: dict[str, str]) -> str:
-    """Return an explanation as ``explain.md``: words, figures by file name with captions, table, pairs."""
-    title = f"# From {found.gap.less} to {found.gap.more} on {in_markdown(found.sequence.name)}"
-    shown = (f"![{in_markdown(said)}]({_FIGURES}/{name})\n\n{in_markdown(said)}" for name, said in captions.items())
+def explanation_markdown(found: ExplanationRecord) -> str:
+    """Return an explanation as ``explain.md``: words, figures with their captions, table, pairs."""
+    shown = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in found.figures.items())
     pairs = (
         f"{part.ingredient}: {'; '.join(f'{one.less} and {one.more}' for one in part.effects) or 'none'}"
         for part in found.parts
     )
-    parts = [title, in_markdown(found.words), *shown, as_markdown(explanation_table(found))]
+    parts = [
+        f"# {in_markdown(title_of(found))}",
+        in_markdown(found.words),
+        *shown,
+        as_markdown(explanation_table(found)),
+    ]
     return "\n\n".join([*parts, *markdown_section("Pairs that differ in one ingredient", pairs)]) + "\n"
+
+
+def title_of(found: ExplanationRecord) -> str:
+    """Return the title of an explanation."""
+    return f"From {found.gap.less} to {found.gap.more} on {found.sequence.name}"
+
+
+def explanation_section(found: ExplanationRecord, directory: Path) -> str:
+    """Return the section of the page for an explanation, with the figure of its directory inside, as HTML.
+
+    Raises DataError where the figure is missing.
+    """
+    return results_section(title_of(found), found.words, explanation_table(found), found.figures, directory)
+
+
+def check_explanation_directory(target: Path) -> None:
+    """Raise OutputError unless an explanation can be written at ``target`` without the loss of anybody's files."""
+    check_replaceable(target, _ours)
+
+
+def _ours(directory: Path) -> frozenset[str]:
+    return own_files(directory, EXPLANATION, read_explanation)
+
+
+def write_explanation(found: Explanation, target: Path, command: str) -> ExplanationRecord:
+    """Write ``explain.json``, ``explain.md`` and the figure, PNG and PDF, beside the outcomes kept in a directory.
+
+    Raises OutputError where it cannot be written or holds something else; nothing is left behind then.
+    """
+    from toolkit.report.figures.waterfall import draw_explanation
+
+    texts = {TEXT: explanation_markdown, EXPLANATION: to_text}
+    figures = list(draw_explanation(explanation_document(found)))
+    return write_results(target, _ours, figures, partial(explanation_document, found, command), texts)

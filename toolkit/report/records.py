@@ -20,6 +20,7 @@ from toolkit.gate.baseline import BaselineRecord
 from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
 from toolkit.report.card import CardRecord, read_card
 from toolkit.report.differences import DiffRecord
+from toolkit.report.explanation import ExplanationRecord, read_explanation
 from toolkit.report.export import BundleRecord
 from toolkit.report.manifest import Manifest, read_manifest
 from toolkit.report.report_json import Report, SeedsReport, read_report, read_seeds_report
@@ -31,6 +32,7 @@ __all__ = [
     "RECORDS",
     "read_card",
     "read_check",
+    "read_explanation",
     "read_manifest",
     "read_metrics",
     "read_report",
@@ -55,6 +57,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "diff-1": DiffRecord,
     "bundle-1": BundleRecord,
     "sweep-1": SweepRecord,
+    "explain-1": ExplanationRecord,
 }
 
 

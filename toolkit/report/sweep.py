@@ -1,35 +1,29 @@
 """A sweep as ``sweep.json`` (the contract ``vislam.sweep/1``), as a table and text made of that, and as a folder."""
 
-import base64
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from functools import partial
 from itertools import groupby
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit.errors import DataError
-from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, Axis, Breaking, Effect, Sweep
 from toolkit.files.documents import number as finite
 from toolkit.files.documents import of_attributes, read, to_text
-from toolkit.files.reading import read_input
-from toolkit.files.writing import check_replaceable, replaced_directory
+from toolkit.files.writing import check_replaceable
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import sequence_line
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.run_directory import PAGE, take_over
+from toolkit.report.results_folder import own_files, results_section, write_results
 from toolkit.report.text import (
     MISSING,
     Table,
-    as_html,
     as_markdown,
     as_text,
     cell,
-    in_html,
     in_markdown,
     number,
     unit_of,
@@ -39,7 +33,7 @@ from toolkit.settings import Scalar, changes_of
 if TYPE_CHECKING:
     from toolkit.report.figures.style import NamedFigure
 
-SWEEP, TEXT, _FIGURES = "sweep.json", "sweep.md", "figures"
+SWEEP, TEXT = "sweep.json", "sweep.md"
 
 
 class IntervalRecord(Struct, frozen=True, kw_only=True):
@@ -243,14 +237,8 @@ def sweep_section(sweep: SweepRecord, directory: Path) -> str:
 
     Raises DataError where a figure is missing.
     """
-    table = sweep_table(sweep)
-    parts = [f"<h2>Sweep of {in_html(sweep.sequence.name)}</h2>", f"<p>{in_html(sweep.about)}</p>", as_html(table)]
-    parts += [f'<p class="fine">{in_html(line)}</p>' for line in table.under]
-    for name, caption in sweep.figures.items():
-        image = base64.b64encode(read_input(directory / name)).decode("ascii")
-        figure = f'<img src="data:image/png;base64,{image}" alt="{in_html(caption)}" style="max-width: 100%">'
-        parts.append(f"<figure>{figure}<figcaption>{in_html(caption)}</figcaption></figure>")
-    return f'<section class="card sweep">{"".join(parts)}</section>'
+    title = f"Sweep of {sweep.sequence.name}"
+    return results_section(title, sweep.about, sweep_table(sweep), sweep.figures, directory)
 
 
 def check_sweep_directory(target: Path) -> None:
@@ -259,11 +247,7 @@ def check_sweep_directory(target: Path) -> None:
 
 
 def _ours(directory: Path) -> frozenset[str]:
-    """Return what in a directory an earlier sweep wrote, by its relative path; folders have a slash behind."""
-    files = set(files_of_ours(directory))
-    with suppress(DataError):
-        files |= {SWEEP, PAGE, *read_sweep(directory / SWEEP).files}
-    return frozenset(files | {f"{part.as_posix()}/" for file in files for part in PurePosixPath(file).parents} - {"./"})
+    return own_files(directory, SWEEP, read_sweep)
 
 
 def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Sequence[NamedFigure]") -> SweepRecord:
@@ -271,16 +255,5 @@ def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Sequence[Nam
 
     Raises OutputError where it cannot be written or holds something else; nothing is left behind then.
     """
-    from toolkit.report.figures import save
-
-    with replaced_directory(target, _ours) as directory:
-        if (target / OUTCOMES).exists():
-            take_over(target / OUTCOMES, directory / OUTCOMES)
-        (directory / _FIGURES).mkdir()
-        save(figures, directory / _FIGURES, "pdf")
-        captions = {f"{_FIGURES}/{name}": text for name, text in save(figures, directory / _FIGURES).items()}
-        written = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file())
-        document = sweep_document(sweep, command, captions, (*sorted(written), TEXT, SWEEP))
-        (directory / TEXT).write_text(sweep_markdown(document), encoding="utf-8")
-        (directory / SWEEP).write_text(to_text(document), encoding="utf-8")
-    return document
+    texts = {TEXT: sweep_markdown, SWEEP: to_text}
+    return write_results(target, _ours, figures, partial(sweep_document, sweep, command), texts)

@@ -1,7 +1,7 @@
 """The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
 Reading order: style -> over_time, bands, from_above, reprojection; the numbers are those of report.curves. sweeps has
-the figures of a sweep.
+the figures of a sweep, waterfall that of an explanation.
 """
 
 import warnings

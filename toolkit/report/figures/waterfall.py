@@ -4,10 +4,11 @@ what the second loses without it.
 
 import math
 from collections.abc import Iterator
+from typing import Literal
 
 from matplotlib.axes import Axes
 
-from toolkit.report.explanation import EffectRecord, ExplanationRecord
+from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, kinds, where
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
@@ -55,9 +56,9 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
     words.set_xlim(0.0, 1.0)
     _effect(axes, words, 0.0, found.gap, "from", 0.0)
     for row, part in enumerate(parts, start=1):
-        for k, effect in enumerate(part.effects):
+        for k, (kind, effect) in enumerate(kinds(found, part)):
             place = row + (k - 0.5 * (len(part.effects) - 1)) * _BAR
-            _effect(axes, words, place, effect, ("added", "taken")[k], (0.0, gap)[k])
+            _effect(axes, words, place, effect, kind, gap if kind == "taken" else 0.0)
     yield NamedFigure(
         "waterfall",
         f"What each ingredient brings {start} (blue, from the left) and what {goal} loses without it (orange, from the "
@@ -67,11 +68,12 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
     )
 
 
-def _effect(axes: Axes, words: Axes, row: float, effect: EffectRecord, kind: str, start: float) -> None:
+def _effect(
+    axes: Axes, words: Axes, row: float, effect: ContributionRecord, kind: Kind | Literal["from"], start: float
+) -> None:
     """Draw a bar with its interval, to the left where an ingredient is taken away, and say beside it what it is."""
     one, sign = effect.error, -1.0 if kind == "taken" else 1.0
     told = f"{effect.ok} of {effect.runs} ended well"
-    where = {"from": "", "added": f"added to {effect.less}", "taken": f"taken from {effect.more}"}[kind]
     is_sure = effect.shown or (kind == "from" and one is not None and one.is_off)
     if one is not None:
         width, *ends = (sign * math.log(value) for value in (one.factor, one.low, one.high))
@@ -79,7 +81,8 @@ def _effect(axes: Axes, words: Axes, row: float, effect: EffectRecord, kind: str
         axes.plot([start + end for end in ends], [row, row], color="black", linewidth=1.0, marker="|", markersize=5.0)
         told = f"{number(one.factor)} ({number(one.low)}-{number(one.high)})"
     words.text(0.0, row, told, fontsize=SMALL_PT, color=_COLOUR_OF[kind] if is_sure else MUTED_COLOUR, va="center")
-    words.text(0.36, row, where, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
+    told = "" if kind == "from" else where(kind, effect)
+    words.text(0.36, row, told, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
 
 
 def _log_ticks(axes: Axes) -> None:

@@ -49,7 +49,7 @@ def payload_of(runs: Sequence[Files]) -> Json:
     titles = _titles(runs)
     colours = look_numbers(run.estimator for files in runs for run in files.scores.runs)
     return {
-        "title": " / ".join(titles) or "Sweeps",
+        "title": " / ".join(titles) or "Experiments",
         "columns": columns_of(_values(runs), real=any(one.manifest.sequence.format != "simulated" for one in runs)),
         "cases": [
             _case(files, f"c{i}", title, colours) for i, (files, title) in enumerate(zip(runs, titles, strict=True))

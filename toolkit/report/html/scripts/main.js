@@ -89,7 +89,7 @@ function build() {
   const jumps = cases.length > 1 ? el("nav", { "aria-label": "Recordings" }, cases.map((one) => el("a", { href: `#${one.id}`, text: one.title }))) : null;
   document.getElementById("page").append(
     el("header", { class: "top" }, el("div", {}, el("span", { class: "brand", text: "vislam report" }), el("h1", { text: payload.title })), jumps, themeButton()),
-    el("main", {}, cases.length > 1 ? severalCases(cases, tables) : cases.map((one) => oneCase(one, tables)), [...document.querySelectorAll(".sweep")]),
+    el("main", {}, cases.length > 1 ? severalCases(cases, tables) : cases.map((one) => oneCase(one, tables)), [...document.querySelectorAll(".results")]),
     el("footer", { text: "Everything on this page is in this file; nothing is fetched. One recording is one sample: for a verdict between estimators, repeat it over seeds or on more recordings." }),
     hint,
   );

@@ -1,0 +1,119 @@
+"""An explanation's words: they call an effect only what is one, and tell where it was measured (1 s)."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from toolkit.report.explanation import (
+    ContributionRecord,
+    ExplanationRecord,
+    FactorRecord,
+    IngredientRecord,
+    VariantRecord,
+    explanation_table,
+    in_words,
+)
+from toolkit.report.manifest import RecordingRecord, SeedsUsed
+
+
+def variant(name: str, *without: str) -> VariantRecord:
+    return VariantRecord(estimator=name, output="causal", has=(), without=without)
+
+
+def effect(
+    less: VariantRecord, more: VariantRecord, factor: float, reach: float = 1.05, **given: object
+) -> ContributionRecord:
+    error = FactorRecord(factor=factor, low=factor / reach, high=factor * reach)
+    made = ContributionRecord(
+        less=less, more=more, distance=0, runs=8, ok=8, shown=error.is_off, error=error, variance=None, nees=None
+    )
+    return msgspec.structs.replace(made, **given)
+
+
+def part(
+    name: str, first: ContributionRecord | None, last: ContributionRecord | None = None, order: bool = False
+) -> IngredientRecord:
+    return IngredientRecord(ingredient=name, first_in=first, last_in=last or first, order_matters=order)
+
+
+A, B, BETWEEN = variant("a"), variant("b"), variant("c", "salt")
+
+
+def explanation(*parts: IngredientRecord, gap: ContributionRecord | None = None, **given: object) -> ExplanationRecord:
+    made = ExplanationRecord(
+        schema="vislam.explain/1",
+        made={},
+        sequence=RecordingRecord(name="drive", hash="", format="simulated", source=""),
+        seeds=SeedsUsed(sequence=0, count=8),
+        settings={},
+        intervals="seeds",
+        metric="ate_yaw_m",
+        words="",
+        gap=gap or effect(A, B, 5.1, 1.2),
+        parts=parts,
+        figures={},
+        files=(),
+    )
+    return msgspec.structs.replace(made, **given)
+
+
+def test_each_shown_effect_is_a_sentence_with_where_it_was_measured_and_its_interval() -> None:
+    found = explanation(
+        part("salt", effect(A, BETWEEN, 2.3), effect(BETWEEN, B, 2.0), order=True),
+        part("pepper", effect(BETWEEN, B, 0.8)),
+    )
+    words = in_words(found)
+    assert words.startswith(
+        "On drive b is 5.10 times as accurate as a (4.25 to 6.12 with 95 % confidence; ATE yaw, 8 seeds)."
+    )
+    assert "Salt, the largest effect: added to a, the error becomes 2.30 times smaller (2.19 to 2.42); " in words
+    assert "taken from b, the error becomes 2.00 times larger (1.90 to 2.10); the order matters." in words
+    assert "Pepper: taken from b, the error becomes 1.25 times smaller (1.19 to 1.31)." in words
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_effect_is_named_whose_interval_contains_none(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    parts = []
+    for i in range(6):
+        made = [effect(A, B, float(np.exp(draw.normal(0.0, 0.1))), float(np.exp(draw.uniform(0.0, 0.3)))) for _ in "ab"]
+        shown = [msgspec.structs.replace(one, shown=one.shown and draw.random() < 0.5) for one in made]
+        parts.append(part(f"ingredient{i}", shown[0], msgspec.structs.replace(shown[1], more=BETWEEN)))
+    words = in_words(explanation(*parts))
+    for one in parts:
+        claimed = f"{one.ingredient.capitalize()}:" in words or f"{one.ingredient.capitalize()}, the largest" in words
+        assert claimed == any(each.shown for each in one.effects)
+    shown = [one for each in parts for one in each.effects if one.shown]
+    assert all(one.error is not None and one.error.is_off for one in shown)
+    assert words.count("the error becomes") == len(shown)
+
+
+def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
+    lost = msgspec.structs.replace(effect(A, BETWEEN, 1.0), ok=2, error=None, shown=False)
+    perhaps = msgspec.structs.replace(effect(A, BETWEEN, 1.2), shown=False)
+    found = explanation(
+        part("salt", effect(A, BETWEEN, 1.0)), part("pepper", lost), part("tea", None), part("oil", perhaps)
+    )
+    words = in_words(found)
+    assert (
+        "Nothing that 8 seeds can show is brought by salt (0.952 to 1.05) and pepper (too few runs ended well)."
+        in words
+    )
+    assert "What tea brings cannot be measured: no two estimators differ in that alone." in words
+    assert "Oil (1.14 to 1.26) seems to have an effect; among 3 tests that may be chance" in words
+    assert [row[:3] for row in explanation_table(found).rows if row[0] in ("pepper", "tea")] == [
+        ("pepper", "added to a", "2 of 8 ok"),
+        ("tea", "no two differ in it alone", "-"),
+    ]
+
+
+def test_two_estimators_that_do_not_differ_are_not_ranked() -> None:
+    assert "8 seeds show no difference of ATE yaw between a and b (0.917 to 1.32)" in in_words(
+        explanation(gap=effect(A, B, 1.1, 1.2))
+    )
+
+
+def test_without_a_truth_the_error_is_that_of_withheld_tracks_and_called_so() -> None:
+    words = in_words(explanation(metric="heldout_reproj_median_px", intervals="stretches"))
+    assert "b predicts withheld tracks 5.10 times as well as a" in words
+    assert "the error of withheld tracks, for there is no truth, stretches of the one recording" in words
