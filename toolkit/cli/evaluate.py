@@ -61,6 +61,8 @@ MOST_RUNS = 10_000
     choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text"),
     output("evaluation.json, and nothing else", "see the exit status and --out"),
     arg("--out DIR", "write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV", Path),
+    choice("--figures", ("few", "all", "none"), "to draw with --out: of three sequences, or of all", default="few"),
+    choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
     WORKERS,
     examples=(
         "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
@@ -88,7 +90,7 @@ def evaluate(options: argparse.Namespace) -> int:
     with of_this_process()(f"{len(gathered.items)} trajectories") as progress:
         found = evaluate(gathered, terms, ranked_by.key, progress, options.workers or usable_cpus())
     if options.out is not None:
-        write_evaluation(found, options.out)
+        write_evaluation(found, options.out, options.figures, options.figure_format)
     if not options.quiet:
         print(_shown(found, columns, options), end="")
     return 0 if found.all_ok else 1

@@ -7,7 +7,7 @@ the place of a folder of trajectories.
 from pathlib import Path
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.evaluation.standings import EvaluatedSystems, PairedRecord, Quartiles, RunRecord, StandingRecord
 from toolkit.files import documents
@@ -59,6 +59,7 @@ class EvaluationRecord(Struct, frozen=True, kw_only=True):
     leaderboard: tuple[StandingRecord, ...]
     paired: Annotated[tuple[PairedRecord, ...], Meta(description="every pair of systems; empty for one sequence")]
     notes: tuple[str, ...]
+    figures: Annotated[tuple[str, ...], Meta(description="files in the folder of figures")] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         known = {one.sequence for one in self.sequences}

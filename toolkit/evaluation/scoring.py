@@ -216,16 +216,30 @@ def _with_times(file: PosesFile) -> PosesFile:
     return replace(file, t_ns=rows.stamps(NS_PER_S)) if as_many else file
 
 
+def _read(path: Path, truth: TruthFile, terms: Terms) -> tuple[PosesFile, Poses]:
+    """Return a trajectory file, and its poses on their stamps."""
+    file = read_poses(path, terms.cov_convention)
+    if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
+        file = _with_times(file)
+    return file, _stamped(file, truth, terms.offset_s)
+
+
+def aligned_file(path: Path, truth: TruthFile, terms: Terms) -> Matched:
+    """Return the pairs of a trajectory file and the truth that are scored, after the fit of SE(3) to all positions.
+
+    Raises DataError where the file cannot be used, Unavailable where nothing can be fitted.
+    """
+    matched = _matched(_read(path, truth, terms)[1], truth, terms.max_dt_s)
+    return replace(matched, estimate=PairsAgainstTruth(matched).se3_alignment.apply(matched.estimate))
+
+
 def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     """Return every metric of a trajectory file, None with the reason where one cannot be computed.
 
     Raises DataError where the file cannot be used or does not belong to the truth: a wrong clock, unit of time or of
     length, order of quaternions or number of lines is named.
     """
-    file = read_poses(path, terms.cov_convention)
-    if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
-        file = _with_times(file)
-    estimate = _stamped(file, truth, terms.offset_s)
+    file, estimate = _read(path, truth, terms)
     turn = _checked(file, estimate, truth)
     matched = _matched(estimate, truth, terms.max_dt_s)
     if turn is None:

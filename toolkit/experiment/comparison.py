@@ -18,7 +18,6 @@ distribution with heavy tails, for which no covariance is right.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -344,8 +343,3 @@ class Comparison:
 def in_order(outcomes: Iterable[Outcome], estimators: Sequence[str], seeds: Sequence[int]) -> tuple[Outcome, ...]:
     """Return outcomes by estimator, then seed, whatever the order they came in."""
     return tuple(sorted(outcomes, key=lambda o: (estimators.index(o.estimator), seeds.index(o.seed))))
-
-
-def plain_name(name: str) -> str:
-    """Return a name that is fit for a file, without blanks, brackets and the like; it may be empty."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._")

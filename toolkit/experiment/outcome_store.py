@@ -19,10 +19,9 @@ from msgspec import Meta, Struct
 from toolkit.answers import Output, Status
 from toolkit.errors import DataError, OutputError
 from toolkit.experiment.code_version import code_digest, numeric_versions
-from toolkit.experiment.comparison import plain_name
 from toolkit.experiment.units import Outcome, Scored, Unit
 from toolkit.files.reading import read_input
-from toolkit.files.writing import LineFile, whole_lines
+from toolkit.files.writing import LineFile, plain_name, whole_lines
 from toolkit.geometry import Array
 from toolkit.metrics import Scores, repeated, without_requests
 from toolkit.settings import Settings, as_values

@@ -23,7 +23,8 @@ from toolkit.datasets.trajectories.covariances import CovConvention, StatedCovar
 from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
-from toolkit.experiment.comparison import TRUTH, plain_name
+from toolkit.experiment.comparison import TRUTH
+from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.metrics.parts.against_truth import STAMP_TOLERANCE_NS, associate, median_period_ns, poses_at
 from toolkit.metrics.parts.consistency import body_errors, with_covariances

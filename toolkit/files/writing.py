@@ -6,6 +6,7 @@ A directory or a file appears complete or not at all: it is written beside its p
 import errno
 import fcntl
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable, Collection, Iterator
@@ -284,3 +285,8 @@ def _unwritable(target: Path, error: OSError, kind: str = "directory") -> Output
     in_the_way = next((parent for parent in target.parents if os.path.isfile(parent)), None)  # noqa: PTH113
     why = f"{in_the_way} is a file" if in_the_way else error.strerror or error
     return OutputError(f"{target} cannot be written ({why}); choose another {kind} with --out")
+
+
+def plain_name(name: str) -> str:
+    """Return a name that is fit for a file, without blanks, brackets and the like; it may be empty."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._")

@@ -1,15 +1,20 @@
 """An evaluation of trajectory files for people: who is ahead, by how much, what failed and what to know before.
 
 As text, Markdown, LaTeX and CSV, and as the directory of ``vislam evaluate --out``: ``evaluation.json``, runs as CSV,
-and the leaderboard in Markdown and as a page, one HTML file that opens from disk in the style of the report's page.
+figures, and the leaderboard in Markdown and as a page, one HTML file that opens from disk in the style of the report's
+page.
 """
 
+import base64
 import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+from msgspec import UNSET
+from msgspec.structs import replace
 
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
@@ -41,6 +46,9 @@ from toolkit.report.text import (
     unit_of,
     unrivalled,
 )
+
+if TYPE_CHECKING:
+    from toolkit.report.figures import FigureChoice, FigureFormat
 
 # Beside the metric that ranks, where there are values.
 _USUAL = (
@@ -277,30 +285,67 @@ def check_evaluation_directory(target: Path) -> None:
     check_replaceable(target, _written_by_us)
 
 
-def write_evaluation(evaluation: EvaluatedSystems, target: Path) -> None:
-    """Write the directory, in the place of an earlier one; raises OutputError where that cannot be."""
-    texts = (
-        to_text(evaluation_document(evaluation)),
-        leaderboard_page(evaluation),
-        evaluation_markdown(evaluation),
-        evaluation_csv(evaluation),
-    )
+def write_evaluation(
+    evaluation: EvaluatedSystems, target: Path, choice: "FigureChoice" = "few", kind: "FigureFormat" = "png"
+) -> None:
+    """Write the directory, in the place of an earlier one, with figures of a kind as chosen.
+
+    Raises OutputError where that cannot be.
+    """
     with replaced_directory(target, _written_by_us) as directory:
+        captions = _written_figures(evaluation, directory / "figures", choice, kind)
+        document = replace(evaluation_document(evaluation), figures=tuple(captions))
+        texts = (
+            to_text(document),
+            leaderboard_page(evaluation, _in_page(directory / "figures", captions)),
+            evaluation_markdown(evaluation),
+            evaluation_csv(evaluation),
+        )
         for name, text in zip(_FILES, texts, strict=True):
             (directory / name).write_text(text, encoding="utf-8")
+
+
+def _written_figures(
+    evaluation: EvaluatedSystems, folder: Path, choice: "FigureChoice", kind: "FigureFormat"
+) -> dict[str, str]:
+    """Draw into a new folder; return file name -> caption."""
+    if choice == "none":
+        return {}
+    # Here alone, for matplotlib takes long to import.
+    from toolkit.report.figures import literal, save
+    from toolkit.report.figures.trajectories import draw
+
+    folder.mkdir()
+    return save(map(literal, draw(evaluation, all_sequences=choice == "all")), folder, kind)
+
+
+def _in_page(folder: Path, captions: Mapping[str, str]) -> str:
+    """Return figures with their captions as elements of HTML, the images inside; a PDF is not shown in a page."""
+    kinds = {".png": "image/png", ".svg": "image/svg+xml"}
+    elements = []
+    for name, caption in captions.items():
+        image, words = folder / name, in_html(caption)
+        if image.suffix in kinds:
+            data = base64.b64encode(image.read_bytes()).decode()
+            source_of = f"data:{kinds[image.suffix]};base64,{data}"
+            elements.append(
+                f'<figure><img alt="{words}" src="{source_of}"><figcaption class="fine">{words}</figcaption></figure>'
+            )
+    return "".join(elements)
 
 
 def _written_by_us(directory: Path) -> frozenset[str]:
     """Return what in a directory an earlier evaluation wrote; nothing where its document is none of ours."""
     try:
-        read_evaluation(directory / EVALUATION)
+        document = read_evaluation(directory / EVALUATION)
     except DataError:
         return frozenset()
-    return frozenset(_FILES)
+    figures = () if document.figures is UNSET else document.figures
+    return frozenset({*_FILES, *(f"figures/{name}" for name in figures), *(["figures/"] if figures else [])})
 
 
-def leaderboard_page(evaluation: EvaluatedSystems) -> str:
-    """Return the page: leaderboard, a table by sequence, every run as a dot, tests, failures and notes."""
+def leaderboard_page(evaluation: EvaluatedSystems, figures: str = "") -> str:
+    """Return the page: leaderboard, a table by sequence, every run as a dot, figures, tests, failures and notes."""
     title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
     if len(evaluation.sequences) > 3:
         title += f" and {len(evaluation.sequences) - 3} more"
@@ -309,6 +354,7 @@ def leaderboard_page(evaluation: EvaluatedSystems) -> str:
         name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
         cards.append(_card(name, _html_table(sequences_table(evaluation))))
     cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
+    cards += [_card("Figures", figures)] if figures else []
     for name, lines in (
         ("Is it more than chance?", paired_lines(evaluation)),
         ("Runs that failed", failure_lines(evaluation, None)),

@@ -13,8 +13,9 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.answers import Output
-from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, read, rounded
+from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time

@@ -20,13 +20,13 @@ from toolkit.answers import Output
 from toolkit.datasets.trajectories import openvins, tum
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
-from toolkit.experiment.comparison import Comparison, plain_name
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.recording import Prepared
 from toolkit.files.documents import to_line, to_text
 from toolkit.files.reading import read_input
-from toolkit.files.writing import check_parent, check_replaceable, replaced_directory
+from toolkit.files.writing import check_parent, check_replaceable, plain_name, replaced_directory
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
 from toolkit.report import report_json

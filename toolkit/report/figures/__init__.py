@@ -1,13 +1,13 @@
 """The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
 Reading order: style -> over_time, bands, from_above, reprojection; the numbers are those of report.curves. sweeps has
-the figures of a sweep, waterfall that of an explanation.
+the figures of a sweep, waterfall that of an explanation, trajectories those of trajectory files.
 """
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -15,9 +15,10 @@ from matplotlib.axis import Axis
 from matplotlib.text import Text
 
 from toolkit.errors import printable
-from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import bands, from_above, over_time, reprojection
 from toolkit.report.figures.style import NamedFigure
+
+if TYPE_CHECKING:
+    from toolkit.experiment.comparison import Comparison
 
 FigureFormat = Literal["png", "pdf", "svg"]
 # Text stays text in an SVG; in a PDF fonts are whole, as publishers ask (no Type 3).
@@ -25,37 +26,38 @@ _IN_FILES: Any = {"svg.hashsalt": "vislam", "svg.fonttype": "none", "pdf.fonttyp
 # Metadata with the time of drawing, by format; they are removed so that the same figure gives the same bytes.
 _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
 FigureChoice = Literal["few", "all", "none"]
-_Drawing = Callable[[Comparison], Iterator[NamedFigure]]
-# Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
-_FEW: tuple[_Drawing, ...] = (
-    from_above.draw_all,
-    over_time.draw_errors,
-    over_time.draw_telling_components,
-    bands.draw_nees,
-    over_time.draw_bound,
-)
-_MORE: tuple[_Drawing, ...] = (
-    reprojection.draw,
-    bands.draw_nis,
-    over_time.draw_frame_times,
-    from_above.draw_trajectories,
-    from_above.draw_maps,
-    over_time.draw_fitted_errors,
-    over_time.draw_other_components,
-    from_above.draw_each,
-)
-_OVER_SEEDS: tuple[_Drawing, ...] = (bands.draw_over_seeds,)
 
 
-def drawn(comparison: Comparison, choice: FigureChoice = "all") -> Iterator[NamedFigure]:
+def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[NamedFigure]:
     """Draw the few most important figures, or all that the comparison has data for, each when it is reached."""
-    drawings = _OVER_SEEDS if comparison.over_seeds else _FEW + (_MORE if choice == "all" else ())
+    # With GTSAM, which figures of trajectory files do without.
+    from toolkit.report.figures import bands, from_above, over_time, reprojection
+
+    # Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
+    few = (
+        from_above.draw_all,
+        over_time.draw_errors,
+        over_time.draw_telling_components,
+        bands.draw_nees,
+        over_time.draw_bound,
+    )
+    more = (
+        reprojection.draw,
+        bands.draw_nis,
+        over_time.draw_frame_times,
+        from_above.draw_trajectories,
+        from_above.draw_maps,
+        over_time.draw_fitted_errors,
+        over_time.draw_other_components,
+        from_above.draw_each,
+    )
+    drawings = (bands.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
     if choice == "none":
         drawings = ()
-    return (_literal(figure) for drawing in drawings for figure in drawing(comparison))
+    return (literal(figure) for drawing in drawings for figure in drawing(comparison))
 
 
-def _literal(drawn_one: NamedFigure) -> NamedFigure:
+def literal(drawn_one: NamedFigure) -> NamedFigure:
     """Return a figure whose words are shown as they are: a name with dollar signs is no formula."""
     figure = drawn_one.figure
     parts = [part for part in figure.get_children() if not isinstance(part, Axes)]

@@ -17,7 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
 
 from toolkit.answers import Run
-from toolkit.experiment.comparison import Comparison, plain_name
+from toolkit.experiment.comparison import Comparison
+from toolkit.files.writing import plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import reprojection
 from toolkit.metrics.parts.against_truth import rmse

@@ -12,7 +12,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
 from toolkit.answers import Output
-from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.metrics.parts.against_truth import rmse

@@ -5,7 +5,7 @@ Figures are as wide as two columns of a paper and are to be set at that width: l
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any, Literal, NamedTuple, Self, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypedDict
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -18,8 +18,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 from toolkit.answers import Output
-from toolkit.experiment.comparison import Comparison, Row
-from toolkit.report.curves import COLOURS, look_numbers
+
+if TYPE_CHECKING:  # with GTSAM, which figures of trajectory files do without
+    from toolkit.experiment.comparison import Comparison, Row
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -51,7 +52,12 @@ class NamedFigure(NamedTuple):
     figure: Figure
 
 
-def colour_of(comparison: Comparison, estimator: str) -> str:
+def colour_at(place: int) -> str:
+    """Return a colour by its place; with more than there are they begin again."""
+    return _COLOURS[place % len(_COLOURS)]
+
+
+def colour_of(comparison: "Comparison", estimator: str) -> str:
     """Return the colour an estimator has in every figure of every run."""
     return stroke_among(comparison.estimators, estimator)["color"]
 
@@ -68,7 +74,7 @@ class Stroke(TypedDict):
     linestyle: Dashes
 
 
-def stroke_of(comparison: Comparison, estimator: str, output: Output) -> Stroke:
+def stroke_of(comparison: "Comparison", estimator: str, output: Output) -> Stroke:
     """Return colour and dashes of one kind of output of an estimator: other dashes where its colour is another's too.
 
     Both outputs keep the estimator's colour, so that thrice as many estimators as there are colours are told apart.
@@ -78,16 +84,18 @@ def stroke_of(comparison: Comparison, estimator: str, output: Output) -> Stroke:
 
 def stroke_among(estimators: Iterable[str], estimator: str, output: Output = "final") -> Stroke:
     """Return colour and dashes of one kind of output of an estimator, given all that are shown."""
+    from toolkit.report.curves import look_numbers
+
     number, styles = look_numbers(estimators)[estimator], _LINE_OF[output]
-    return Stroke(color=_COLOURS[number % COLOURS], linestyle=styles[number // COLOURS % len(styles)])
+    return Stroke(color=colour_at(number), linestyle=styles[number // len(_COLOURS) % len(styles)])
 
 
-def shown_as(row: Row) -> Output:
+def shown_as(row: "Row") -> Output:
     """Return the kind of output whose line a row has: a filter's only answer is drawn as a final one."""
     return "final" if row.label == "both" else row.output
 
 
-def width_of(comparison: Comparison, estimator: str) -> float:
+def width_of(comparison: "Comparison", estimator: str) -> float:
     """Return the width of an estimator's line: each wider than the next, so that equal lines show as a border."""
     order = [run.estimator for run in comparison.runs]
     if len(order) == 1:
@@ -123,7 +131,7 @@ class Entry(NamedTuple):
         return cls(label, (Line2D([], [], color=colour, linestyle=dashes, linewidth=width),))
 
 
-def entries_of(comparison: Comparison, drawn: Iterable[tuple[str, Output]]) -> list[Entry]:
+def entries_of(comparison: "Comparison", drawn: Iterable[tuple[str, Output]]) -> list[Entry]:
     """Return an entry for each estimator of which outputs are drawn, the final one's line first."""
     outputs: dict[str, list[Output]] = {}
     for name, output in drawn:
@@ -134,7 +142,7 @@ def entries_of(comparison: Comparison, drawn: Iterable[tuple[str, Output]]) -> l
     ]
 
 
-def _sample(comparison: Comparison, name: str, output: Output) -> Line2D:
+def _sample(comparison: "Comparison", name: str, output: Output) -> Line2D:
     return Line2D([], [], linewidth=1.8, **stroke_of(comparison, name, output))
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
-from toolkit.experiment.comparison import plain_name
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
+from toolkit.files.writing import plain_name
 from toolkit.report.figures.style import (
     MUTED_COLOUR,
     SMALL_PT,

@@ -1,0 +1,235 @@
+"""Trajectory files of any systems: the map, errors over time, positions and angles, and every run's error as boxes.
+
+Of each system it is the run of the middle error that is drawn, after the fit of SE(3) to its positions, as evo's -a.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from toolkit.errors import DataError
+from toolkit.evaluation.scoring import TruthFile, aligned_file
+from toolkit.evaluation.standings import EvaluatedSystems, RunRecord
+from toolkit.files.writing import plain_name
+from toolkit.geometry import Array, IntArray, yaw_of
+from toolkit.measurements import NS_PER_S
+from toolkit.metrics import Unavailable
+from toolkit.metrics.parts.against_truth import Matched, angles_deg, changes, lengths, rmse
+from toolkit.report.figures.style import (
+    TRUTH_COLOUR,
+    Entry,
+    NamedFigure,
+    colour_at,
+    finish,
+    legend_below,
+    new_figure,
+    panels_of,
+    scale_by_decades,
+    style_axes,
+)
+from toolkit.report.text import number
+
+# Systems in a figure of trajectories, from the first of the leaderboard; sequences that are drawn unless all are asked
+# for; and sequences that have a panel of boxes each.
+_MOST_SYSTEMS, _FEW_SEQUENCES, _MOST_PANELS = 7, 3, 12
+_ORDER_OF_MAGNITUDE = 12.0
+_FITTED = "after the fit of SE(3)"
+_TRUTH = Entry.of_line("truth", TRUTH_COLOUR)
+
+
+class _Drawn(NamedTuple):
+    """What is drawn of a system: its colour, and its pairs with the truth."""
+
+    system: str
+    colour: str
+    matched: Matched
+
+
+def draw(evaluation: EvaluatedSystems, *, all_sequences: bool = False) -> Iterator[NamedFigure]:
+    """Yield boxes of all runs, then the figures of the first few sequences or of all, each when it is reached."""
+    yield from _boxes(evaluation)
+    sequences = evaluation.ranked_sequences[: None if all_sequences else _FEW_SEQUENCES]
+    for i, sequence in enumerate(sequences):
+        truth, drawn = evaluation.truths[sequence], _drawn(evaluation, sequence)
+        if not drawn:
+            continue
+        name = plain_name(sequence) or "sequence"
+        name = f"{name}-{i + 1}" if name in map(plain_name, sequences[:i]) else name
+        yield _map(name, truth, drawn)
+        yield _errors(name, truth, drawn)
+        at_s = [_since_start(truth, one.matched.t_ns) for one in drawn]
+        positions = [one.matched.estimate[:, :3, 3] for one in drawn]
+        yield _components(f"positions_{name}", truth, drawn, at_s, (truth.poses[:, :3, 3], positions), "xyz")
+        if changes(truth.poses[:, :3, :3]):
+            angles = [_roll_pitch_yaw_deg(one.matched.estimate) for one in drawn]
+            both = _roll_pitch_yaw_deg(truth.poses), angles
+            yield _components(f"angles_{name}", truth, drawn, at_s, both, ("roll", "pitch", "yaw"))
+
+
+def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
+    """Return the run of the middle error of each of the first systems that has one."""
+    truth, found = evaluation.truths[sequence], []
+    for standing in evaluation.leaderboard[:_MOST_SYSTEMS]:
+        system = standing.estimator
+        run = _middle(evaluation, system, sequence)
+        if run is None or run.file is None:
+            continue
+        try:
+            matched = aligned_file(Path(run.file), truth, evaluation.terms)
+        except (DataError, Unavailable):  # a file that went away, or one whose positions nothing can be fitted to
+            continue
+        found.append(_Drawn(system, colour_at(evaluation.systems.index(system)), matched))
+    return found
+
+
+def _middle(evaluation: EvaluatedSystems, system: str, sequence: str) -> RunRecord | None:
+    key, cell = evaluation.ranked_by.key, evaluation.cells[system, sequence]
+    good = [(value, run) for run in cell.runs if run.status == "ok" and (value := run.metrics.get(key)) is not None]
+    ordered = sorted(good, key=lambda pair: pair[0])
+    return ordered[(len(ordered) - 1) // 2][1] if ordered else None
+
+
+def _since_start(truth: TruthFile, t_ns: IntArray) -> Array:
+    """Return times (n,) s since the truth's first pose, or the numbers of poses where there are no stamps."""
+    since: Array = (t_ns - truth.t_ns[0]) / NS_PER_S
+    return since if truth.is_timed else np.arange(t_ns.size, dtype=float)
+
+
+def _x_label(truth: TruthFile) -> str:
+    return "time [s]" if truth.is_timed else "pose"
+
+
+def _entries(drawn: list[_Drawn]) -> list[Entry]:
+    return [Entry.of_line(one.system, one.colour) for one in drawn]
+
+
+def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
+    figure = new_figure(5.0)
+    axes = figure.subplots()
+    axes.plot(*truth.poses[:, :2, 3].T, color=TRUTH_COLOUR, linewidth=2.2)
+    for one in drawn:
+        axes.plot(*one.matched.estimate[:, :2, 3].T, color=one.colour, linewidth=1.2)
+    axes.plot(*truth.poses[0, :2, 3], "o", color=TRUTH_COLOUR, markersize=5.0)
+    axes.set_aspect("equal", adjustable="datalim")
+    style_axes(axes, f"{truth.name} from above, {_FITTED}", "x [m]", "y [m]")
+    legend_below(figure, [_TRUTH, *_entries(drawn)])
+    return NamedFigure(f"map_{name}", f"{truth.name} from above, from the dot on, {_FITTED} to all positions.", figure)
+
+
+def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
+    """Return distances, and angles where the truth has orientations, with RMSE and median in the legend."""
+    with_angles = changes(truth.poses[:, :3, :3])
+    figure = new_figure(4.4 if with_angles else 2.8)
+    grid = figure.subplots(1 + with_angles, 1, sharex=True, squeeze=False).ravel()
+    entries: list[Entry] = []
+    sizes: list[float] = []
+    largest = 0.0
+    for one in drawn:
+        at_s, pairs = _since_start(truth, one.matched.t_ns), one.matched
+        error_m = lengths(pairs.truth[:, :3, 3] - pairs.estimate[:, :3, 3])
+        grid[0].plot(at_s, error_m, color=one.colour, linewidth=1.2)
+        sizes, largest = [*sizes, rmse(error_m)], max(largest, float(error_m.max()))
+        told = f"{one.system}: RMSE {number(rmse(error_m))} m, median {number(float(np.median(error_m)))} m"
+        if with_angles:
+            error_deg = angles_deg(np.swapaxes(pairs.truth[:, :3, :3], 1, 2) @ pairs.estimate[:, :3, :3])
+            grid[1].plot(at_s, error_deg, color=one.colour, linewidth=1.2)
+            told += f"; {number(rmse(error_deg))} deg, {number(float(np.median(error_deg)))} deg"
+        entries.append(Entry.of_line(told, one.colour))
+    style_axes(grid[0], f"{truth.name}: position error, {_FITTED}", "", "position [m]")
+    if with_angles:
+        style_axes(grid[1], "rotation error", "", "rotation [deg]")
+        grid[1].set_ylim(bottom=0.0)
+    grid[-1].set_xlabel(_x_label(truth))
+    _fit_scale(grid[0], sizes, largest)
+    figure.align_ylabels()
+    legend_below(figure, entries)
+    return NamedFigure(
+        f"errors_{name}", f"Errors on {truth.name} over time, {_FITTED}, with their RMSE and median.", figure
+    )
+
+
+def _fit_scale(axes: Axes, sizes: list[float], largest: float) -> None:
+    """Make an axis logarithmic where the errors differ by more than an order of magnitude."""
+    least = min((size for size in sizes if size > 0.0), default=0.0)
+    if least and max(sizes) > _ORDER_OF_MAGNITUDE * least:
+        scale_by_decades(axes, 0.2 * least, 1.2 * largest)
+    else:
+        axes.set_ylim(bottom=0.0)
+
+
+def _components(
+    name: str,
+    truth: TruthFile,
+    drawn: list[_Drawn],
+    at_s: list[Array],
+    values: tuple[Array, list[Array]],
+    rows: str | tuple[str, ...],
+) -> NamedFigure:
+    """Return three panels, one a component of the truth's values (N, 3) and of each estimate's (n, 3)."""
+    true, estimates = values
+    unit = "m" if rows == "xyz" else "deg"
+    figure = new_figure(4.6)
+    grid = figure.subplots(3, 1, sharex=True)
+    for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
+        axes.plot(_since_start(truth, truth.t_ns), true[:, i], color=TRUTH_COLOUR, linewidth=2.0)
+        for one, t_s, estimate in zip(drawn, at_s, estimates, strict=True):
+            axes.plot(t_s, estimate[:, i], color=one.colour, linewidth=1.2)
+        title = f"{truth.name}: {'position' if unit == 'm' else 'angles'}, {_FITTED}" if i == 0 else ""
+        style_axes(axes, title, _x_label(truth) if i == 2 else "", f"{row} [{unit}]")
+    figure.align_ylabels()
+    legend_below(figure, [_TRUTH, *_entries(drawn)])
+    what = "Position" if unit == "m" else "Roll, pitch and yaw (about z, then y, then x)"
+    return NamedFigure(name, f"{what} on {truth.name} over time, {_FITTED}, with the truth.", figure)
+
+
+def _roll_pitch_yaw_deg(poses: Array) -> Array:
+    """Return the angles (n, 3) of R = Rz(yaw) Ry(pitch) Rx(roll), without leaps of a whole turn."""
+    rotation = poses[:, :3, :3]
+    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+    pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
+    return np.degrees(np.unwrap(np.stack([roll, pitch, yaw_of(rotation)], axis=1), axis=0))
+
+
+def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
+    """Yield boxes of the ranking error: over the runs of each sequence, or of many sequences over their medians."""
+    metric, systems = evaluation.ranked_by, evaluation.systems
+    cells, sequences = evaluation.cells, evaluation.ranked_sequences
+    if len(sequences) > _MOST_PANELS:
+        medians = {name: [cells[name, sequence].median(metric) for sequence in sequences] for name in systems}
+        groups, over = {"all sequences": medians}, f"the medians of {len(sequences)} sequences"
+    else:
+        over = "the runs that are ok"
+        groups = {
+            sequence: {
+                name: [run.metrics.get(metric.key) for run in cells[name, sequence].runs if run.status == "ok"]
+                for name in systems
+            }
+            for sequence in sequences
+        }
+    figure, panels = panels_of(list(groups), "", 2.0)
+    every = []
+    for sequence, axes in panels.items():
+        axes.set_xticks([])
+        for place, name in enumerate(systems):
+            values = [value for value in groups[sequence][name] if value is not None]
+            colour = colour_at(place)
+            if values:
+                line = {"color": colour, "linewidth": 1.3}
+                axes.boxplot(
+                    [values], positions=[place], widths=0.6, whis=(0.0, 100.0), manage_ticks=False,
+                    boxprops=line, whiskerprops=line, capprops=line, medianprops=line,
+                )  # fmt: skip
+                axes.plot(np.full(len(values), place), values, ".", color=colour, markersize=4.0, alpha=0.6)
+            every += values
+    if not every:
+        return
+    if min(every) > 0.0 and max(every) > _ORDER_OF_MAGNITUDE * min(every):
+        scale_by_decades(next(iter(panels.values())), 0.8 * min(every), 1.2 * max(every))
+    unit = f" [{metric.unit}]" if metric.unit not in ("", "1") else ""
+    entries = [Entry.of_line(name, colour_at(place)) for place, name in enumerate(systems)]
+    finish(figure, panels, f"{metric.name}{unit}", f"{metric.name} over {over}", entries)
+    caption = f"{metric.name} over {over}: median, quartiles, least and most, and every value as a dot."
+    yield NamedFigure("boxes", caption, figure)
