@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.covariances import CONVENTIONS
+from toolkit.datasets.trajectories.covariances import CONVENTIONS, written_as
 from toolkit.estimate import Trajectory
-from toolkit.geometry import se3_exp
+from toolkit.geometry import quaternion_from_rotation, se3_exp
 
 # Heading and forward position are the least certain (rad, m); and the position depends on the heading.
 ROOT = np.diag([2e-3, 2e-3, 1e-2, 0.3, 0.05, 0.05])
@@ -81,6 +83,55 @@ def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam) -
     assert run["metrics"]["ate_se3_m"] < 0.5
     said = run_of(vislam, "--cov-convention", "pos-rot/fixed")
     assert said["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=0.06)
+
+
+def write_bag(path: Path, trajectory: Trajectory, topics: tuple[str, ...], convention: str = "pos-rot/fixed") -> None:
+    """Write the poses as odometry, each topic the same, with covariances in a convention."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+
+    def make(name: str, *values: object) -> object:
+        return store.types[name](*values)
+
+    zeros = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", zeros, zeros), np.zeros(36))
+    covs = written_as(CONVENTIONS[convention], trajectory.T_world_imu, trajectory.cov, 6)
+    turns = quaternion_from_rotation(trajectory.T_world_imu[:, :3, :3])
+    with Writer(path) as writer:
+        for topic in topics:
+            connection = writer.add_connection(topic, "nav_msgs/msg/Odometry", typestore=store)
+            for t_ns, at, turn, cov in zip(trajectory.t_ns.tolist(), trajectory.positions, turns, covs, strict=True):
+                stamp = make("builtin_interfaces/msg/Time", *divmod(t_ns, 10**9))
+                header = make("std_msgs/msg/Header", 0, stamp, "odom")
+                where = make("geometry_msgs/msg/Point", *at), make("geometry_msgs/msg/Quaternion", *turn)
+                pose = make("geometry_msgs/msg/PoseWithCovariance", make("geometry_msgs/msg/Pose", *where), cov.ravel())
+                message = make("nav_msgs/msg/Odometry", header, "imu", pose, twist)
+                writer.write(connection, t_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+
+
+def test_odometry_of_a_bag_is_scored_with_the_covariances_of_ros(scene, vislam, capsys) -> None:
+    given = estimate(scene)
+    written(given)
+    by_file = run_of(vislam)["metrics"]
+    write_bag(Path("est.bag"), given, ("/odom", "/other"))
+    assert vislam("evaluate", "truth.tum", "est=est.bag:/odom", "--out", "out", "--quiet") == 0
+    (run,) = json.loads(Path("out/evaluation.json").read_text())["runs"]
+    for key in ("nees_pose_mean", "ate_se3_m", "log_score_pose", "inside_50_ori_percent"):
+        assert run["metrics"][key] == pytest.approx(by_file[key], rel=1e-9)
+    assert vislam("evaluate", "truth.tum", "est.bag", "--quiet") == 3
+    assert "name the topic of the poses, as in est.bag:/odom; there are /odom (nav_msgs/Odom" in capsys.readouterr().err
+    assert vislam("evaluate", "truth.tum", "est.bag:/odm", "--quiet") == 3
+    assert "no topic of poses is called /odm (did you mean /odom?)" in capsys.readouterr().err
+
+
+def test_a_bag_whose_program_writes_another_convention_is_named(scene, vislam) -> None:
+    write_bag(Path("est.bag"), estimate(scene), ("/odom",), "rot-pos/mixed")
+    assert vislam("evaluate", "truth.tum", "est.bag", "--out", "out", "--quiet") == 0
+    (run,) = json.loads(Path("out/evaluation.json").read_text())["runs"]
+    assert run["notes"]["nees_pose_mean"].startswith("the covariances are said to be pos-rot/fixed and fit the errors")
+    said = ("--cov-convention", "rot-pos/mixed", "--out", "out", "--quiet")
+    assert vislam("evaluate", "truth.tum", "est.bag", *said) == 0
+    (run,) = json.loads(Path("out/evaluation.json").read_text())["runs"]
+    assert run["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 0.9, 1.1), (0.25, 1.4, 1.8)])

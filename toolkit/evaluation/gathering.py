@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from toolkit.datasets.io.bag_reader import place_in_bag
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import unreadable
 
@@ -153,7 +154,8 @@ def _named(word: str) -> tuple[str | None, Path]:
 
 def _existing(path: Path) -> Path:
     """Return the path; raises DataError where it does not exist: a mistyped name is no failure of a system."""
-    if not path.exists():
+    place = place_in_bag(path)
+    if not (path if place is None else place[0]).exists():
         raise DataError(f"{path}: there is no such file; check the path")
     return path
 

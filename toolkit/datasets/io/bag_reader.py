@@ -140,6 +140,14 @@ def kind_of(path: Path) -> Kind | None:
     return next((kind for magic, kind in _MAGIC.items() if begin.startswith(magic)), None)
 
 
+def place_in_bag(path: Path) -> tuple[Path, str | None] | None:
+    """Return the bag that a path is, or names with a topic, as in ``run.bag:/odom``; None where it is neither."""
+    name, colon, topic = str(path).partition(":/")
+    if colon and not path.exists():
+        return Path(name), f"/{topic}"
+    return (path, None) if path.exists() and kind_of(path) is not None else None
+
+
 def _of_rosbag2(metadata: Path) -> bool:
     if not is_regular(metadata):
         return False

@@ -19,6 +19,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from toolkit.datasets.io.bag_reader import place_in_bag
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
 from toolkit.datasets.trajectories.covariances import (
     OPENVINS,
@@ -463,7 +464,7 @@ _KIND = (
 
 
 def read_poses(path: Path, cov_convention: CovConvention | None = None) -> PosesFile:
-    """Read a file of any of the formats, which is recognised from its content and not from its name.
+    """Read a file of any of the formats, which is recognised from its content, or poses of a bag (``run.bag:/odom``).
 
     ``cov_convention`` is that of its covariances where the file does not say it.
 
@@ -471,7 +472,13 @@ def read_poses(path: Path, cov_convention: CovConvention | None = None) -> Poses
     not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
     only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
     """
-    return read_finite_poses(path, cov_convention).whole()
+    place = place_in_bag(path)
+    if place is None:
+        return read_finite_poses(path, cov_convention).whole()
+    # Here, because what reads messages imports what makes tracks of images.
+    from toolkit.datasets.trajectories.bags import read_topic
+
+    return read_topic(*place, cov_convention)
 
 
 def read_finite_poses(path: Path, cov_convention: CovConvention | None = None) -> PosesFile:

@@ -55,7 +55,7 @@ def likelier_reading(stated: StatedCovariances, T_world_imu: Array, errors: Erro
     if own < (_TIMES if best <= _NEAR else _TIMES_ANY) * best:
         return ""
     fits = f"the covariances are said to be {stated.convention.name} and fit the errors only as {alike}"
-    return f"{fits}: correct the header, or name the convention with --cov-convention {told}"
+    return f"{fits}: correct its header or, where it names none, --cov-convention {told}"
 
 
 def _listed(values: Iterable[tuple[str, float]]) -> str:
