@@ -19,7 +19,7 @@ LENGTH_S = {"drive": 10.0, "drive-imu": 10.0, "flight": 6.0}
 
 
 @cache
-def clean(scenario: str = "drive", seed: int = 0, duration_s: float | None = None) -> Sequence:
+def clean_recording(scenario: str = "drive", seed: int = 0, duration_s: float | None = None) -> Sequence:
     """Return a simulated recording."""
     length_s = LENGTH_S[scenario] if duration_s is None else duration_s
     return simulate(replace(SCENARIOS[scenario], duration_s=length_s), seed)
@@ -170,7 +170,7 @@ def plant(request: pytest.FixtureRequest) -> Plant:
     """Return each fault planted in each kind of recording that can have it."""
     scenario, name = request.param
     # A lag of the twists shows only where there are turns enough.
-    return PLANTS[name](clean(scenario, duration_s=30.0 if name == "twist-lag" else None))
+    return PLANTS[name](clean_recording(scenario, duration_s=30.0 if name == "twist-lag" else None))
 
 
 def _once(function: Callable[..., Any], content: Callable[[Sequence], str]) -> Callable[..., Any]:
@@ -210,13 +210,33 @@ def _derived_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def clean_recording() -> Callable[..., Sequence]:
-    """Return the maker of clean recordings: scenario, seed, length."""
-    return clean
+def planted(name: str, sequence: Sequence) -> Sequence:
+    """Plant a fault, by its name, in a recording."""
+    return PLANTS[name](sequence).planted
 
 
-@pytest.fixture
-def planted() -> Callable[[str, Sequence], Sequence]:
-    """Return what plants a fault, by name, in a recording."""
-    return lambda name, sequence: PLANTS[name](sequence).planted
+# Long enough for faults that show in the second half alone, or beside turns.
+LONGER_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+
+
+@cache
+def recording(scenario: str, seed: int = 1, duration_s: float | None = None, varied: bool = False) -> Sequence:
+    """Return a simulated recording of any scenario."""
+    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s or LONGER_S[scenario], varied=varied), seed)
+
+
+def details(outcome: Audit) -> dict[str, str]:
+    return {finding.fault: finding.detail for finding in outcome.findings}
+
+
+def unrepaired(sequence: Sequence) -> dict[str, str]:
+    return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}
+
+
+def with_values(sequence: Sequence, change: Callable[[Array], Array]) -> Sequence:
+    """Return a recording whose motion samples have other values (S, 6)."""
+    return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, change(sequence.motion.values.copy())))
+
+
+def with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))

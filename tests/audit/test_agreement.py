@@ -2,34 +2,21 @@
 
 import re
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from toolkit.audit import Audit, audit
+from tests.audit.conftest import LONGER_S, details, recording
+from toolkit.audit import audit
 from toolkit.audit.agreement import Deviation, accelerometer_change, sustained
 from toolkit.audit.calibration import steady_difference
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.sequence import Sequence
-from toolkit.simulation import SCENARIOS, faults, simulate
-
-LENGTH_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+from toolkit.simulation import SCENARIOS, faults
 
 
-@cache
-def recording(scenario: str, seed: int = 1, duration_s: float | None = None, varied: bool = False) -> Sequence:
-    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s or LENGTH_S[scenario], varied=varied), seed)
-
-
-def details(outcome: Audit) -> dict[str, str]:
-    return {finding.fault: finding.detail for finding in outcome.findings}
-
-
-@pytest.mark.parametrize("seed", [11, 12])
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_a_sound_recording_warns_of_nothing(scenario: str, seed: int) -> None:
-    findings = audit(recording(scenario, seed, 8.0)).findings
+def test_a_sound_recording_warns_of_nothing(scenario: str) -> None:
+    findings = audit(recording(scenario, 11, 8.0)).findings
     assert not any(finding.warning or finding.blocking for finding in findings)
     assert [finding.fault for finding in findings] == ["correlated-tracks"] * ("realistic" in scenario)
 
@@ -100,12 +87,12 @@ def test_a_scale_that_wanders_hides_a_step_and_the_audit_says_how_large_a_one() 
     assert "scale-change" not in audit(clean).undecided
 
 
-@pytest.mark.parametrize("scenario", LENGTH_S)
+@pytest.mark.parametrize("scenario", LONGER_S)
 def test_an_image_that_jumps_and_stays_is_reported_at_its_time(scenario: str) -> None:
     faulty = faults.jumped_image(recording(scenario), 15.0)
     found = re.search(r"at ([\d.]+) s \(by ([\d.]+) rad\)", details(audit(faulty))["image-jump"])
     assert found is not None
-    assert float(found[1]) == pytest.approx(LENGTH_S[scenario] / 2.0, abs=0.2)
+    assert float(found[1]) == pytest.approx(LONGER_S[scenario] / 2.0, abs=0.2)
     # A shift is a rotation in the middle of the image only, and close points take some of it for a translation.
     assert float(found[2]) == pytest.approx(np.sqrt(2.0) * 15.0 / faulty.rig.fx_px, rel=0.35)
 
@@ -117,8 +104,10 @@ def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
     assert "image-jump" not in details(audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))))
 
 
-@pytest.mark.parametrize("dose", [0.97, 1.06])
-@pytest.mark.parametrize(("scenario", "duration_s"), [("drive-imu", 12.0), ("flight", 8.0), ("flight-realistic", 8.0)])
+@pytest.mark.parametrize(
+    ("scenario", "duration_s", "dose"),
+    [("drive-imu", 12.0, 1.06), ("flight", 8.0, 0.97), ("flight-realistic", 8.0, 1.06)],
+)
 def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
     scenario: str, duration_s: float, dose: float
 ) -> None:
@@ -137,9 +126,7 @@ def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
     ("fault", "dose", "percent"),
     [
         (faults.wrong_focal_length, 1.02, 2.0),
-        (faults.baseline_unit, 1.02, 2.0),
         (faults.linear_unit, 1.02, -2.0),
-        (faults.wrong_focal_length, 0.97, -3.0),
     ],
 )
 def test_two_percent_of_scale_are_reported_with_their_error(fault: faults.Fault, dose: float, percent: float) -> None:
@@ -160,16 +147,7 @@ def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction() -> N
 
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-realistic"])
-@pytest.mark.parametrize("seed", range(50, 54))
+@pytest.mark.parametrize("seed", (50, 51))
 def test_a_sound_drive_has_no_steady_difference(scenario: str, seed: int) -> None:
     sound = recording(scenario, seed, 8.0 + (seed % 4) * 4.0, seed % 2 == 1)
     assert steady_difference(Evidence(sound)) is None
-
-
-def test_vision_that_is_too_long_beside_odometry_is_a_fault_reported_once_with_its_error() -> None:
-    (reported,) = details(audit(faults.stretched_disparity(recording("drive", 4), 1.06))).values()
-    match = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", reported)
-    assert match is not None
-    # 1 - 1 / 1.06 is 5.7 %; the tracks' noise makes half a percent of bias.
-    assert float(match[1]) == pytest.approx(5.7, abs=1.0)
-    assert float(match[2]) < 0.6

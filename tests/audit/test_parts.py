@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from toolkit.audit.conventions import axes_named, right_handed_axes, signed_axes
-from toolkit.audit.edits import split
 from toolkit.audit.intervals import interval_means
 from toolkit.audit.one_step import errors_are_independent
 from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
@@ -14,7 +13,7 @@ from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import camera_motion
-from toolkit.sequence import Observations, Sequence
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
 
@@ -60,17 +59,6 @@ def test_interval_means_integrate_straight_lines_exactly() -> None:
     values = np.stack([2.0 * t_ns / NS_PER_S, np.ones(5)], axis=1)
     frames_t_ns = np.array([1, 2, 8, 11]) * NS_PER_S
     np.testing.assert_allclose(interval_means(t_ns, values, frames_t_ns), [[3, 1], [10, 1], [19, 1]], rtol=1e-12)
-
-
-def test_split_renames_from_the_start_on_and_keeps_every_other_track() -> None:
-    observations = Observations.sorted(
-        np.array([0, 1, 2, 3, 0, 1, 2]), np.array([7, 7, 7, 7, 9, 9, 9]), np.zeros((7, 3))
-    )
-    starts = (observations.track_id == 7) & (observations.frame == 2)
-    renamed = split(observations, starts)
-    assert renamed[(observations.track_id == 7) & (observations.frame < 2)].tolist() == [7, 7]
-    assert renamed[(observations.track_id == 7) & (observations.frame >= 2)].tolist() == [10, 10]
-    assert (renamed[observations.track_id == 9] == 9).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8])

@@ -7,11 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.audit.conftest import unrepaired, with_pixels
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.tracks import coarse_pixels, track_scatter
 from toolkit.datasets import own_tables
-from toolkit.geometry import Array, interpolate_poses, se3_inverse, transform
+from toolkit.geometry import interpolate_poses, se3_inverse, transform
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 from toolkit.models.stereo import CHANNELS, project, triangulate
 from toolkit.sequence import Sequence
@@ -22,14 +23,6 @@ from toolkit.simulation.sensors import TrackNoise, with_track_noise
 @cache
 def recording(scenario: str, seed: int = 3, duration_s: float = 6.0) -> Sequence:
     return simulate(replace(SCENARIOS[scenario], duration_s=duration_s), seed)
-
-
-def with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
-    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
-
-
-def details(sequence: Sequence) -> dict[str, str]:
-    return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}
 
 
 @pytest.mark.parametrize("scenario", ["drive", "flight"])
@@ -101,10 +94,10 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
 def test_tracks_with_a_walk_or_an_offset_of_their_own_are_reported_and_white_or_exact_ones_are_not() -> None:
     exact = simulate(replace(SCENARIOS["flight"], duration_s=4.0, noise_scale=0.0), 3)
     for sound in (recording("flight"), recording("drive"), exact):
-        assert "correlated-tracks" not in details(sound)
+        assert "correlated-tracks" not in unrepaired(sound)
     walks = faults.track_walk(recording("flight", 3, 4.0), 4.0, 3)
-    assert "where independent errors have -0.5" in details(walks)["correlated-tracks"]
-    assert "correlated-tracks" in details(faults.match_offset(recording("drive"), 3.0, 3))
+    assert "where independent errors have -0.5" in unrepaired(walks)["correlated-tracks"]
+    assert "correlated-tracks" in unrepaired(faults.match_offset(recording("drive"), 3.0, 3))
 
 
 def scatter_of(sequence: Sequence) -> str | None:
@@ -136,11 +129,11 @@ def test_of_tracks_with_correlated_errors_only_a_noise_far_too_large_is_reported
 
 def test_mismatches_are_reported_and_a_few_are_not() -> None:
     sound = recording("drive", 7, 8.0)
-    assert set(details(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter", "correlated-tracks"}
-    assert details(faults.outlier_tracks(sound, 0.05, 7)) == {}
+    assert set(unrepaired(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter", "correlated-tracks"}
+    assert unrepaired(faults.outlier_tracks(sound, 0.05, 7)) == {}
     overstated = faults.wrong_noise(sound, 2.0)
     assert "have residuals of more than" not in (scatter_of(overstated) or "")
-    match = re.search(r"frame ([\d.]+)% \+-", details(faults.exchanged_tracks(overstated, 0.1, 1))["track-scatter"])
+    match = re.search(r"frame ([\d.]+)% \+-", unrepaired(faults.exchanged_tracks(overstated, 0.1, 1))["track-scatter"])
     # An exchanged sighting spoils the step to it and the one from it: nearly twice the share, less those lost as pairs.
     assert match is not None and 10.0 < float(match[1]) < 20.0
 
@@ -148,7 +141,9 @@ def test_mismatches_are_reported_and_a_few_are_not() -> None:
 @pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 12.0), ("flight", 6.0)])
 def test_a_tenth_of_tracks_that_slide_is_reported_where_the_noise_is_right(scenario: str, duration_s: float) -> None:
     sound = recording(scenario, 9, duration_s)
-    match = re.search(r"frame ([\d.]+)% \+- ([\d.]+)%", details(faults.outlier_tracks(sound, 0.1, 9))["track-scatter"])
+    match = re.search(
+        r"frame ([\d.]+)% \+- ([\d.]+)%", unrepaired(faults.outlier_tracks(sound, 0.1, 9))["track-scatter"]
+    )
     # Some slide by less than four standard deviations a frame; with twice the noise stated they are beneath it.
     assert match is not None and 1.0 < float(match[1]) < 10.0
     beneath = scatter_of(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))

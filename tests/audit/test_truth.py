@@ -51,8 +51,7 @@ def test_a_truth_in_another_unit_is_named_and_not_taken_for_another_motion(metre
     assert f"times the truth's, as of one in {unit}" in found.detail
 
 
-@pytest.mark.parametrize("scale", [0.8, 2.0])
-@pytest.mark.parametrize("scenario", ["drive", "flight"])
+@pytest.mark.parametrize(("scenario", "scale"), [("drive", 0.8), ("flight", 2.0)])
 def test_a_wrong_baseline_is_reported_with_its_size(scenario: str, scale: float) -> None:
     found = truth_mismatch(Evidence(faults.baseline_unit(recording(scenario), scale)))
     assert isinstance(found, Symptom) and found.warns
@@ -70,8 +69,7 @@ def test_a_truth_of_another_flight_is_reported() -> None:
     assert "the truth's motion is not the camera's" in found.detail
 
 
-@pytest.mark.parametrize("late_s", [0.05, 0.5])
-@pytest.mark.parametrize("scenario", ["flight", "drive", "drive-imu"])
+@pytest.mark.parametrize(("scenario", "late_s"), [("flight", 0.05), ("drive", 0.5), ("drive-imu", 0.05)])
 def test_a_truth_by_another_clock_is_reported_with_its_offset(scenario: str, late_s: float) -> None:
     sequence = recording(scenario, 5, 12.0)
     truth = truth_of(sequence)
@@ -97,8 +95,7 @@ def test_a_truth_that_leaps_or_is_not_finite_is_reported(rows: slice, added: flo
     assert expected in with_poses(recording("flight"), poses)
 
 
-@pytest.mark.parametrize("scenario", ["drive", "flight"])
-@pytest.mark.parametrize("from_to", [(0, None), (40, None), (20, 65)])
+@pytest.mark.parametrize(("scenario", "from_to"), [("drive", (0, None)), ("flight", (40, None)), ("flight", (20, 65))])
 def test_a_truth_that_stands_still_while_the_camera_moves_is_reported(
     scenario: str, from_to: tuple[int, int | None]
 ) -> None:
@@ -129,8 +126,16 @@ def test_a_truth_of_other_times_or_none_is_not_checked() -> None:
     assert isinstance(with_truth(drive, elsewhen), Undecided)
 
 
-@pytest.mark.parametrize("pace", [1.03, 0.95, 1.015, 1.0])
-@pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 12.0), ("drive-imu", 12.0), ("flight", 6.0)])
+@pytest.mark.parametrize(
+    ("scenario", "duration_s", "pace"),
+    [
+        ("drive", 12.0, 1.03),
+        ("drive-imu", 12.0, 0.95),
+        ("flight", 6.0, 1.015),
+        ("drive", 12.0, 1.0),
+        ("flight", 6.0, 1.0),
+    ],
+)
 def test_the_pace_of_the_truths_clock_is_reported(scenario: str, duration_s: float, pace: float) -> None:
     evidence = Evidence(faults.truth_clock_rate(recording(scenario, 31, duration_s, True), pace))
     symptom = truth_clock(evidence)
@@ -159,8 +164,9 @@ def test_a_truth_without_turns_leaves_its_clock_open() -> None:
     assert isinstance(reported, Undecided) and "too little change of rotation" in reported.why
 
 
-@pytest.mark.parametrize("scenario", ["flight", "drive-imu"])
-@pytest.mark.parametrize("gravity_world", [(0.0, 0.0, 9.81), (-9.81, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("scenario", "gravity_world"), [("flight", (0.0, 0.0, 9.81)), ("drive-imu", (-9.81, 0.0, 0.0))]
+)
 def test_gravity_that_points_elsewhere_is_set_right(scenario: str, gravity_world: tuple[float, ...]) -> None:
     sound = recording(scenario, 31, 6.0, True)
     assert "gravity-direction" not in {finding.fault for finding in audit(sound).findings}
