@@ -11,8 +11,6 @@ import pytest
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 
-Refused = Callable[..., None]
-
 
 def edit(path: Path, old: str, new: str) -> None:
     """Replace a text in a file, the first time it stands there."""
@@ -83,26 +81,14 @@ def openvins(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def assert_folder_refused() -> Refused:
-    """Return a check that reading a folder as a recording fails in one line that holds a pattern."""
-
-    def check(folder: Path, pattern: str) -> None:
-        with pytest.raises(DataError, match=pattern) as raised:
-            load_sequence(str(folder))
-        assert "\n" not in str(raised.value)
-
-    return check
+def assert_folder_refused(folder: Path, pattern: str) -> None:
+    with pytest.raises(DataError, match=pattern) as raised:
+        load_sequence(str(folder))
+    assert "\n" not in str(raised.value)
 
 
-@pytest.fixture
-def assert_refused() -> Refused:
-    """Return a check that reading a file fails in one line, which names the file and holds a pattern."""
-
-    def check(read: Callable[[], object], path: Path, pattern: str) -> None:
-        with pytest.raises(DataError, match=pattern) as raised:
-            read()
-        assert str(path) in str(raised.value)
-        assert "\n" not in str(raised.value)
-
-    return check
+def assert_refused(read: Callable[[], object], path: Path, pattern: str) -> None:
+    with pytest.raises(DataError, match=pattern) as raised:
+        read()
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)

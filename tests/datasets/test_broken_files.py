@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from tests.datasets.conftest import assert_refused
 from tests.datasets.conftest import edit as replace
 from tests.datasets.test_own_tables import recorded, written
 from toolkit.datasets import load_sequence
@@ -22,7 +23,6 @@ from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3, so3_exp
 
-Refused = Callable[..., None]
 Arrays = dict[str, Any]
 # What an array is exchanged for, the arrays to leave out, and what the answer says.
 Broken = tuple[Arrays, tuple[str, ...], str]
@@ -91,9 +91,7 @@ UTIAS: list[Broken] = [
 
 
 @pytest.mark.parametrize(("name", "broken"), [*(("course", row) for row in COURSE), *(("utias", row) for row in UTIAS)])
-def test_arrays(
-    name: str, broken: Broken, request: pytest.FixtureRequest, tmp_path: Path, assert_refused: Refused
-) -> None:
+def test_arrays(name: str, broken: Broken, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     exchanged, left_out, says = broken
     sound: Arrays = request.getfixturevalue(name)
     arrays = {key: value for key, value in (sound | exchanged).items() if key not in left_out}
@@ -188,15 +186,13 @@ OWN: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("spoil", "says"), OPENVINS)
-def test_exports_of_openvins(
-    openvins: Path, spoil: Callable[[Path], object], says: str, assert_refused: Refused
-) -> None:
+def test_exports_of_openvins(openvins: Path, spoil: Callable[[Path], object], says: str) -> None:
     spoil(openvins)
     assert_refused(lambda: load_sequence(str(openvins)), openvins, says)
 
 
 @pytest.mark.parametrize(("spoil", "says"), OWN)
-def test_own_tables(tmp_path: Path, spoil: Callable[[Path], object], says: str, assert_refused: Refused) -> None:
+def test_own_tables(tmp_path: Path, spoil: Callable[[Path], object], says: str) -> None:
     folder = written(recorded("imu"), tmp_path / "own")
     spoil(folder)
     assert_refused(lambda: load_sequence(str(folder)), folder, says)
@@ -223,9 +219,7 @@ OF_STAMPS = [
     ("name", "row", "column", "word", "says"),
     [(name, row, where[name], word, says) for row, where, word, says in CELLS + OF_STAMPS for name in where],
 )
-def test_a_cell_of_a_trajectory(
-    tmp_path: Path, name: str, row: int, column: int, word: str, says: str, assert_refused: Refused
-) -> None:
+def test_a_cell_of_a_trajectory(tmp_path: Path, name: str, row: int, column: int, word: str, says: str) -> None:
     rng = np.random.default_rng(5)
     poses = se3(so3_exp(rng.normal(size=(6, 3))), rng.normal(size=(6, 3)))
     separator = "," if name == "euroc" else " "
@@ -262,7 +256,7 @@ TEXTS = [
 
 
 @pytest.mark.parametrize(("content", "says"), TEXTS)
-def test_a_file_that_is_no_trajectory(tmp_path: Path, content: bytes, says: str, assert_refused: Refused) -> None:
+def test_a_file_that_is_no_trajectory(tmp_path: Path, content: bytes, says: str) -> None:
     path = tmp_path / "poses"
     path.write_bytes(content)
     assert_refused(lambda: read_poses(path), path, says)
@@ -285,6 +279,6 @@ OTHERS = [
 
 
 @pytest.mark.parametrize(("content", "says"), OTHERS)
-def test_a_file_that_is_no_recording(tmp_path: Path, content: bytes, says: str, assert_refused: Refused) -> None:
+def test_a_file_that_is_no_recording(tmp_path: Path, content: bytes, says: str) -> None:
     (tmp_path / "drive").write_bytes(content)
     assert_refused(lambda: load_sequence(str(tmp_path / "drive")), tmp_path / "drive", says)

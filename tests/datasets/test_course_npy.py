@@ -5,7 +5,6 @@ import os
 import pickle
 import pickletools
 import tracemalloc
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.datasets.conftest import assert_refused
 from toolkit.audit import audit
 from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.io.numpy_files import read_dict
@@ -25,7 +25,6 @@ from toolkit.sequence import NO_FEATURES, Sequence
 from toolkit.settings import Frontend
 from toolkit.simulation import DRIVE, simulate
 
-Refused = Callable[..., None]
 T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 CONVENTIONS = {
     "as given, camera axes optical": se3_inverse,
@@ -175,7 +174,7 @@ class Touches:
 
 
 def test_a_pickle_that_would_run_something_is_refused_by_name_and_nothing_is_run(
-    tmp_path: Path, small: dict[str, Any], assert_refused: Refused
+    tmp_path: Path, small: dict[str, Any]
 ) -> None:
     path = saved(tmp_path, {**small, "extra": Touches(tmp_path / "touched")})
     assert_refused(lambda: load_sequence(str(path)), path, r"names posix\.mkdir.*nothing of it was executed")
@@ -194,9 +193,7 @@ def test_a_pickle_that_would_run_something_is_refused_by_name_and_nothing_is_run
         ({"v_t": 1j}, "only plain numbers"),
     ],
 )
-def test_other_content_is_refused_in_one_line(
-    tmp_path: Path, assert_refused: Refused, content: Any, pattern: str
-) -> None:
+def test_other_content_is_refused_in_one_line(tmp_path: Path, content: Any, pattern: str) -> None:
     path = saved(tmp_path, content)
     assert_refused(lambda: load_sequence(str(path)), path, pattern)
 
@@ -216,15 +213,13 @@ def test_other_content_is_refused_in_one_line(
         (b"]r\xff\xff\xff\xff.", "holds no dict"),
     ],
 )
-def test_what_no_plain_data_need_is_refused_by_name(
-    tmp_path: Path, assert_refused: Refused, instructions: bytes, pattern: str
-) -> None:
+def test_what_no_plain_data_need_is_refused_by_name(tmp_path: Path, instructions: bytes, pattern: str) -> None:
     path = saved(tmp_path, {"v_t": 1})
     path.write_bytes(path.read_bytes()[:128] + instructions)
     assert_refused(lambda: load_sequence(str(path)), path, pattern)
 
 
-def test_bytes_that_are_announced_and_not_there_are_no_memory_taken(tmp_path: Path, assert_refused: Refused) -> None:
+def test_bytes_that_are_announced_and_not_there_are_no_memory_taken(tmp_path: Path) -> None:
     path = saved(tmp_path, {"v_t": 1})
     header = path.read_bytes()[:128]
     path.write_bytes(header + b"\x80\x04\x8e" + (1 << 50).to_bytes(8, "little") + b"x")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.datasets.conftest import edit
+from tests.datasets.conftest import assert_refused, edit
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.datasets.io.fields import read_fields
@@ -19,7 +19,6 @@ from toolkit.models.stereo import project, triangulate
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence
 
-Refused = Callable[..., None]
 # As large as today's stamps, and no multiple of what a double can tell apart.
 START_NS = 1_403_715_273_262_142_977
 AXIS = np.array([0.6, 0.0, 0.8])
@@ -284,7 +283,7 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
 
 @pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
 def test_a_malformed_recording_is_one_clear_line(
-    recording: Path, spoil: Callable[[Path], object], complaint: str, assert_refused: Refused
+    recording: Path, spoil: Callable[[Path], object], complaint: str
 ) -> None:
     spoil(recording)
     assert_refused(lambda: load_sequence(str(recording)), recording, complaint)

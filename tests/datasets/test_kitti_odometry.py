@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import toolkit
-from tests.datasets.conftest import edit
+from tests.datasets.conftest import assert_folder_refused, edit
 from toolkit.datasets import kitti, load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
@@ -164,7 +164,7 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
 
 @pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in BROKEN], ids=[m[0] for m in BROKEN])
 def test_a_folder_that_cannot_be_used_is_one_clear_line(
-    drive: Path, spoil: Callable[[Path], object], complaint: str, assert_folder_refused: Callable[..., None]
+    drive: Path, spoil: Callable[[Path], object], complaint: str
 ) -> None:
     spoil(drive)
     assert_folder_refused(drive, complaint)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.datasets.conftest import edit
+from tests.datasets.conftest import assert_folder_refused, edit
 from toolkit.datasets import load_sequence
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
@@ -198,7 +198,7 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
 
 @pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in BROKEN], ids=[m[0] for m in BROKEN])
 def test_a_drive_that_cannot_be_used_is_one_clear_line(
-    drive: Path, spoil: Callable[[Path], object], complaint: str, assert_folder_refused: Callable[..., None]
+    drive: Path, spoil: Callable[[Path], object], complaint: str
 ) -> None:
     spoil(drive)
     assert_folder_refused(drive, complaint)

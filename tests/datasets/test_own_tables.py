@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import toolkit
+from tests.datasets.conftest import assert_refused
 from toolkit.cli import main
 from toolkit.datasets import own_tables
 from toolkit.datasets.trajectories import tum
@@ -20,7 +21,6 @@ from toolkit.measurements import is_left_only
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-Refused = Callable[..., None]
 NAMES = {"imu": own_tables.IMU, "twist": own_tables.TWIST}
 
 
@@ -133,7 +133,7 @@ def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Pat
     ],
 )
 def test_tables_as_spreadsheets_write_them_are_read_or_reported(
-    tmp_path: Path, assert_refused: Refused, write: Callable[[str], str], pattern: str | None
+    tmp_path: Path, write: Callable[[str], str], pattern: str | None
 ) -> None:
     folder = written(recorded("twist"), tmp_path / "own")
     path, expected = folder / "tracks.csv", toolkit.load_sequence(str(folder)).content_hash()

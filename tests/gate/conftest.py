@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,16 +85,3 @@ def planted(percent: float, seed: int, estimator: str = "two", metric: str = "at
 def as_another_trajectory(measured: Measured) -> Measured:
     """Return what is measured with every metric moved by a hundred-thousandth, as by poses that are not the same."""
     return edited(measured, lambda _name, _key, values: values * (1.0 + 1e-5))
-
-
-@pytest.fixture
-def gate() -> SimpleNamespace:
-    """Return the ways to change what is measured, and to check it."""
-    return SimpleNamespace(
-        as_measured=as_measured,
-        another=as_another_trajectory,
-        edited=edited,
-        checked=checked,
-        planted=planted,
-        seeds=SEEDS,
-    )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from tests.gate.conftest import SEEDS, as_another_trajectory, as_measured, checked, edited, planted
 from toolkit.gate.baseline import COVERAGE
 
 
@@ -21,8 +22,8 @@ def with_values(measured, estimator, key, values):
     return with_series(measured, estimator, causal=measured.runs[estimator].causal | {key: values})
 
 
-def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
-    check = gate.checked(baseline, gate.as_measured(baseline))
+def test_identical_results_pass_and_every_difference_is_zero(baseline):
+    check = checked(baseline, as_measured(baseline))
     assert check.passed
     assert check.tests == 3 * 5  # estimators times metrics, on the simulated sequence
     assert {v.finding for v in check.verdicts} == {"same"}
@@ -33,35 +34,35 @@ def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
 
 
 @pytest.mark.parametrize("metric", ["ate_se3_m", "ate_yaw_m", "heldout_reproj_median_px"])
-def test_a_planted_regression_fails_and_nothing_else_does(baseline, gate, metric):
-    simulated, recorded = gate.as_measured(baseline)
-    check = gate.checked(baseline, [gate.edited(simulated, gate.planted(5.0, 1, metric=metric)), recorded])
+def test_a_planted_regression_fails_and_nothing_else_does(baseline, metric):
+    simulated, recorded = as_measured(baseline)
+    check = checked(baseline, [edited(simulated, planted(5.0, 1, metric=metric)), recorded])
     assert findings(check) == [("flight", "two", metric, "regressed")]
     assert check.failures[0].p < 0.05
     assert check.failures[0].change_percent == pytest.approx(5.0, abs=2.0)
 
 
 @pytest.mark.parametrize(("accepted", "finding"), [(False, "moved"), (True, "better")])
-def test_an_improvement_fails_unless_it_is_accepted(baseline, gate, accepted, finding):
-    simulated, recorded = gate.as_measured(baseline)
-    moved = gate.edited(simulated, gate.planted(-10.0, 1))
-    check = gate.checked(baseline, [moved, recorded], accept_better=accepted)
+def test_an_improvement_fails_unless_it_is_accepted(baseline, accepted, finding):
+    simulated, recorded = as_measured(baseline)
+    moved = edited(simulated, planted(-10.0, 1))
+    check = checked(baseline, [moved, recorded], accept_better=accepted)
     assert check.passed is accepted
     assert [(v.estimator, v.metric, v.finding) for v in check.verdicts if v.finding != "same"] == [
         ("two", "ate_se3_m", finding)
     ]
 
 
-def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(baseline):
+    simulated, recorded = as_measured(baseline)
     findings = {
         (factor, accepted): {v.finding for v in check.verdicts if v.metric == "ate_se3_m" and v.sequence == "flight"}
         for factor in (1.0 + 1e-7, 0.996, 1.004, 1.006)
         for accepted in (False, True)
         for check in [
-            gate.checked(
+            checked(
                 baseline,
-                [gate.edited(simulated, lambda _n, _k, v, f=factor: v * f), recorded],
+                [edited(simulated, lambda _n, _k, v, f=factor: v * f), recorded],
                 accept_better=accepted,
             )
         ]
@@ -78,10 +79,10 @@ def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(ba
     }
 
 
-def test_a_change_under_a_few_seeds_is_chance(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_a_change_under_a_few_seeds_is_chance(baseline):
+    simulated, recorded = as_measured(baseline)
     flipped = np.where(np.arange(24) < 3, 1.02, 1.0)  # as a gate that decides otherwise after another rounding
-    assert gate.checked(baseline, [gate.edited(simulated, lambda _n, _k, v: v * flipped), recorded]).passed
+    assert checked(baseline, [edited(simulated, lambda _n, _k, v: v * flipped), recorded]).passed
 
 
 @pytest.mark.parametrize("accepted", [False, True])
@@ -94,23 +95,19 @@ def test_a_change_under_a_few_seeds_is_chance(baseline, gate):
         (("ate_se3_m", "ate_yaw_m", "rpe_100m_percent", "heldout_reproj_median_px", "nees_pose_mean"), ()),
     ],
 )
-def test_a_metric_that_moves_while_the_poses_do_not_is_another_metric(baseline, gate, edit, changed, accepted):
-    now = [
-        gate.edited(one, lambda n, k, v: 0.9 * v if n == "two" and k in edit else v)
-        for one in gate.as_measured(baseline)
-    ]
-    check = gate.checked(baseline, now, accept_better=accepted)
+def test_a_metric_that_moves_while_the_poses_do_not_is_another_metric(baseline, edit, changed, accepted):
+    now = [edited(one, lambda n, k, v: 0.9 * v if n == "two" and k in edit else v) for one in as_measured(baseline)]
+    check = checked(baseline, now, accept_better=accepted)
     found = {v.metric for v in check.verdicts if v.finding == "changed metric"}
     assert found == set(changed)
     assert not (found and check.passed)
 
 
-def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline):
+    simulated, recorded = as_measured(baseline)
     checks = 300
     alarms = sum(
-        not gate.checked(baseline, [gate.edited(simulated, gate.planted(0.0, seed)), recorded]).passed
-        for seed in range(checks)
+        not checked(baseline, [edited(simulated, planted(0.0, seed)), recorded]).passed for seed in range(checks)
     )
     # 15 are promised at most; three standard deviations above that.
     assert alarms <= 15 + 3.0 * np.sqrt(15.0)
@@ -130,25 +127,25 @@ def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline, gate):
         (3.0, 0.6, False),  # through it, and nearer
     ],
 )
-def test_consistency_is_worse_farther_from_its_band_on_either_side(baseline, gate, was, now, fails):
-    found = consistency_findings(baseline, gate, was, now, accept_better=True)
+def test_consistency_is_worse_farther_from_its_band_on_either_side(baseline, was, now, fails):
+    found = consistency_findings(baseline, was, now, accept_better=True)
     assert found == ([("flight", "two", "nees_pose_mean", "regressed")] if fails else [])
 
 
 @pytest.mark.parametrize(("was", "now"), [(4.0, 3.6), (0.30, 0.33), (0.95, 1.05), (1.05, 0.95), (3.0, 0.6)])
-def test_consistency_that_moves_either_way_fails_unless_accepted(baseline, gate, was, now):
-    assert consistency_findings(baseline, gate, was, now) == [("flight", "two", "nees_pose_mean", "moved")]
+def test_consistency_that_moves_either_way_fails_unless_accepted(baseline, was, now):
+    assert consistency_findings(baseline, was, now) == [("flight", "two", "nees_pose_mean", "moved")]
 
 
-def consistency_findings(baseline, gate, was, now, **terms):
-    simulated, recorded = gate.as_measured(baseline)
+def consistency_findings(baseline, was, now, **terms):
+    simulated, recorded = as_measured(baseline)
     rng = np.random.default_rng(9)
-    scatter = np.exp(0.1 * rng.standard_normal(len(gate.seeds)))
+    scatter = np.exp(0.1 * rng.standard_normal(len(SEEDS)))
     before = with_values(simulated, "two", "nees_pose_mean", tuple((was * scatter).tolist()))
     moved = now * scatter * np.exp(0.02 * rng.standard_normal(scatter.size))
     after = with_values(simulated, "two", "nees_pose_mean", tuple(moved.tolist()))
     of_then = replace(baseline, cases=((baseline.cases[0][0], before), baseline.cases[1]))
-    return findings(gate.checked(of_then, [after, recorded], **terms))
+    return findings(checked(of_then, [after, recorded], **terms))
 
 
 @pytest.mark.parametrize(
@@ -167,74 +164,74 @@ def consistency_findings(baseline, gate, was, now, **terms):
 )
 @pytest.mark.parametrize("accept_better", [False, True])
 def test_a_recording_shows_any_change_and_fails_beyond_its_bound(
-    baseline, gate, metric, factor, finding, accepted, accept_better
+    baseline, metric, factor, finding, accepted, accept_better
 ):
-    simulated, recorded = gate.as_measured(baseline)
+    simulated, recorded = as_measured(baseline)
     finding = accepted if accept_better else finding
-    moved = gate.another(recorded)
-    changed = gate.edited(moved, lambda n, key, v: v * factor if (n, key) == ("two", metric) else v)
-    check = gate.checked(baseline, [simulated, changed], accept_better=accept_better)
+    moved = as_another_trajectory(recorded)
+    changed = edited(moved, lambda n, key, v: v * factor if (n, key) == ("two", metric) else v)
+    check = checked(baseline, [simulated, changed], accept_better=accept_better)
     one = next(v for v in check.verdicts if (v.sequence, v.estimator, v.metric) == ("data/drive_small", "two", metric))
     assert one.finding == finding
     assert check.passed == (finding not in ("regressed", "moved"))
 
 
-def test_a_recording_that_rounds_otherwise_is_the_same(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
-    check = gate.checked(baseline, [simulated, gate.edited(recorded, lambda _n, _k, v: v * (1.0 + 1e-8))])
+def test_a_recording_that_rounds_otherwise_is_the_same(baseline):
+    simulated, recorded = as_measured(baseline)
+    check = checked(baseline, [simulated, edited(recorded, lambda _n, _k, v: v * (1.0 + 1e-8))])
     assert {v.finding for v in check.verdicts} == {"same"}
 
 
 @pytest.mark.parametrize("status", ["diverged", "failed"])
-def test_a_run_that_ended_well_and_no_longer_does_fails(baseline, gate, status):
-    simulated, recorded = gate.as_measured(baseline)
+def test_a_run_that_ended_well_and_no_longer_does_fails(baseline, status):
+    simulated, recorded = as_measured(baseline)
     changed = with_series(simulated, "two", status=("ok", status, *("ok",) * 22))
     changed = replace(changed, why={"two": "left the road"})
-    check = gate.checked(baseline, [changed, recorded])
+    check = checked(baseline, [changed, recorded])
     assert findings(check) == [("flight", "two", "status", "regressed")]
     assert check.failures[0].words == f"{status} under seed 1: left the road"
 
 
-def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline):
+    simulated, recorded = as_measured(baseline)
     before = with_series(simulated, "two", status=("failed", *("ok",) * 23))
     of_then = replace(baseline, cases=((baseline.cases[0][0], before), baseline.cases[1]))
-    assert findings(gate.checked(of_then, [simulated, recorded])) == [("flight", "two", "status", "moved")]
-    check = gate.checked(of_then, [simulated, recorded], accept_better=True)
+    assert findings(checked(of_then, [simulated, recorded])) == [("flight", "two", "status", "moved")]
+    check = checked(of_then, [simulated, recorded], accept_better=True)
     assert check.passed
     assert "flight: two ends better in 1 runs than before" in check.notes
 
 
-def test_frames_that_got_lost_fail_however_good_the_rest(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_frames_that_got_lost_fail_however_good_the_rest(baseline):
+    simulated, recorded = as_measured(baseline)
     lost = with_values(simulated, "two", COVERAGE, (97.0, *(100.0,) * 23))
-    assert findings(gate.checked(baseline, [lost, recorded])) == [("flight", "two", COVERAGE, "regressed")]
+    assert findings(checked(baseline, [lost, recorded])) == [("flight", "two", COVERAGE, "regressed")]
 
 
-def test_other_measurements_are_not_compared(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
+def test_other_measurements_are_not_compared(baseline):
+    simulated, recorded = as_measured(baseline)
     other = replace(
         simulated,
         hashes=("other", *simulated.hashes[1:]),
         fingerprints=("other", *simulated.fingerprints[1:]),
     )
-    check = gate.checked(baseline, [other, recorded])
+    check = checked(baseline, [other, recorded])
     assert findings(check) == [("flight", "", "sequence", "missing")]
     assert "under seed 0" in check.failures[0].words
 
 
-def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseline, gate):
-    simulated, recorded = gate.as_measured(baseline)
-    check = gate.checked(baseline, [replace(simulated, hashes=("other", *simulated.hashes[1:])), recorded])
+def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseline):
+    simulated, recorded = as_measured(baseline)
+    check = checked(baseline, [replace(simulated, hashes=("other", *simulated.hashes[1:])), recorded])
     assert check.passed
     assert "last bits" in check.notes[0]
 
 
 @pytest.mark.parametrize(("factor", "finding"), [(1.25, "same"), (1.4, "regressed"), (0.6, "better")])
-def test_speed_is_checked_by_its_ratio_to_the_reference(baseline, gate, factor, finding):
-    simulated, recorded = gate.as_measured(baseline)
+def test_speed_is_checked_by_its_ratio_to_the_reference(baseline, factor, finding):
+    simulated, recorded = as_measured(baseline)
     slower = with_series(simulated, "two", speed=tuple(factor * s for s in simulated.runs["two"].speed))
-    check = gate.checked(baseline, [slower, recorded])
+    check = checked(baseline, [slower, recorded])
     one = next(v for v in check.verdicts if (v.estimator, v.metric) == ("two", "speed"))
     assert (one.finding, check.passed) == (finding, finding != "regressed")
-    assert gate.checked(baseline, [slower, recorded], speed=False).passed
+    assert checked(baseline, [slower, recorded], speed=False).passed

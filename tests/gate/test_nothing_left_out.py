@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from msgspec import UNSET, structs
 
+from tests.gate.conftest import as_another_trajectory, as_measured, checked, edited
 from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.datasets.trajectories import tum
@@ -187,14 +188,14 @@ def losses_of_a_series(one: SeriesRecord, last: int) -> Iterator[tuple[str, Seri
                 yield f"{key} {what}", structs.replace(one, **{output: of_output})
 
 
-def test_nothing_that_was_measured_can_be_missing(baseline: Baseline, gate) -> None:
+def test_nothing_that_was_measured_can_be_missing(baseline: Baseline) -> None:
     passed, count = [], 0
     for i, (case, before) in enumerate(baseline.cases):
         for what, now in losses(before):
-            measured = gate.as_measured(baseline)
+            measured = as_measured(baseline)
             measured[i] = now
             count += 1
-            passed += [f"{case.source}: {what}"] if gate.checked(baseline, measured).passed else []
+            passed += [f"{case.source}: {what}"] if checked(baseline, measured).passed else []
     assert count > 500
     assert passed == []
 
@@ -209,13 +210,13 @@ def test_a_unit_that_gives_no_result_is_a_run_that_failed(baseline: Baseline) ->
         assert (verdict.finding, verdict.metric) == ("regressed", "status")
 
 
-def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline: Baseline, gate) -> None:
+def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline: Baseline) -> None:
     case, before = baseline.cases[0]
     one_seed = gathered_first(before)
     single = replace(baseline, cases=((replace(case, seeds=(0,)), one_seed), baseline.cases[1]))
     for percent, fails in ((0.4, False), (0.6, True)):
-        now = gate.edited(one_seed, lambda _n, k, v, f=1.0 + percent / 100.0: v * f if k == "ate_se3_m" else v)
-        check = gate.checked(single, [gate.another(now), gate.as_measured(baseline)[1]], accept_better=True)
+        now = edited(one_seed, lambda _n, k, v, f=1.0 + percent / 100.0: v * f if k == "ate_se3_m" else v)
+        check = checked(single, [as_another_trajectory(now), as_measured(baseline)[1]], accept_better=True)
         assert any("one seed" in note for note in check.notes)
         assert bool([v for v in check.failures if v.metric == "ate_se3_m"]) is fails
 

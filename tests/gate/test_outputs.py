@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import pytest
 from msgspec import structs
 
+from tests.gate.conftest import as_measured, checked, edited, planted
 from toolkit.cli import main
 from toolkit.gate.verdict import check_document
 from toolkit.report.gate import BEGINNINGS, WRITERS, gate_markdown, gate_text, write_check
@@ -16,22 +17,22 @@ from toolkit.report.records import read_check
 
 
 @pytest.fixture
-def failed(baseline, gate):
+def failed(baseline):
     """A check with a regression, a missing estimator whose reason would break a table, and an improvement."""
-    simulated, recorded = gate.as_measured(baseline)
-    worse = gate.edited(simulated, gate.planted(8.0, 1))
+    simulated, recorded = as_measured(baseline)
+    worse = edited(simulated, planted(8.0, 1))
     runs = {name: one for name, one in recorded.runs.items() if name != "three"}
     slower = structs.replace(worse.runs["one"], speed=tuple(0.5 * s for s in worse.runs["one"].speed))
     now = [
         replace(worse, runs=worse.runs | {"one": slower}),
         replace(recorded, runs=runs, absent={"three": "it needs <a | b> &\nmore"}),
     ]
-    return gate.checked(baseline, now)
+    return checked(baseline, now)
 
 
 @pytest.fixture
-def passed(baseline, gate):
-    return gate.checked(baseline, gate.as_measured(baseline))
+def passed(baseline):
+    return checked(baseline, as_measured(baseline))
 
 
 @pytest.fixture(params=["failed", "passed"])

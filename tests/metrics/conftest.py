@@ -1,10 +1,8 @@
 """Small exact recordings for the metrics: a path with known poses, points seen from it, and runs made from both."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from toolkit.answers import Run, Timings
 from toolkit.estimate import Landmarks, Trajectory
@@ -48,54 +46,30 @@ def sightings(
     return Observations.sorted(frame, track, uv_px), points
 
 
-@pytest.fixture
-def make_sequence() -> Callable[..., Sequence]:
-    """Return a function that makes a sequence along poses (K, 4, 4), which are also its truth."""
-
-    def make(poses: Array, track_count: int = 300, pixel_sigma: float = 0.0, motion: str = "twist") -> Sequence:
-        t_ns = 1_317_386_425_562_502_384 + PERIOD_NS * np.arange(len(poses))
-        observations, _ = sightings(poses, track_count, pixel_sigma, np.random.default_rng(5))
-        zeros, three = np.zeros((len(poses), 3)), np.full(3, 0.1)
-        imu = motion == "imu"
-        return Sequence(
-            name="synthetic",
-            rig=RIG,
-            noise=ImuNoise(1e-3, 1e-4, 1e-4, 1e-5) if imu else TwistNoise(three, three, three),
-            frames_t_ns=t_ns,
-            observations=observations,
-            motion=ImuSamples(t_ns, zeros, zeros) if imu else TwistSamples(t_ns, zeros, zeros),
-            provenance=Provenance("test", "tests/metrics/conftest.py"),
-            truth=Truth(t_ns, poses),
-        )
-
-    return make
+def make_sequence(poses: Array, track_count: int = 300, pixel_sigma: float = 0.0, motion: str = "twist") -> Sequence:
+    t_ns = 1_317_386_425_562_502_384 + PERIOD_NS * np.arange(len(poses))
+    observations, _ = sightings(poses, track_count, pixel_sigma, np.random.default_rng(5))
+    zeros, three = np.zeros((len(poses), 3)), np.full(3, 0.1)
+    imu = motion == "imu"
+    return Sequence(
+        name="synthetic",
+        rig=RIG,
+        noise=ImuNoise(1e-3, 1e-4, 1e-4, 1e-5) if imu else TwistNoise(three, three, three),
+        frames_t_ns=t_ns,
+        observations=observations,
+        motion=ImuSamples(t_ns, zeros, zeros) if imu else TwistSamples(t_ns, zeros, zeros),
+        provenance=Provenance("test", "tests/metrics/conftest.py"),
+        truth=Truth(t_ns, poses),
+    )
 
 
-@pytest.fixture
-def make_run() -> Callable[..., Run]:
-    """Return a function that makes a run whose two outputs are the same poses (N, 4, 4) at stamps (N,)."""
-
-    def make(t_ns: Array, poses: Array, landmarks: Landmarks | None = None, **changes: object) -> Run:
-        trajectory = Trajectory(t_ns, poses)
-        timings = Timings(np.array([0.004, 0.001, 0.001, 0.002]), 0.5, 0.6, 0.7, 123.0)
-        run = Run("test", "ok", trajectory, trajectory, landmarks or Landmarks.none(), timings)
-        return replace(run, **changes)
-
-    return make
+def make_run(t_ns: Array, poses: Array, landmarks: Landmarks | None = None, **changes: object) -> Run:
+    trajectory = Trajectory(t_ns, poses)
+    timings = Timings(np.array([0.004, 0.001, 0.001, 0.002]), 0.5, 0.6, 0.7, 123.0)
+    run = Run("test", "ok", trajectory, trajectory, landmarks or Landmarks.none(), timings)
+    return replace(run, **changes)
 
 
-@pytest.fixture
-def drive() -> Callable[..., Array]:
-    """Return :func:`drive_poses`."""
-    return drive_poses
-
-
-@pytest.fixture
-def perturb() -> Callable[[Array, float, int], Array]:
-    """Return a function that gives poses (N, 4, 4) a random walk of rotation (rad) and ten times that in metres."""
-
-    def walk(poses: Array, sigma: float, seed: int) -> Array:
-        steps = np.random.default_rng(seed).normal(0.0, sigma, (len(poses), 6))
-        return poses @ se3_exp(np.cumsum(steps, axis=0) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
-
-    return walk
+def perturb(poses: Array, sigma: float, seed: int) -> Array:
+    steps = np.random.default_rng(seed).normal(0.0, sigma, (len(poses), 6))
+    return poses @ se3_exp(np.cumsum(steps, axis=0) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))

@@ -5,6 +5,7 @@ import pytest
 from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PoseTrajectory3D
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence, perturb
 from toolkit.geometry import se3, se3_exp
 from toolkit.metrics import score_run
 
@@ -15,9 +16,9 @@ POSITION, ANGLE_DEG = PoseRelation.translation_part, PoseRelation.rotation_angle
 
 
 @pytest.fixture
-def case(make_sequence, make_run, drive, perturb):
+def case():
     """A drive of 260 m and an estimate with drift, a scale error and a world of its own."""
-    truth = drive(260)
+    truth = drive_poses(260)
     sequence = make_sequence(truth, track_count=3)
     drifted = perturb(truth, 5e-3, seed=2)
     drifted = se3(drifted[:, :3, :3], 1.03 * drifted[:, :3, 3])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence, perturb
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
@@ -14,8 +15,8 @@ from toolkit.sequence import Truth
 PERIOD_NS = 100_000_000
 
 
-def test_stamps_that_differ_by_rounding_are_not_interpolated(drive):
-    poses = drive(30)
+def test_stamps_that_differ_by_rounding_are_not_interpolated():
+    poses = drive_poses(30)
     t_ns = PERIOD_NS * np.arange(30)
     rounding_ns = np.random.default_rng(0).integers(-60_000, 60_000, 30)  # kitti00's truth: four decimals
     matched = associate(Trajectory(t_ns, poses), Truth(t_ns + rounding_ns, poses), PERIOD_NS)
@@ -32,7 +33,7 @@ def test_between_frames_the_estimate_moves_on_the_geodesic():
     assert len(matched) == 9
 
 
-def test_a_dense_truth_never_matches_one_estimate_twice(drive):
+def test_a_dense_truth_never_matches_one_estimate_twice():
     t_ns = PERIOD_NS * np.arange(20)
     dense_ns = np.arange(0, t_ns[-1] + 1, 1_000_000)  # 1 kHz
     truth = Truth(dense_ns, se3_exp(np.outer(dense_ns / 1e9, [0, 0, 0, 10.0, 0, 0])))
@@ -41,15 +42,15 @@ def test_a_dense_truth_never_matches_one_estimate_twice(drive):
     np.testing.assert_allclose(matched.estimate[:, 0, 3], matched.truth[:, 0, 3], atol=1e-12)  # rounding
 
 
-def test_nothing_is_scored_in_a_gap_or_outside_the_estimate(drive):
-    poses, t_ns = drive(40), PERIOD_NS * np.arange(40)
+def test_nothing_is_scored_in_a_gap_or_outside_the_estimate():
+    poses, t_ns = drive_poses(40), PERIOD_NS * np.arange(40)
     kept = np.r_[5:15, 17:30]
     matched = associate(Trajectory(t_ns[kept], poses[kept]), Truth(t_ns, poses), PERIOD_NS)
     np.testing.assert_array_equal(matched.t_ns, t_ns[kept])
 
 
-def test_poses_that_are_not_finite_take_no_part_and_lower_the_coverage(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(300), track_count=60)
+def test_poses_that_are_not_finite_take_no_part_and_lower_the_coverage():
+    sequence = make_sequence(drive_poses(300), track_count=60)
     poses = sequence.truth.T_world_imu.copy()
     poses[40:70] = np.nan
     poses[100, 1, 3] = np.inf
@@ -60,8 +61,8 @@ def test_poses_that_are_not_finite_take_no_part_and_lower_the_coverage(make_sequ
     assert "observations scored" in scores.notes["heldout_reproj_median_px"]
 
 
-def test_a_run_that_tracked_a_tenth_shows_it(make_sequence, make_run, drive, perturb):
-    sequence = make_sequence(drive(300), track_count=60)
+def test_a_run_that_tracked_a_tenth_shows_it():
+    sequence = make_sequence(drive_poses(300), track_count=60)
     drifting = perturb(sequence.truth.T_world_imu, 2e-3, seed=3)
     t_ns = sequence.frames_t_ns
     whole = score_run(make_run(t_ns, drifting), "final", sequence).values
@@ -71,17 +72,17 @@ def test_a_run_that_tracked_a_tenth_shows_it(make_sequence, make_run, drive, per
     assert (whole["coverage_percent"], whole["pairs"]) == (100.0, 300)
 
 
-def test_coverage_counts_the_frames_within_the_truths_time(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(100), track_count=3)
+def test_coverage_counts_the_frames_within_the_truths_time():
+    sequence = make_sequence(drive_poses(100), track_count=3)
     truth = Truth(sequence.frames_t_ns[:80] + 128, sequence.truth.T_world_imu[:80])  # ucsd 0027: off by 128 ns, short
     run = make_run(sequence.frames_t_ns[:80], sequence.truth.T_world_imu[:80])
     assert score_run(run, "final", replace(sequence, truth=truth)).values["coverage_percent"] == 100.0
 
 
 @pytest.mark.parametrize("kept", [0, 1])
-def test_too_few_matches_leave_reasons_instead_of_numbers(make_sequence, make_run, drive, kept):
-    sequence = make_sequence(drive(50), track_count=20)
-    scores = score_run(make_run(sequence.frames_t_ns[:kept], drive(50)[:kept]), "final", sequence)
+def test_too_few_matches_leave_reasons_instead_of_numbers(kept):
+    sequence = make_sequence(drive_poses(50), track_count=20)
+    scores = score_run(make_run(sequence.frames_t_ns[:kept], drive_poses(50)[:kept]), "final", sequence)
     assert scores.values["pairs"] == kept
     assert scores.values["coverage_percent"] == pytest.approx(2.0 * kept)
     for key in ("ate_none_m", "ate_se3_m", "rpe_1s_m", "kitti_t_percent", "end_drift_percent"):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import make_run
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
@@ -72,14 +73,14 @@ def with_error(sequence, make_run, extra, stated=1.0):
     return make_run(sequence.frames_t_ns, poses, causal=trajectory, final=trajectory)
 
 
-def test_an_efficient_estimator_loses_nothing_and_states_the_bound(sequence, make_run):
+def test_an_efficient_estimator_loses_nothing_and_states_the_bound(sequence):
     values, _ = scores(with_error(sequence, make_run, np.zeros(6)), sequence)
     assert values["efficiency_percent"] == pytest.approx(100.0, abs=1e-3)
     assert values["excess_variance"] == pytest.approx(0.0, abs=1e-6)
     assert values["claimed_variance"] == pytest.approx(1.0)
 
 
-def test_what_an_estimator_errs_beyond_the_efficient_one_is_its_excess(sequence, make_run):
+def test_what_an_estimator_errs_beyond_the_efficient_one_is_its_excess(sequence):
     best, extra = efficient(sequence, "causal"), np.array([0.0, 0.0, 1e-3, 0.02, 0.0, 0.0])
     values, _ = scores(with_error(sequence, make_run, extra, stated=4.0), sequence)
     d = np.zeros(best.layout.size)
@@ -108,7 +109,7 @@ def test_a_full_smoother_attains_the_bound_and_an_ekf_with_a_hardened_map_does_n
     assert ekf["claimed_pose"] < 0.5
 
 
-def test_without_a_request_it_is_not_computed_and_says_how(sequence, make_run):
+def test_without_a_request_it_is_not_computed_and_says_how(sequence):
     values, notes = scores(with_error(sequence, make_run, np.zeros(6)), sequence, requested=())
     assert set(values.values()) == {None}
     assert notes["excess_variance"] == "computed on request: --set metrics.bound=true"
@@ -126,7 +127,7 @@ def test_without_a_request_it_is_not_computed_and_says_how(sequence, make_run):
         ("exact", "the truth is not exact"),
     ],
 )
-def test_without_an_exact_truth_the_bound_is_what_the_model_claims_and_says_why(make_run, lacking, why):
+def test_without_an_exact_truth_the_bound_is_what_the_model_claims_and_says_why(lacking, why):
     sequence = simulate(SHORT["drive"], 0)
     run, truth = with_error(sequence, make_run, np.zeros(6)), sequence.truth
     shaken = truth.T_world_imu.copy()

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import make_run, make_sequence
 from toolkit.answers import Run
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import Array, about_z, se3, se3_exp, se3_inverse, so3_exp, transform
@@ -82,7 +83,7 @@ def sightings(poses: Array, T_imu_cam: Array, rig: object) -> tuple[Observations
 
 
 @pytest.fixture
-def drifting(make_sequence, make_run):
+def drifting():
     """Return a function: the road with motion of a kind and, if it is known, the start; and a run that drifts along it.
 
     Without a known start the run's world is its own, tilted by 0.6 degrees.

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence
 from toolkit.answers import Run
 from toolkit.metrics import Evaluation, Scores
 from toolkit.metrics.innovations import ACCEPTED, refuses_much, score
@@ -16,8 +17,8 @@ RunEstimator = Callable[..., Run]
 
 
 @pytest.fixture
-def scored(make_sequence, make_run, drive) -> Scored:
-    sequence = make_sequence(drive(150), track_count=60)
+def scored() -> Scored:
+    sequence = make_sequence(drive_poses(150), track_count=60)
     return lambda output, info: score(
         Evaluation(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, info=info), output, sequence)
     )

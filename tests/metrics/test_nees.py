@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse
 from toolkit.measurements import Prior
@@ -28,9 +29,9 @@ def prior_at(pose):
 
 
 @pytest.fixture
-def sequence(make_sequence, drive):
-    made = make_sequence(drive(POSES), track_count=3)
-    return replace(made, prior=prior_at(drive(POSES)[0]))
+def sequence():
+    made = make_sequence(drive_poses(POSES), track_count=3)
+    return replace(made, prior=prior_at(drive_poses(POSES)[0]))
 
 
 def drawn(sequence, make_run, scale=1.0, seed=1):
@@ -52,7 +53,7 @@ def nees(run, sequence, output="causal"):
 
 
 @pytest.mark.parametrize("output", ["causal", "final"])
-def test_exact_draws_have_nees_one_and_are_in_band_at_95_percent(sequence, make_run, output):
+def test_exact_draws_have_nees_one_and_are_in_band_at_95_percent(sequence, output):
     pose, ori, pos, in_band = nees(drawn(sequence, make_run), sequence, output)
     # Four sigma: the mean of N chi-square variables over d degrees of freedom scatters by sqrt(2 / (d N)).
     assert pose == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * POSES)))
@@ -62,7 +63,7 @@ def test_exact_draws_have_nees_one_and_are_in_band_at_95_percent(sequence, make_
 
 
 @pytest.mark.parametrize("scale", [0.25, 4.0])
-def test_a_wrong_covariance_leaves_the_band(sequence, make_run, scale):
+def test_a_wrong_covariance_leaves_the_band(sequence, scale):
     pose, ori, pos, in_band = nees(drawn(sequence, make_run, scale), sequence)
     assert [pose, ori, pos] == pytest.approx([scale] * 3, rel=0.1)
     assert in_band < 60.0
@@ -70,10 +71,10 @@ def test_a_wrong_covariance_leaves_the_band(sequence, make_run, scale):
 
 @pytest.mark.parametrize("prior", [None, "elsewhere"])
 @pytest.mark.parametrize("motion", ["twist", "imu"])
-def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequence, make_run, drive, prior, motion):
-    sequence = make_sequence(drive(200), track_count=3, motion=motion)
+def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(prior, motion):
+    sequence = make_sequence(drive_poses(200), track_count=3, motion=motion)
     elsewhere = se3(about_z(1.0), np.array([10.0, 20.0, 30.0]))
-    poses = elsewhere @ drive(200)
+    poses = elsewhere @ drive_poses(200)
     sequence = replace(sequence, prior=None if prior is None else prior_at(poses[0]))
     run = stating(make_run, sequence, poses, np.broadcast_to(COV, (200, 6, 6)))
     scores = score(Evaluation(run, "causal", sequence))
@@ -83,32 +84,30 @@ def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequenc
 
 
 @pytest.mark.parametrize(("motion", "tilt_is_an_error"), [("imu", True), ("twist", False)])
-def test_a_tilted_start_counts_where_an_imu_measures_the_vertical(
-    make_sequence, make_run, drive, motion, tilt_is_an_error
-):
+def test_a_tilted_start_counts_where_an_imu_measures_the_vertical(motion, tilt_is_an_error):
     """Placed by the whole pose, an IMU's run would have its tilt, which it states to 3 mrad, given away."""
-    sequence = make_sequence(drive(200), track_count=3, motion=motion)
-    tilted = se3_exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])) @ drive(200)
+    sequence = make_sequence(drive_poses(200), track_count=3, motion=motion)
+    tilted = se3_exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])) @ drive_poses(200)
     _, orientation, position, _ = nees(stating(make_run, sequence, tilted, np.broadcast_to(COV, (200, 6, 6))), sequence)
     # (0.05 rad / 0.003 rad)^2 / 3 = 93; along 200 m the position is off by 10 m and more. Else rounding is left.
     assert (orientation > 50.0) == (position > 50.0) == tilt_is_an_error
     assert tilt_is_an_error or max(orientation, position) < 1e-12
 
 
-def test_a_world_of_its_own_needs_the_truth_of_its_first_pose(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(50), track_count=3)
+def test_a_world_of_its_own_needs_the_truth_of_its_first_pose():
+    sequence = make_sequence(drive_poses(50), track_count=3)
     late = replace(sequence, truth=Truth(sequence.truth.t_ns[20:], sequence.truth.T_world_imu[20:]))
-    run = stating(make_run, sequence, drive(50), np.broadcast_to(COV, (50, 6, 6)))
+    run = stating(make_run, sequence, drive_poses(50), np.broadcast_to(COV, (50, 6, 6)))
     assert nees(run, late) == [None] * 4
 
 
-def test_a_truth_with_other_stamps_is_interpolated(make_sequence, make_run, drive):
+def test_a_truth_with_other_stamps_is_interpolated():
     """Truth between the frames: on the geodesic of a smooth path it is off by far less than the covariance."""
-    sequence = replace(make_sequence(drive(100), track_count=3), prior=prior_at(drive(100)[0]))
+    sequence = replace(make_sequence(drive_poses(100), track_count=3), prior=prior_at(drive_poses(100)[0]))
     t_ns = sequence.truth.t_ns
     between = np.concatenate([t_ns[:1], t_ns[:-1] + 30_000_000])
     truth = Truth(between, interpolate_poses(t_ns, sequence.truth.T_world_imu, between))
-    run = stating(make_run, sequence, drive(100), np.broadcast_to(COV, (100, 6, 6)))
+    run = stating(make_run, sequence, drive_poses(100), np.broadcast_to(COV, (100, 6, 6)))
     evaluation = Evaluation(run, "causal", replace(sequence, truth=truth))
     found = nees_over_time(evaluation)
     assert found.t_ns.tolist() == t_ns[:-1].tolist()  # the last frame is behind the truth's end
@@ -121,7 +120,7 @@ def refused(sequence, run):
     return scores.notes["nees_pose_mean"]
 
 
-def test_missing_nees_has_its_reason(sequence, make_run):
+def test_missing_nees_has_its_reason(sequence):
     run = drawn(sequence, make_run)
     dependent = replace(sequence, truth=replace(sequence.truth, independent=False))
     assert "agreement proves nothing" in refused(dependent, run)
@@ -154,8 +153,8 @@ def covariance() -> np.ndarray:
 
 
 @pytest.fixture
-def states(make_sequence, drive):
-    made = make_sequence(drive(POSES), track_count=3, motion="imu")
+def states():
+    made = make_sequence(drive_poses(POSES), track_count=3, motion="imu")
     rng = np.random.default_rng(4)
     truth = replace(made.truth, v_world=rng.normal(0, 5, (POSES, 3)), bias=rng.normal(0, 0.1, (POSES, 6)))
     prior = Prior(truth.T_world_imu[0], np.zeros(3), np.zeros(6), covariance(), "test")
@@ -186,14 +185,14 @@ def values(run, states):
 
 
 @pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
-def test_errors_drawn_from_what_is_stated_have_nees_one(states, make_run, scale):
+def test_errors_drawn_from_what_is_stated_have_nees_one(states, scale):
     # Four sigma of a mean of N chi-square variables of three degrees of freedom, over these: 7 % at 4000.
     found, _ = values(drawn_states(states, make_run, scale), states)
     assert found == pytest.approx([scale] * 3, rel=4.0 * np.sqrt(2.0 / (3 * POSES)))
 
 
 @pytest.mark.parametrize("key", STATE_KEYS)
-def test_each_block_is_checked_by_its_own_covariance(states, make_run, key):
+def test_each_block_is_checked_by_its_own_covariance(states, key):
     """One block stated four times too small in variance shows in its own figure alone."""
     run, cov = drawn_states(states, make_run), np.array(covariance())
     block, others = BLOCKS[key], [other for other in STATE_KEYS if other != key]
@@ -206,7 +205,7 @@ def test_each_block_is_checked_by_its_own_covariance(states, make_run, key):
     assert [after[other] for other in others] == [before[other] for other in others]
 
 
-def test_a_state_without_them_says_so(states, make_run, make_sequence, drive):
+def test_a_state_without_them_says_so(states):
     """A state of nine has a gyro bias; one of six nothing but the pose; a truth may have poses alone."""
     run = drawn_states(states, make_run)
     kept = [*range(6), *range(12, 15)]

@@ -1,7 +1,6 @@
 """Reprojection errors: in-sample against gtsam's camera, held-out against re-triangulation, and over the motion."""
 
 import itertools
-from collections.abc import Callable
 from dataclasses import replace
 
 import gtsam
@@ -9,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence, perturb
 from toolkit.answers import Run
 from toolkit.estimate import Landmarks
-from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, transform
+from toolkit.geometry import se3_exp, se3_inverse, se3_log, transform
 from toolkit.metrics import Evaluation, Scores, reprojection, score_run
 from toolkit.metrics.parts.leave_one_out import CAP_PX, predict_left_out
 from toolkit.metrics.reprojection import ERROR, RATIO
@@ -29,8 +29,8 @@ def first_sighting_landmarks(sequence, poses):
     return Landmarks(ids, stereo.triangulate_world(seen.uv_px[row], poses[seen.frame[row]], sequence.rig))
 
 
-def test_in_sample_error_equals_a_loop_over_gtsams_camera(make_sequence, make_run, drive, perturb):
-    sequence = make_sequence(drive(60), track_count=80, pixel_sigma=0.7)
+def test_in_sample_error_equals_a_loop_over_gtsams_camera():
+    sequence = make_sequence(drive_poses(60), track_count=80, pixel_sigma=0.7)
     poses, rig = perturb(sequence.truth.T_world_imu, 1e-4, seed=1), sequence.rig
     landmarks = first_sighting_landmarks(sequence, poses)
     calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
@@ -51,8 +51,8 @@ def test_in_sample_error_equals_a_loop_over_gtsams_camera(make_sequence, make_ru
     assert values["reproj_rmse_px"] == pytest.approx(np.sqrt(np.mean(np.square(expected))), rel=1e-9)
 
 
-def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(60), track_count=80)
+def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap():
+    sequence = make_sequence(drive_poses(60), track_count=80)
     landmarks = first_sighting_landmarks(sequence, sequence.truth.T_world_imu)
     points = landmarks.points_world.copy()
     points[0] = transform(sequence.truth.T_world_imu[0], np.array([-500.0, 0.0, 0.0]))
@@ -65,8 +65,8 @@ def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap(make_sequence
     assert f"{lost.sum()} behind the camera" in score_run(run, "final", sequence).notes["reproj_rmse_px"]
 
 
-def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(120), track_count=600)
+def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise():
+    sequence = make_sequence(drive_poses(120), track_count=600)
     truth = sequence.truth.T_world_imu
     shape = np.random.default_rng(0).normal(size=(120, 6)) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
     medians = []
@@ -79,9 +79,9 @@ def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise(make_sequence
     assert all(1.5 * small < large for small, large in itertools.pairwise(medians))
 
 
-def test_held_out_error_needs_no_truth_and_ignores_the_world(make_sequence, make_run, drive, perturb):
-    sequence = replace(make_sequence(drive(120), pixel_sigma=0.5), truth=None)
-    poses = perturb(drive(120), 1e-4, seed=2)
+def test_held_out_error_needs_no_truth_and_ignores_the_world():
+    sequence = replace(make_sequence(drive_poses(120), pixel_sigma=0.5), truth=None)
+    poses = perturb(drive_poses(120), 1e-4, seed=2)
     moved = se3_exp(np.array([1.0, -2.0, 0.5, 300.0, 20.0, -7.0])) @ poses
     here = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence)
     there = score_run(make_run(sequence.frames_t_ns, moved), "final", sequence)
@@ -127,10 +127,10 @@ def predict_by_retriangulation(track_ids, uv_px, T_world_cam, rig, left_out):
         (1.0, 1e-3, 0.1),  # weights at work: iteratively reweighted against jointly minimised
     ],
 )
-def test_leaving_a_view_out_equals_triangulating_anew(make_sequence, drive, pixel_sigma, pose_sigma, tolerance_px):
-    sequence = make_sequence(drive(80), track_count=60, pixel_sigma=pixel_sigma)
+def test_leaving_a_view_out_equals_triangulating_anew(pixel_sigma, pose_sigma, tolerance_px):
+    sequence = make_sequence(drive_poses(80), track_count=60, pixel_sigma=pixel_sigma)
     noise = np.random.default_rng(1).normal(0.0, pose_sigma, (80, 6)) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
-    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive(80) @ se3_exp(noise))
+    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive_poses(80) @ se3_exp(noise))
     predicted_px = predict_left_out(track_ids, uv_px, T_world_cam, sequence.rig).uv_px
     rows = np.random.default_rng(2).choice(len(track_ids), 40, replace=False)
     anew_px = [predict_by_retriangulation(track_ids, uv_px, T_world_cam, sequence.rig, row) for row in rows]
@@ -140,9 +140,9 @@ def test_leaving_a_view_out_equals_triangulating_anew(make_sequence, drive, pixe
     assert np.median(errors_px) > 0.3
 
 
-def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew(make_sequence, drive):
-    sequence = make_sequence(drive(80, step_m=0.1), track_count=40, pixel_sigma=0.0)
-    poses = drive(80, step_m=0.1)
+def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew():
+    sequence = make_sequence(drive_poses(80, step_m=0.1), track_count=40, pixel_sigma=0.0)
+    poses = drive_poses(80, step_m=0.1)
     point = transform(poses[79], np.array([12.0, 3.0, 1.0]))
     T_world_cam = poses @ sequence.rig.T_imu_cam
     uv_px = stereo.project(transform(se3_inverse(T_world_cam), point), sequence.rig)
@@ -155,9 +155,9 @@ def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew(make_sequence
         np.testing.assert_allclose(predicted_px[row], anew_px, atol=0.01)
 
 
-def test_an_outlier_does_not_spoil_the_rest_of_its_track(make_sequence, drive):
-    sequence = make_sequence(drive(80), track_count=60)
-    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive(80))
+def test_an_outlier_does_not_spoil_the_rest_of_its_track():
+    sequence = make_sequence(drive_poses(80), track_count=60)
+    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive_poses(80))
     long = np.flatnonzero(np.bincount(track_ids) >= 8)
     struck = np.array([np.flatnonzero(track_ids == t)[3] for t in long])
     spoiled = uv_px.copy()
@@ -168,8 +168,8 @@ def test_an_outlier_does_not_spoil_the_rest_of_its_track(make_sequence, drive):
     assert np.median(np.abs(predicted.uv_px[clean] - uv_px[clean])) < 1.5  # Huber bounds the pull; least squares: 3 px
 
 
-def test_points_at_infinity_are_predicted(make_sequence, drive):
-    rig, poses = make_sequence(drive(10), track_count=3).rig, drive(10)
+def test_points_at_infinity_are_predicted():
+    rig, poses = make_sequence(drive_poses(10), track_count=3).rig, drive_poses(10)
     T_cam_world = se3_inverse(poses @ rig.T_imu_cam)
     directions = T_cam_world[:, :3, :3] @ (poses[5] @ rig.T_imu_cam)[:3, :3] @ np.array([0.1, -0.05, 1.0])
     uv_px = stereo.project(1e12 * directions, rig)
@@ -177,8 +177,8 @@ def test_points_at_infinity_are_predicted(make_sequence, drive):
     np.testing.assert_allclose(predicted.uv_px, uv_px, atol=1e-6)  # 1e12 m for infinity leaves fx b / 1e12
 
 
-def test_tracks_with_fewer_than_three_posed_views_are_counted_not_scored(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(120), track_count=300)
+def test_tracks_with_fewer_than_three_posed_views_are_counted_not_scored():
+    sequence = make_sequence(drive_poses(120), track_count=300)
     _, views = np.unique(sequence.held_out.track_id, return_counts=True)
     assert (views == 2).any()
     scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu), "final", sequence)
@@ -187,18 +187,18 @@ def test_tracks_with_fewer_than_three_posed_views_are_counted_not_scored(make_se
     assert scores.values["heldout_reproj_rmse_px"] < 1e-9  # exact: rounding only
 
 
-def test_absurd_poses_end_at_the_cap_and_not_in_an_error(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(60), track_count=200)
-    poses = np.random.default_rng(0).permutation(drive(60)) @ se3_exp(np.full((60, 6), 2.0))
+def test_absurd_poses_end_at_the_cap_and_not_in_an_error():
+    sequence = make_sequence(drive_poses(60), track_count=200)
+    poses = np.random.default_rng(0).permutation(drive_poses(60)) @ se3_exp(np.full((60, 6), 2.0))
     poses[:, :3, 3] *= 1e6
     values = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence).values
     assert 10.0 < values["heldout_reproj_median_px"] <= CAP_PX
 
 
 @pytest.fixture
-def recording(make_sequence: Callable[..., Sequence], drive: Callable[[int], Array]) -> Sequence:
+def recording() -> Sequence:
     """20 s with 240 withheld tracks and half a pixel of noise, whose twists scatter by 0.1 m/s and 0.005 rad/s."""
-    poses = drive(200)
+    poses = drive_poses(200)
     sequence = make_sequence(poses, track_count=2400, pixel_sigma=0.5)
     twists = se3_log(se3_inverse(poses[:-1]) @ poses[1:]) / PERIOD_S
     twists += np.random.default_rng(1).normal(0.0, np.repeat([0.005, 0.1], 3), twists.shape)
@@ -210,13 +210,13 @@ def scored(recording: Sequence, run: Run) -> Scores:
     return reprojection.score(Evaluation(run, "causal", recording))
 
 
-def test_an_estimate_better_than_the_motion_is_below_one_and_nothing_is_reported(recording, make_run) -> None:
+def test_an_estimate_better_than_the_motion_is_below_one_and_nothing_is_reported(recording) -> None:
     scores = scored(recording, make_run(recording.frames_t_ns, recording.truth.T_world_imu))
     assert scores.values[RATIO] < 0.9
     assert RATIO not in scores.notes
 
 
-def test_the_motion_alone_is_exactly_itself(recording, make_run) -> None:
+def test_the_motion_alone_is_exactly_itself(recording) -> None:
     poses = recording.truth.T_world_imu
     motion = reprojection._motion_alone(make_run(recording.frames_t_ns, poses).causal, recording).causal
     scores = scored(recording, make_run(recording.frames_t_ns, motion.T_world_imu))
@@ -224,7 +224,7 @@ def test_the_motion_alone_is_exactly_itself(recording, make_run) -> None:
     assert RATIO not in scores.notes
 
 
-def test_an_estimate_that_leaps_for_three_seconds_is_reported_with_the_time(recording, make_run) -> None:
+def test_an_estimate_that_leaps_for_three_seconds_is_reported_with_the_time(recording) -> None:
     poses = recording.truth.T_world_imu.copy()
     leaps = np.zeros((200, 6))
     leaps[98:128, 3] = np.random.default_rng(2).normal(0.0, 2.0, 30)
@@ -234,16 +234,16 @@ def test_an_estimate_that_leaps_for_three_seconds_is_reported_with_the_time(reco
     assert " times at 10-12 s" in scores.notes[RATIO]
 
 
-def test_an_estimate_that_is_worse_all_along_is_reported_with_its_standard_error(recording, make_run, perturb) -> None:
+def test_an_estimate_that_is_worse_all_along_is_reported_with_its_standard_error(recording) -> None:
     poses = perturb(recording.truth.T_world_imu, 0.02, seed=3)
     scores = scored(recording, make_run(recording.frames_t_ns, poses))
     assert scores.values[RATIO] > 2.0
     assert f"{scores.values[RATIO]:.2f} +- " in scores.notes[RATIO]
 
 
-def test_no_ratio_is_made_up_where_there_is_nothing_to_compare_with(recording, make_run, make_sequence, drive) -> None:
+def test_no_ratio_is_made_up_where_there_is_nothing_to_compare_with(recording) -> None:
     few = recording.truncated(15)
     scores = scored(few, make_run(few.frames_t_ns, recording.truth.T_world_imu[:15]))
     assert scores.values[RATIO] is None and "withheld tracks have 3 views" in scores.notes[RATIO]
-    imu = make_sequence(drive(60), motion="imu")
+    imu = make_sequence(drive_poses(60), motion="imu")
     assert "no velocity" in scored(imu, make_run(imu.frames_t_ns, imu.truth.T_world_imu)).notes[RATIO]

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.metrics.conftest import drive_poses, make_run, make_sequence
 from toolkit import metrics
 from toolkit.errors import ExtensionError, VislamError
 from toolkit.metrics import Scores, score_run
@@ -13,8 +14,8 @@ from toolkit.models.gating import chi2_bound, mean_below_bound
 
 
 @pytest.fixture
-def case(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(150), track_count=60)
+def case():
+    sequence = make_sequence(drive_poses(150), track_count=60)
 
     def scored(output="causal", poses=sequence.truth.T_world_imu, **changes):
         return score_run(make_run(sequence.frames_t_ns, poses, **changes), output, sequence)
@@ -68,8 +69,8 @@ def test_cost_is_read_off_the_timings(case):
     assert (values["total_s"], values["cpu_s"], values["peak_rss_mb"]) == (0.6, 0.7, 123.0)
 
 
-def test_a_run_that_overflows_has_reasons_instead_of_numbers(case, drive):
-    poses = drive(150).copy()
+def test_a_run_that_overflows_has_reasons_instead_of_numbers(case):
+    poses = drive_poses(150).copy()
     poses[100:, :3, 3] *= 1e200
     scores = case(poses=poses)
     json.dumps(scores.values, allow_nan=False)
@@ -79,9 +80,9 @@ def test_a_run_that_overflows_has_reasons_instead_of_numbers(case, drive):
     assert scores.values["coverage_percent"] == 100.0
 
 
-def test_an_output_that_does_not_exist_is_refused(make_sequence, make_run, drive):
-    sequence = make_sequence(drive(20), track_count=3)
-    run = make_run(sequence.frames_t_ns, drive(20), causal=None)
+def test_an_output_that_does_not_exist_is_refused():
+    sequence = make_sequence(drive_poses(20), track_count=3)
+    run = make_run(sequence.frames_t_ns, drive_poses(20), causal=None)
     with pytest.raises(ValueError, match="no causal output"):
         score_run(run, "causal", sequence)
 

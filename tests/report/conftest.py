@@ -23,8 +23,6 @@ from toolkit.report.run_directory import MadeBy, write_run
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, simulate
 
-Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
-
 SEED = 3
 FINDING = Finding("stale-frames", 91, True, "91 of 1106 frames repeat the one before; their tracks end there", False)
 UNDECIDED = {"time-offset": "too little change of rotation", "twist-lag": "too little change of rotation"}
@@ -83,34 +81,21 @@ def run_called(run_directory: Path, tmp_path: Path) -> Callable[[str], Path]:
     return copied
 
 
-@pytest.fixture(scope="session")
-def comparison_of() -> Callable[[Sequence, tuple[Run, ...]], Comparison]:
-    """Return a function that scores runs over a sequence and lays them side by side."""
-    return compared
-
-
-@pytest.fixture(scope="session")
-def rescored() -> Rescored:
-    """Return a function that gives every output of a comparison other scores, made from its row."""
-
-    def changed(comparison: Comparison, score: Callable[[Row], Scores]) -> Comparison:
-        scores = {(row.estimator, row.output): score(row) for row in comparison.rows}
-        outcomes = tuple(
-            replace(
-                outcome,
-                outputs={
-                    output: replace(scored, scores=scores[outcome.estimator, output])
-                    for output, scored in outcome.outputs.items()
-                },
-            )
-            for outcome in comparison.outcomes
-        )
-        return replace(comparison, outcomes=outcomes)
-
-    return changed
+def rescored(comparison: Comparison, score: Callable[[Row], Scores]) -> Comparison:
+    """Give every output of a comparison other scores, made from its row."""
+    scores = {(row.estimator, row.output): score(row) for row in comparison.rows}
+    outcomes = []
+    for outcome in comparison.outcomes:
+        outputs = {
+            output: replace(scored, scores=scores[outcome.estimator, output])
+            for output, scored in outcome.outputs.items()
+        }
+        outcomes.append(replace(outcome, outputs=outputs))
+    return replace(comparison, outcomes=tuple(outcomes))
 
 
 def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:
+    """Score runs over a sequence and lay them side by side."""
     assert sequence.prior is not None
     outcomes = tuple(outcome_of(run, sequence, SEED) for run in runs)
     return Comparison("made-up", sequence, (FINDING,), sequence.prior, (SEED,), outcomes, undecided=UNDECIDED)

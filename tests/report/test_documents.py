@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from msgspec import to_builtins
 
+from tests.report.conftest import compared, rescored
 from toolkit.answers import Run
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
@@ -216,17 +217,12 @@ def test_fields_of_a_later_version_are_passed_over(name: str) -> None:
     assert parse(json.dumps(later), record) == read(OLD / name, record)
 
 
-Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
-
-
 @pytest.fixture(scope="module")
 def scores(comparison: Comparison) -> dict[str, Any]:
     return json.loads(to_text(metrics_document(comparison)))
 
 
-def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
-    comparison: Comparison, rescored: Rescored
-) -> None:
+def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(comparison: Comparison) -> None:
     timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
     built = json.loads(to_text(metrics_document(timid)))
     assert parse(to_text(metrics_document(timid)), MetricsDocument) == metrics_document(timid)
@@ -250,9 +246,7 @@ def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimato
     assert mark(88.0) == "heavy-tailed"
 
 
-def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(
-    comparison: Comparison, rescored: Rescored
-) -> None:
+def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(comparison: Comparison) -> None:
     trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
     leaning = rescored(comparison, lambda row: Scores(row.scores.values | trend, {}))
     built = json.loads(to_text(metrics_document(leaning)))
@@ -267,9 +261,7 @@ def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_li
     assert all(text in words[0] for text in ("steady", "trend 5.2", "limit 4.00", "check calibration"))
 
 
-def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
-    comparison: Comparison, rescored: Rescored
-) -> None:
+def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(comparison: Comparison) -> None:
     harm = "explains withheld tracks worse than dead reckoning, with 3.00 +- 0.10 times its error"
 
     def given(row: Row) -> Scores:
@@ -282,7 +274,7 @@ def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
     assert reported
 
 
-def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Comparison, rescored: Rescored) -> None:
+def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Comparison) -> None:
     def words(accepted: float) -> list[str]:
         reported = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
         return [line for line in note_lines(reported) if "outlier gate" in line]
@@ -293,7 +285,7 @@ def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Compari
     assert "calibration" in line
 
 
-def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:
+def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison) -> None:
     scores = Scores(dict.fromkeys(describe(), float("nan")), {})
     built = metrics_document(rescored(comparison, lambda _: scores))
     assert parse(to_text(built), MetricsDocument) == built
@@ -309,11 +301,11 @@ def build(comparison: Comparison) -> Document:
 
 
 @pytest.fixture(scope="module")
-def scored(run_estimator: Callable[..., Run], comparison_of: Callable[..., Comparison]) -> Comparison:
+def scored(run_estimator: Callable[..., Run]) -> Comparison:
     """A filter that states covariances and innovations, and one that does not, on a short simulated drive."""
     sequence = load_sequence("drive").truncated(40)
     runs = tuple(run_estimator(name, sequence) for name in ("ekf", "dead-reckoning"))
-    return comparison_of(sequence, runs)
+    return compared(sequence, runs)
 
 
 def run_of(document: Document, estimator: str, output: str = "causal") -> Document:

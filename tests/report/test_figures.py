@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.inset import InsetIndicator
 
+from tests.report.conftest import compared
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, interpolate_poses, se3
@@ -33,7 +34,6 @@ from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
 from toolkit.simulation import DRIVE, simulate
 
-ComparisonOf = Callable[..., Comparison]
 Draw = Callable[[Comparison], Iterator[NamedFigure]]
 CHOICES: tuple[FigureChoice, ...] = ("few", "all", "none")
 BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
@@ -43,7 +43,7 @@ SIGMA_DEG, SIGMA_M = np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.4])
 
 
 @pytest.fixture(scope="module")
-def offset(sequence: Sequence, comparison: Comparison, comparison_of: ComparisonOf) -> Comparison:
+def offset(sequence: Sequence, comparison: Comparison) -> Comparison:
     """The truth with every pose set off along its own axes and turned about its vertical, with stated covariances."""
     truth, t_ns = sequence.truth, sequence.frames_t_ns
     assert truth is not None
@@ -53,7 +53,7 @@ def offset(sequence: Sequence, comparison: Comparison, comparison_of: Comparison
     trajectory = Trajectory(t_ns, wrong, cov=cov)
     steady = comparison.runs[0]
     run = replace(steady, estimator="offset", causal=trajectory, final=trajectory)
-    return comparison_of(sequence, (run, steady))
+    return compared(sequence, (run, steady))
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +76,12 @@ def test_top_views_have_equal_scale(comparison: Comparison) -> None:
     assert all(map_of(figure).get_aspect() == 1.0 for figure in shown.values())
 
 
-def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, comparison_of: ComparisonOf) -> None:
+def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison) -> None:
     late = comparison.runs[2]
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
     spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
-    ((_, _, figure),) = from_above.draw_all(comparison_of(comparison.sequence, (spoiled,)))
+    ((_, _, figure),) = from_above.draw_all(compared(comparison.sequence, (spoiled,)))
     low, high = map_of(figure).get_xlim()
     assert high - low < 500.0
 
@@ -99,14 +99,12 @@ def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Co
     assert np.abs(errors.heading_deg).max() < 1e-9
 
 
-def test_one_slow_step_at_the_end_does_not_bend_the_running_median(
-    comparison: Comparison, comparison_of: ComparisonOf
-) -> None:
+def test_one_slow_step_at_the_end_does_not_bend_the_running_median(comparison: Comparison) -> None:
     steady = comparison.runs[0]
     step_s = np.full(steady.timings.step_s.size, 1e-3)
     step_s[[0, -1]] = 1.0
     slow = replace(steady, timings=replace(steady.timings, step_s=step_s))
-    (drawn,) = over_time.draw_frame_times(comparison_of(comparison.sequence, (slow,)))
+    (drawn,) = over_time.draw_frame_times(compared(comparison.sequence, (slow,)))
     dots, median = drawn.figure.axes[0].get_lines()
     assert np.max(dots.get_ydata()) == pytest.approx(1e3)
     assert np.max(median.get_ydata()) == pytest.approx(1.0)
@@ -131,9 +129,9 @@ def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: ob
     assert list(draw(broken)) == []
 
 
-def test_the_bound_is_drawn_where_it_was_requested(comparison_of: ComparisonOf, run_estimator) -> None:
+def test_the_bound_is_drawn_where_it_was_requested(run_estimator) -> None:
     sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
-    usual = comparison_of(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
+    usual = compared(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
     assert list(over_time.draw_bound(usual)) == []
     requested = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
     (drawn,) = over_time.draw_bound(requested)
@@ -212,12 +210,12 @@ def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None
 
 @pytest.mark.parametrize("turn_rad", [-0.5, 1.0])
 def test_lines_to_the_closer_look_end_at_the_corners_that_face_the_map(
-    sequence: Sequence, comparison: Comparison, comparison_of: ComparisonOf, turn_rad: float
+    sequence: Sequence, comparison: Comparison, turn_rad: float
 ) -> None:
     truth = sequence.truth
     assert truth is not None
     turned = replace(truth, T_world_imu=se3(about_z(turn_rad), np.zeros(3)) @ truth.T_world_imu)
-    (one,) = from_above.draw_all(comparison_of(replace(sequence, truth=turned), comparison.runs))
+    (one,) = from_above.draw_all(compared(replace(sequence, truth=turned), comparison.runs))
     FigureCanvasAgg(one.figure).draw()
     _, the_map, panel = one.figure.axes
     (square,) = (artist for artist in the_map.get_children() if isinstance(artist, InsetIndicator))

@@ -12,9 +12,8 @@ import pytest
 
 from toolkit.answers import STATUS_MEANING, Status
 from toolkit.errors import DataError
-from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
-from toolkit.metrics import Scores
 from toolkit.report.html import json_in_html, page_text
 from toolkit.report.html.payload import highlights, payload_of, running_median, with_peaks
 from toolkit.report.records import schema_files
@@ -22,7 +21,6 @@ from toolkit.report.run_directory import MadeBy, read_run, write_run
 from toolkit.report.verdict import ContestRecord, Rival
 
 Json = dict[str, Any]
-Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 HOSTILE = "</script><script>window.broken = 1</script><!-- <img src=x onerror=alert(1)> {{ script }} \u2028"
 
 

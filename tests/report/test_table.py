@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.report.conftest import rescored
 from toolkit.audit import Finding
 from toolkit.errors import VislamError
 from toolkit.experiment import Plan, run
@@ -34,8 +35,6 @@ from toolkit.sequence import Provenance
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import SCENARIOS, simulate
 
-Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
-
 
 def test_every_output_of_every_run_has_a_line_or_shares_one(comparison: Comparison) -> None:
     lines = [line.split()[:3] for line in as_text(comparison_table(comparison)).splitlines()]
@@ -45,7 +44,7 @@ def test_every_output_of_every_run_has_a_line_or_shares_one(comparison: Comparis
 
 
 @pytest.fixture
-def shared_by_all(comparison: Comparison, rescored: Rescored) -> Callable[..., Comparison]:
+def shared_by_all(comparison: Comparison) -> Callable[..., Comparison]:
     """Return a function that gives every output that there is the same values of some metrics."""
     answered = replace(comparison, outcomes=tuple(outcome for outcome in comparison.outcomes if outcome.outputs))
     return lambda **values: rescored(answered, lambda row: Scores(row.scores.values | values, {}))
@@ -78,9 +77,7 @@ def test_a_mark_stands_below_how_the_run_ended_and_beside_it_in_markdown() -> No
     assert as_text(marked._replace(marks=())) == as_text(marked._replace(marks=("", "")))
 
 
-def test_a_real_drive_leads_with_drift_and_the_error_that_keeps_the_vertical(
-    comparison: Comparison, rescored: Rescored
-) -> None:
+def test_a_real_drive_leads_with_drift_and_the_error_that_keeps_the_vertical(comparison: Comparison) -> None:
     driven = rescored(comparison, lambda row: Scores(dict(row.scores.values) | {"kitti_t_percent": 1.0}))
     real = replace(driven, sequence=replace(driven.sequence, provenance=Provenance("kitti", "a drive")))
     usual, of_real = ([metric.key for metric in shown_metrics(one)] for one in (driven, real))
@@ -157,9 +154,7 @@ def test_below_the_table_stand_the_verdict_and_the_most_harmful_notes_and_no_mor
     assert f"{len(list(note_lines(comparison))) - 3} more in report.md" in below[-1] + below[-2]
 
 
-def test_remarks_are_reported_once_and_those_on_the_vertical_beside_the_table(
-    comparison: Comparison, rescored: Rescored
-) -> None:
+def test_remarks_are_reported_once_and_those_on_the_vertical_beside_the_table(comparison: Comparison) -> None:
     def remarked(row: Row) -> Scores:
         values = dict(row.scores.values) | {"ate_yaw_m": 1.0, "reproj_median_px": 1.0, "reproj_rmse_px": 1.0}
         notes = {"ate_yaw_m": "tilted", "reproj_median_px": "half of them", "reproj_rmse_px": "half of them"}
