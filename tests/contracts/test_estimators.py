@@ -135,39 +135,14 @@ def test_without_noise_its_landmarks_are_where_they_are(name: str, build: Build,
     assert np.abs(landmarks.points_world - expected).max(initial=0.0) < limit_m
 
 
-def without_vision(sequence: Sequence, frames: range) -> Sequence:
-    seen = sequence.observations
-    return replace(sequence, observations=seen.select((seen.frame < frames.start) | (seen.frame >= frames.stop)))
-
-
 @both_kinds
-@pytest.mark.parametrize(
-    ("blind", "frames"),
-    [(range(3), 15), (range(10**6), 20)],
-    ids=["the first frames", "all frames"],
-)
-def test_frames_without_vision_do_not_break_it(
-    name: str, build: Build, scenario: str, blind: range, frames: int
-) -> None:
-    sequence = without_vision(recording(scenario).truncated(frames), blind)
+def test_without_vision_it_goes_on(name: str, build: Build, scenario: str) -> None:
+    whole = recording(scenario).truncated(20)
+    sequence = replace(whole, observations=whole.observations.select(whole.observations.frame < 0))
     run = run_on(name, build, sequence)
     assert run.status == "ok", run.log
     assert run.final is not None
     assert len(run.final) == sequence.frame_count
-
-
-@both_kinds
-def test_after_a_blackout_it_still_recovers_a_noise_free_truth(name: str, build: Build, scenario: str) -> None:
-    sequence = without_vision(exact_recording(scenario), range(10, 30))
-    run = run_on(name, build, sequence)
-    assert run.status == "ok"
-    assert run.final is not None
-    assert_close_to_truth(run.final, sequence)
-
-
-def error_m(trajectory: Trajectory, sequence: Sequence) -> float:
-    assert sequence.truth is not None
-    return float(np.sqrt(np.square(trajectory.positions - sequence.truth.T_world_imu[:, :3, 3]).sum(axis=1).mean()))
 
 
 def test_without_noise_and_a_third_of_the_right_images_it_recovers_the_truth(name: str, build: Build) -> None:
@@ -176,16 +151,6 @@ def test_without_noise_and_a_third_of_the_right_images_it_recovers_the_truth(nam
     assert run.status == "ok", run.log
     assert run.final is not None
     assert_close_to_truth(run.final, sequence)
-
-
-def test_a_third_of_the_right_images_costs_less_than_as_much_again(name: str, build: Build) -> None:
-    """And gains nothing but by chance: one draw, whose error another choice of what is withheld moves by a tenth."""
-    whole = recording("drive")
-    usual_m = error_m(watched(build, "drive").finished.trajectory, whole)
-    run = run_on(name, build, faults.missing_right(whole, 1.0 / 3.0, SEED))
-    assert run.status == "ok", run.log
-    assert run.final is not None
-    assert 0.9 * usual_m < error_m(run.final, whole) < 2.0 * usual_m
 
 
 def with_nan(sequence: Sequence, where: str) -> Sequence:
@@ -211,8 +176,9 @@ def _never(_setup: object) -> Estimator:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@both_kinds
-@pytest.mark.parametrize("field", ["T_world_imu", "cov"])
+@pytest.mark.parametrize(
+    ("scenario", "field"), [("drive", "T_world_imu"), ("flight", "T_world_imu"), ("flight", "cov")]
+)
 def test_a_start_that_is_not_a_number_never_ends_ok(name, build, scenario, field) -> None:
     """The prior does not pass through packets(): here the estimator and the runner have to tell."""
     sequence = recording(scenario).truncated(FRAMES_WITH_NAN)

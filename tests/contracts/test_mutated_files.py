@@ -235,21 +235,21 @@ def test_what_is_not_mutated_is_read(original: Original, tmp_path: Path, name: s
     _load(write(original(name), tmp_path / "given"))
 
 
-@mutating(RECORDINGS, KINDS, 150)
+@mutating(RECORDINGS, KINDS, 80)
 def test_a_mutated_recording_is_read_or_refused_in_one_line(
     original: Original, name: str, happened: list[Mutation]
 ) -> None:
     read_or_refused(_load, mutated(original(name), happened))
 
 
-@mutating(TRAJECTORIES, tuple(RAW), 135)
+@mutating(TRAJECTORIES, tuple(RAW), 70)
 def test_a_mutated_trajectory_is_read_or_refused_in_one_line(
     original: Original, name: str, happened: list[Mutation]
 ) -> None:
     read_or_refused(read_poses, mutated(original(name), happened))
 
 
-@mutating(RECORDINGS, KINDS, 30)
+@mutating(RECORDINGS, KINDS, 15)
 def test_the_command_line_survives_a_mutated_recording(
     original: Original, name: str, happened: list[Mutation], capfd: pytest.CaptureFixture[str]
 ) -> None:

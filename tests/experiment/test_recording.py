@@ -95,9 +95,7 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     ("requested", "findings", "audited_s"),
     [
         (Recording("drive", max_frames=7), (), [40]),
-        (Recording("flight", max_frames=7), (), [20]),
         (Recording("drive", part=Part(30.0, 50.0)), (), [50]),
-        (Recording("drive"), (), [60]),
         (Recording("drive", max_frames=7), (FOUND,), [40, 60]),
         (Recording("drive"), (FOUND,), [60]),
         (Recording("drive-realistic", max_frames=7), (), [60]),  # its tracks err otherwise than it states

@@ -25,7 +25,7 @@ def test_the_bound_passes_95_percent_of_gaussian_innovations():
     assert passed.mean() == pytest.approx(0.95, abs=0.005)
 
 
-@pytest.mark.parametrize("dof", [1, 3, 6, 12, 33, 200])
+@pytest.mark.parametrize("dof", [1, 3, 33, 200])
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.999])
 def test_the_mean_behind_the_gate_is_the_truncated_densitys(dof, probability):
     bound = stats.chi2.ppf(probability, dof)

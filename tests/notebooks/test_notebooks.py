@@ -2,7 +2,6 @@
 
 import ast
 import importlib.util
-import json
 import os
 import re
 import tempfile
@@ -85,30 +84,6 @@ def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[s
     assert machine_paths(text) == []
     places = {Path.home(), Path(tempfile.gettempdir()), ROOT} - {Path("/")}  # the home of a user who has none
     assert not [place for place in places if f"{place}{os.sep}" in text]
-
-
-@pytest.mark.parametrize(
-    "expected",
-    [
-        'read "/home/somebody/drive.npz"',
-        "<module '/Users/somebody/my filters.py'>",
-        "file:///home/somebody/figure.png",
-        "(/var/folders/ab/ipykernel_123/456.py:1)",
-        r"C:\Users\somebody\drive.npz",
-        json.dumps(r"C:\Users\somebody"),
-    ],
-)
-def test_the_path_of_another_machine_is_recognised(expected: str, machine_paths: Callable[[str], list[str]]) -> None:
-    assert len(machine_paths(f"text {expected} text")) == 1
-
-
-@pytest.mark.parametrize(
-    "expected", ["https://example.org/home/page.html", "runs/tmp/figure.png", "and/or", "../home/x"]
-)
-def test_an_address_or_a_path_inside_the_project_is_no_machines(
-    expected: str, machine_paths: Callable[[str], list[str]]
-) -> None:
-    assert machine_paths(f"text {expected} text") == []
 
 
 @pytest.mark.parametrize("page", [*SOURCES, NOTEBOOKS / "README.md"], ids=lambda page: page.name)
