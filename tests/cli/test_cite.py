@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from toolkit.cli import main
 from toolkit.datasets import formats
 from toolkit.registry import discover
@@ -59,15 +57,10 @@ def test_a_run_directory_stands_for_what_it_compared(tmp_path: Path) -> None:
     assert [one.name for one in citations([str(tmp_path)])][:2] == ["dead-reckoning", "ekf"]
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [(None, "no estimator or format is called mscf"), ('CITES = ("li2013hihg",)', "did you mean li2013high?")],
-)
-def test_what_is_unknown_is_reported_in_one_line(tmp_path, monkeypatch, capsys, text, expected) -> None:
+def test_a_reference_that_there_is_not_is_reported_in_one_line(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    if text is not None:
-        Path("mine.py").write_text(text)
-    assert main(["cite", "mscf" if text is None else "mine.py"]) == 5
+    Path("mine.py").write_text('CITES = ("li2013hihg",)')
+    assert main(["cite", "mine.py"]) == 5
     printed = capsys.readouterr().err
-    assert expected in printed
+    assert "did you mean li2013high?" in printed
     assert printed.count("\n") == 1

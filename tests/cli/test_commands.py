@@ -15,7 +15,6 @@ from toolkit.audit import Audit, Finding
 from toolkit.cli import progress_display
 from toolkit.experiment import recording
 from toolkit.report.records import read_metrics, read_seeds
-from toolkit.report.run_directory import unique_names
 
 Vislam = Callable[..., int]
 Captured = pytest.CaptureFixture[str]
@@ -186,8 +185,3 @@ def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch)
     for words in ((), ("--no-repair",), ("--keep", f"{first},{second}")):
         vislam("check-data", "drive", *words)
     assert kept == [frozenset(), frozenset(audit.faults()), frozenset({first, second})]
-
-
-def test_directory_names_are_plain_and_differ() -> None:
-    given = ["drive", "a/b c", "drive", "..", "drive"]
-    assert unique_names(given) == ["drive", "a_b_c", "drive-2", "sequence", "drive-3"]

@@ -10,10 +10,7 @@ import msgspec
 import pytest
 
 from toolkit.cli import parser
-from toolkit.cli.compare import SEQUENCES
-from toolkit.datasets import built_in_names
 from toolkit.metrics import cost, known_metrics
-from toolkit.registry import defaults
 from toolkit.settings import POLICIES
 
 Vislam = Callable[..., int]
@@ -95,14 +92,6 @@ def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
         for key in ("command", "date", "threads"):
             del expected[key]
     assert again == once
-
-
-def test_without_words_the_default_sequences_and_estimators_are_compared(vislam: Vislam) -> None:
-    assert set(SEQUENCES) <= set(built_in_names())
-    assert vislam("compare", "--max-frames", "3", "--workers", "1", "--figures", "none", "--out", "run") == 0
-    assert {path.name for path in Path("run").iterdir()} == set(SEQUENCES)
-    for sequence in SEQUENCES:
-        assert manifest(f"run/{sequence}")["estimators"] == list(defaults())
 
 
 def table(reported: str) -> list[str]:

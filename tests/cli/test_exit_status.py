@@ -210,15 +210,14 @@ def test_a_name_that_is_no_text_is_reported_in_any_encoding(encoding: str, tmp_p
     assert "caf\\udce9" in messages.stderr
 
 
-@pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT", "SIGHUP")])
 def test_signals_leave_no_file_and_no_process(
-    tmp_path: Path, starts_group: Callable[..., subprocess.Popen[str]], signals: tuple[str, ...]
+    tmp_path: Path, starts_group: Callable[..., subprocess.Popen[str]]
 ) -> None:
     words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "deep/down")
     running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
     wait_until(lambda: len(living(running.pid)) > 2)
-    for name in signals:
-        os.kill(running.pid, getattr(signal, name))
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(running.pid, number)
         time.sleep(0.05)
     _, messages = running.communicate(timeout=PATIENCE_S)
     assert messages == "vislam: error: interrupted; what was not finished is not written\n"

@@ -46,13 +46,3 @@ def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(
     assert vislam("compare", folder, *QUICK, "--out", os.fsdecode(b"r\xe9sultats")) == 0
     assert "results: r\\udce9sultats" in capfd.readouterr().out
     assert vislam("report", os.fsdecode(b"r\xe9sultats")) == 0
-
-
-def test_a_recording_without_noise_is_named(vislam: Vislam, one_line: Callable[[], str]) -> None:
-    folder = Path(shutil.copytree(RECORDING, "exact"))
-    text = json.loads((folder / "recording.json").read_text())
-    text["noise"]["gyro_noise_density"] = [0.0, 0.0, 0.0]
-    (folder / "recording.json").write_text(json.dumps(text))
-    assert vislam("compare", "exact", "--estimators", "dead-reckoning", "--out", "run") == 3
-    assert "noise.gyro_noise_density is 0, expected a positive number" in one_line()
-    assert not Path("run").exists()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evo.tools import file_interface as evo
 
 from toolkit.cli import main
 from toolkit.datasets.trajectories import FORMATS, read_poses
@@ -21,11 +20,6 @@ WithoutPixels = Callable[[], AbstractContextManager[None]]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20", "--workers", "1")
 # What an export with covariances is written as.
 COVARIANCES = {"tum": "pos-rot/fixed", "euroc": "rot-pos/left", "openvins": "rot-pos/mixed"}
-EVO = {
-    "tum": evo.read_tum_trajectory_file,
-    "kitti": evo.read_kitti_poses_file,
-    "euroc": evo.read_euroc_csv_trajectory,
-}
 
 
 pytestmark = pytest.mark.usefixtures("unrendered")
@@ -63,15 +57,6 @@ def again(run: Path, without_pixels: WithoutPixels) -> Path:
     with without_pixels():
         assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
     return run.parent / "again"
-
-
-def test_evo_reads_in_every_export_what_the_run_directory_holds(run: Path) -> None:
-    held = evo.read_tum_trajectory_file(run / "trajectories/ekf_final.tum")
-    for name, reader in EVO.items():
-        there = reader(run.parent / f"ekf.{name}")
-        np.testing.assert_allclose(there.poses_se3, held.poses_se3, atol=1e-9, rtol=0.0)
-        if name != "kitti":
-            np.testing.assert_array_equal(there.timestamps, held.timestamps)
 
 
 @pytest.mark.parametrize("name", FORMATS)

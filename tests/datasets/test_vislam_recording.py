@@ -131,10 +131,6 @@ def test_an_interruption_between_the_two_moves_puts_the_old_one_back(
 
 def test_a_folder_with_other_things_is_not_touched(drive: Sequence, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/recording.json").write_text('{"tracks": 4}')  # of another program
-    with pytest.raises(OutputError, match=r"recording\.json"):
-        vislam_recording.save(drive, tmp_path / "other")
     with pytest.raises(OutputError, match=r"thesis\.tex"):
         vislam_recording.save(drive, tmp_path)
     with pytest.raises(OutputError, match="is not a directory"):
@@ -142,6 +138,10 @@ def test_a_folder_with_other_things_is_not_touched(drive: Sequence, tmp_path: Pa
     with pytest.raises(OutputError, match="cannot be written"):
         vislam_recording.save(drive, tmp_path / "thesis.tex" / "below")
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/recording.json").write_text('{"tracks": 4}')  # of another program
+    with pytest.raises(OutputError, match=r"recording\.json"):
+        vislam_recording.save(drive, tmp_path / "other")
 
 
 def edit_text(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:

@@ -22,9 +22,11 @@ import pytest
 from toolkit import cli
 from toolkit.audit import audit
 from toolkit.cli import main
+from toolkit.cli.compare import SEQUENCES
 from toolkit.datasets import load_sequence
 from toolkit.errors import VislamError
 from toolkit.geometry import se3_exp
+from toolkit.registry import defaults
 
 PROJECT = Path(__file__).parents[2]
 README, EXTENDING, COURSE = PROJECT / "README.md", PROJECT / "docs/extending.md", PROJECT / "docs/course.md"
@@ -204,7 +206,7 @@ def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(
     first_line: tuple[str, Path], alone: Path
 ) -> None:
     steps = [step for step in _steps(README) if step != FIRST_LINE]
-    assert {row[0] for row in _rows(first_line[0])} == {"drive", "kitti00"}
+    assert {row[:2] for row in _rows(first_line[0])} == {(name, one) for name in SEQUENCES for one in defaults()}
     assert (first_line[1] / "runs").is_dir()
     assert_tables_are_those_shown(README, dict(zip(steps, carry_out(steps), strict=True)))
 
@@ -279,7 +281,7 @@ def _rows(text: str) -> dict[tuple[str, ...], list[str]]:
     for line in text.splitlines():
         words = line.split()
         if re.match(r"\S+: \d+ frames, ", line):
-            sequence = words[0]
+            sequence = words[0].rstrip(":")
         elif words[1:2] in (["causal"], ["final"], ["both"]):
             row = (sequence, *words[:3])
             rows[row] = words[3:]
