@@ -98,7 +98,9 @@ def test_a_recording_here_is_read_in_the_place_of_a_built_in_one_and_anything_el
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive").mkdir()
     built_in = load_sequence("drive")
-    assert built_in.provenance.facts[-1] == "what is called drive here is no recording and is not read"
+    assert (
+        built_in.provenance.facts[-1] == "the built-in sequence drive is read: what is called so here is no recording"
+    )
     (tmp_path / "drive").rmdir()
     shutil.copytree(openvins, tmp_path / "drive")
     here = load_sequence("drive")

@@ -58,13 +58,43 @@ def test_a_body_with_other_axes_is_named_and_only_its_positions_are_scored(scene
     assert metrics_of("again")[0]["ate_se3_deg"] < 2.0
 
 
+def test_a_turned_body_is_named_beside_a_scale_and_on_a_line(scene, vislam) -> None:
+    t_ns, body = scene.stamps(10.0), turned_by((0.6, 1.2, 0.4))
+    poses = scene.estimated(t_ns, 0.02) @ body
+    scene.write("s.tum", t_ns, se3(poses[:, :3, :3], 0.4 * poses[:, :3, 3]))
+    assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+    assert "turned by 80 deg" in metrics_of()[1]["ate_se3_deg"]
+    # A drive along a road that hardly bends, with a sensor that looks aside.
+    time_s = np.arange(600) / 10.0
+    heading = 0.02 * np.sin(time_s)
+    line = se3(about_z(heading), np.stack([5.0 * time_s, 0.1 * np.cos(time_s), 0.0 * time_s], axis=1))
+    scene.write("truth.tum", t_ns, line)
+    for turn, words in ((np.pi / 2.0, "its x, y and z point along the truth's y, -x and z"), (0.0, "")):
+        scene.write("s.tum", t_ns, line @ se3_exp(noise(600)) @ turned_by((0.0, 0.0, turn)))
+        assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+        assert words in metrics_of()[1].get("ate_se3_deg", "")
+        assert (metrics_of()[0]["ate_se3_deg"] is None) == bool(words)
+
+
+def test_an_extrinsic_that_is_a_little_off_is_told_and_scored(scene, vislam) -> None:
+    t_ns = scene.stamps(10.0)
+    for turn, is_told in ((0.1, True), (0.0, False)):
+        scene.write("s.tum", t_ns, scene.estimated(t_ns, 0.05) @ turned_by((0.0, 0.0, turn)))
+        assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
+        assert ("off by one turn of 5.7 deg" in metrics_of()[1].get("rpe_100m_percent", "")) == is_told
+        assert metrics_of()[0]["rpe_100m_percent"] is not None
+
+
 def rows(t_ns: Array, poses: Array, row: str) -> str:
-    """Lines of poses as a format says: t, x y z, qx qy qz qw, i the number of the row, n the stamp in nanoseconds."""
+    """Lines of poses as a format says: t, x y z, qx qy qz qw, i the number of the row, n the stamp in nanoseconds.
+
+    s and ns are its whole seconds and the rest.
+    """
     quaternions = quaternion_from_rotation(poses[:, :3, :3])
     lines = []
     for i, (t, p, q) in enumerate(zip(t_ns.tolist(), poses[:, :3, 3].tolist(), quaternions.tolist(), strict=True)):
         named = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*p, *q), strict=True))
-        lines.append(row.format(i=i, n=t, t=f"{t / S:.9f}", **named))
+        lines.append(row.format(i=i, n=t, s=t // S, ns=t % S, t=f"{t / S:.9f}", **named))
     return "\n".join(lines) + "\n"
 
 
@@ -89,6 +119,7 @@ ROS = ",".join(f"field.pose.position.{axis}" for axis in "xyz")
             f"{{n}},{{i}},{COMMAS},{QUATERNION}",
         ),
         ("# timestamp x y z qx qy qz qw", TUM),
+        ("sec,nsec,x,y,z,qx,qy,qz,qw", f"{{s}},{{ns}},{COMMAS},{QUATERNION}"),
         ("", TUM),
     ],
 )
@@ -230,6 +261,11 @@ def conjugated(lines: list[str]) -> list[str]:
     return rewritten(lines, se3(np.swapaxes(rotations, 1, 2), positions))
 
 
+def inverted(lines: list[str]) -> list[str]:
+    positions, rotations = poses_of(lines)
+    return rewritten(lines, np.linalg.inv(se3(rotations, positions)))
+
+
 def backwards(lines: list[str]) -> list[str]:
     positions, rotations = poses_of(lines)
     return rewritten(lines, se3(rotations, positions)[::-1])
@@ -264,6 +300,7 @@ ADVICE: list[tuple[Lines, list[tuple[str, Lines]]]] = [
         conjugated,
         [("conjugate them", conjugated)],
     ),
+    (inverted, [("the poses look like those of the world in the IMU frame: invert each one", inverted)]),
     (
         backwards,
         [("write them in the order of their stamps", backwards)],

@@ -228,9 +228,9 @@ def _told_of_both(sequence: Sequence, source: str) -> Sequence:
     """Return a sequence whose facts say what else is called as its source: a built-in one, or a file or folder here."""
     if source not in built_ins() or not Path(source).exists():
         return sequence
-    other = f"what is called {source} here is no recording and is not read"
+    other = f"the built-in sequence {source} is read: what is called so here is no recording"
     if not is_built_in(source):
-        other = f"the recording here is read, and not the built-in sequence {source}; go elsewhere for that"
+        other = f"the recording here is read, and not the built-in sequence {source}, which is read elsewhere"
     return replace(sequence, provenance=replace(sequence.provenance, facts=(*sequence.provenance.facts, other)))
 
 

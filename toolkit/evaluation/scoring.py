@@ -18,6 +18,7 @@ import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
+    BodyTurn,
     Reference,
     check_axes,
     check_body,
@@ -113,6 +114,10 @@ _LOOKS_ONE_WAY = (
     "the estimate's orientations are all one, as where none was written: these are the truth's own rotations"
 )
 _OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
+_OFF = (
+    "its orientations are off by one turn of {:.1f} deg, about which they scatter by {:.1f} deg: an extrinsic is off, "
+    "and not the estimate alone"
+)
 _LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Of the hash of a truth: significant digits that are hashed, hexadecimal digits that are kept.
@@ -242,15 +247,17 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     file, estimate = _read(path, truth, terms)
     turn = _checked(file, estimate, truth)
     matched = _matched(estimate, truth, terms.max_dt_s)
-    if turn is None:
+    if turn is None or not turn.is_other_body:
         check_axes(str(path), matched.truth, matched.estimate)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
-    if turn is not None:
-        scores = scores.without(
-            _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {other_axes(turn)}"
-        )
+    if turn is not None and turn.is_other_body:
+        axes = other_axes(turn.R_truth_body)
+        scores = scores.without(_OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {axes}")
+    elif turn is not None and turn.is_told:
+        off_deg, scatter_deg = np.degrees((turn.angle_rad, turn.scatter_rad))
+        scores = scores.remarked(_OF_ORIENTATIONS, _OFF.format(off_deg, scatter_deg))
     if changes(matched.estimate[:, :3, 3]) and not changes(matched.truth[:, :3, 3]):
         scores = scores.remarked(_OF_POSITIONS, _STANDS)
     scores = _with_the_estimates_own(scores, matched)
@@ -292,8 +299,8 @@ def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
     return Poses(file.path, truth.t_ns, file.T_world_imu)
 
 
-def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None:
-    """Check that a trajectory belongs to the truth; return the turn to its body's axes where these are others."""
+def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> BodyTurn | None:
+    """Check that a trajectory belongs to the truth; return how its body is turned, where that shows."""
     what = str(file.path)
     if len(file) == 0:
         raise DataError(f"{what}: it holds no poses")

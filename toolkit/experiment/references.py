@@ -108,8 +108,9 @@ def _external(name: str, file: ExternalFile, recording: Sequence, sequence: Sequ
         pairs = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
         matched = pairs.truth, pairs.estimate
     turn = check_body(poses, reference, trajectory.t_ns, matched, of_the_camera(recording))
-    if turn is not None:
-        raise DataError(f"{what}: its poses are of a body with other axes than the IMU's: {other_axes(turn)}")
+    if turn is not None and turn.is_other_body:
+        axes = other_axes(turn.R_truth_body)
+        raise DataError(f"{what}: its poses are of a body with other axes than the IMU's: {axes}")
     if matched is not None:
         check_axes(what, *matched)
     remarks = [] if recording.truth is not None else _of_another_scale(trajectory, sequence)

@@ -25,6 +25,7 @@ from toolkit.geometry import (
     quaternion_from_rotation,
     se3,
     se3_inverse,
+    so3_exp,
     so3_log,
 )
 from toolkit.measurements import NS_PER_S
@@ -64,6 +65,10 @@ _FEWEST = 10
 # Number of poses, evenly spread, that are compared, and by which rates of rotation are.
 _ENOUGH, _ENOUGH_TURNS = 500, 1000
 _ALONG_AN_AXIS = 0.9
+# Share of a path that its ends are apart, in a steady direction of the body, on a line; and no length at all (m).
+_STEADY, _STILL = 0.95, 1e-9
+# A turn of a body that is told, and is no other axes: an extrinsic that is a little off.
+_LEAST_TOLD_RAD = float(np.deg2rad(2.0))
 _NAMES = "xyz"
 
 
@@ -134,6 +139,11 @@ INVERTED = Reading(
     "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
     lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2),
 )
+_EACH_INVERTED = Reading(
+    "each pose is inverted",
+    "the poses look like those of the world in the IMU frame: invert each one",
+    lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2),
+)
 # Poses in the reverse of their order, on stamps that go on.
 BACKWARDS = Reading(
     "read backwards",
@@ -194,8 +204,8 @@ def check_turns(
 
 def check_body(
     file: PosesFile, reference: Reference, t_ns: IntArray, matched: tuple[Array, Array] | None, *readings: Reading
-) -> Array | None:
-    """Return R_reference_body (3, 3) where a file's poses are of a body with other axes than the truth's, else None.
+) -> "BodyTurn | None":
+    """Return the turn of a file's body against the truth's, which may have other axes; None where it does not show.
 
     ``matched`` are the truth's and the estimate's poses (n, 4, 4) of the same times, where there is a truth. Every
     reading is judged by what it leaves of the orientations once the positions are laid over each other: at best one
@@ -210,21 +220,69 @@ def check_body(
         most_rad = min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
         fits = given.scatter_rad < most_rad
         if fits and not given.is_other_body:
-            return None
+            return given
         # A reading that leaves no turn is likelier than one that leaves a turn, which a loop may make by chance.
         best = min(left, key=lambda one: left[one].scatter_rad)
         is_better = not left[best].is_other_body if fits else left[best].scatter_rad < given.scatter_rad / _TIMES
         if is_better and left[best].scatter_rad < most_rad:
             raise DataError(_only_if(what, reference, best))
         if fits:
-            return given.R_truth_body
+            return given
+    if matched is not None and fit is None and _fits_inverted(*matched):
+        raise DataError(_only_if(what, reference, _EACH_INVERTED))
     some = slice(None, None, 1 + len(file) // _ENOUGH_TURNS)
     t_ns, poses = t_ns[some], file.T_world_imu[some]
     confirmed = check_turns(what, reference, t_ns, poses[:, :3, :3], others)
     turn = _turned_body(reference, t_ns, poses[:, :3, :3])
+    if turn is None and matched is not None:
+        turn = _turned_on_a_line(*matched)
     if order is not None and not confirmed and turn is None:
         check_order(file.path, file.T_world_imu, order)
+    return None if turn is None else BodyTurn(turn, 0.0, 0.0)
+
+
+def _fits_inverted(truth: Array, estimate: Array) -> bool:
+    """Say whether poses (n, 4, 4) that are nowhere near the truth's are, with one turn of the body, once inverted.
+
+    Those that stand in one place and turn are a circle then.
+    """
+    extents_m = [float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))) for poses in (estimate, truth) if len(poses)]
+    if len(extents_m) < 2 or extents_m[0] < _LEAST_SHARE * extents_m[1]:
+        return False
+    fit = _fit(truth, se3_inverse(estimate))
+    return fit is not None and fit.turns and fit.body.scatter_rad < min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
+
+
+def _turned_on_a_line(truth: Array, estimate: Array) -> Array | None:
+    """Return the least turn of the body that makes it travel in the same direction of its own axes on a line, or None.
+
+    A line leaves the turn about it open. None where either changes its direction, both travel alike, or one states no
+    orientation, for they are all one.
+    """
+    if any(np.ptp(poses[:, :3, :3], axis=0).max() == 0.0 for poses in (truth, estimate) if len(poses)):
+        return None
+    directions = [_travels(poses[np.isfinite(poses).all(axis=(1, 2))]) for poses in (truth, estimate)]
+    if any(np.linalg.norm(one) < _STEADY for one in directions):
+        return None
+    y, x = (one / np.linalg.norm(one) for one in directions)
+    axis = np.cross(x, y)
+    angle = float(np.arctan2(np.linalg.norm(axis), x @ y))
+    if angle < _OTHER_AXES_RAD:
+        return None
+    if np.linalg.norm(axis) < _STILL:  # backwards, about whatever is upright
+        axis = np.cross(x, np.eye(3)[int(np.argmin(np.abs(x)))])
+    turn: Array = so3_exp(angle * axis / np.linalg.norm(axis))
     return turn
+
+
+def _travels(poses: Array) -> Array:
+    """Return the mean direction of travel (3,) in the body's axes of poses (n, 4, 4), shorter where it changes."""
+    if len(poses) < _FEWEST:
+        return np.zeros(3)
+    way = poses[-1, :3, 3] - poses[0, :3, 3]
+    path_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+    mean: Array = (np.swapaxes(poses[:, :3, :3], 1, 2) @ way).mean(axis=0) / max(path_m, _STILL)
+    return mean
 
 
 def _only_if(what: str, reference: Reference, reading: Reading) -> str:
@@ -513,10 +571,19 @@ class BodyTurn(NamedTuple):
     unknown_rad: float
 
     @property
+    def angle_rad(self) -> float:
+        """The angle of the turn."""
+        return float(np.linalg.norm(so3_log(self.R_truth_body)))
+
+    @property
+    def is_told(self) -> bool:
+        """Say whether the turn is more than the errors of both."""
+        return self.angle_rad > max(_LEAST_TOLD_RAD, _TIMES * self.scatter_rad, _TIMES * self.unknown_rad)
+
+    @property
     def is_other_body(self) -> bool:
-        """Say whether the body's axes are others: the turn is large, and more than the errors of both."""
-        angle = float(np.linalg.norm(so3_log(self.R_truth_body)))
-        return angle > max(_OTHER_AXES_RAD, _TIMES * self.scatter_rad, _TIMES * self.unknown_rad)
+        """Say whether the body's axes are others."""
+        return self.is_told and self.angle_rad > _OTHER_AXES_RAD
 
 
 class _Fit:

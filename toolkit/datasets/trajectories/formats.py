@@ -33,7 +33,7 @@ from toolkit.datasets.trajectories.covariances import (
     with_triangles_apart,
     written_as,
 )
-from toolkit.datasets.trajectories.headings import Named, named_columns
+from toolkit.datasets.trajectories.headings import Named, is_of_the_globe, named_columns
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.files.reading import read_text_input
@@ -106,7 +106,10 @@ class Rows:
         try:
             return [_number(cell) for cell in cells]
         except ValueError as error:
-            raise DataError(f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}") from error
+            point = ", with a point in numbers" if any("," in cell for cell in cells) else ""
+            raise DataError(
+                f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}{point}"
+            ) from error
 
 
 def read_rows(path: Path, kind: str) -> Rows:
@@ -121,7 +124,7 @@ def read_rows(path: Path, kind: str) -> Rows:
         lines = [line.partition("#")[0] for line in lines]
     lines = ["" if line.startswith("%") else line for line in lines]
     last = next((line for line in reversed(lines) if line and not line.isspace()), "")
-    separator = next((mark for mark in ",;" if mark in last), None)
+    separator = next((mark for mark in ";," if mark in last), None)
     cells = [_between(line, separator) for line in lines] if separator else [line.split() for line in lines]
     line_numbers = [n for n, of_line in enumerate(cells, start=1) if of_line]
     cells = [of_line for of_line in cells if of_line]
@@ -131,6 +134,8 @@ def read_rows(path: Path, kind: str) -> Rows:
         line_numbers, cells = line_numbers[1:], cells[1:]
     if not cells:
         raise DataError(f"{path}: the file holds no poses; {kind}")
+    if any(is_of_the_globe(one) for one in headings):
+        raise DataError(f"{path}: its positions are latitude and longitude; convert them to metres (ENU, UTM)")
     headings = [one for one in headings if len(one) == len(cells[0]) and named_columns(one) is not None]
     heading = tuple(headings[-1]) if headings else ()
     underscored = "_" in text and any("_" in line for line in lines)
@@ -502,6 +507,8 @@ def read_finite_poses(path: Path, cov_convention: CovConvention | None = None) -
 
 def _is_usual(named: Named, rows: Rows) -> bool:
     """Say whether columns that have names are where a format has them that needs no names."""
+    if named.nanoseconds is not None:
+        return False
     begin = (named.stamp, *named.position)
     if begin == (0, 1, 2, 3) and rows.commas and named.quaternion == (5, 6, 7, 4):
         return named.unit_ns == 1 or (named.unit_ns is None and _unit_ns(rows.numbers(rows.width, "t")[:, 0]) == 1)
@@ -517,17 +524,26 @@ def _is_usual(named: Named, rows: Rows) -> bool:
 def _by_name(rows: Rows, named: Named) -> PosesFile:
     """Return the poses in columns that names say, or the positions alone; raises DataError as a format does."""
     table = rows.numbers(rows.width, ", ".join(rows.heading) or _POSITIONS_ALONE)
-    _check_digits(rows, table, named.stamp)
-    stamps, unit_ns = table[:, named.stamp], named.unit_ns
-    if unit_ns is None:
-        unit_ns = _unit_ns(stamps)
-    if unit_ns == NS_PER_S:
-        stamps_ns(rows.path, "time", stamps)
-    t_ns = replace(rows, cells=[[cells[named.stamp]] for cells in rows.cells]).stamps(unit_ns)
+    t_ns = _stamps_by_name(rows, named, table)
     turns = table[:, named.quaternion] if named.quaternion else np.tile([0.0, 0.0, 0.0, 1.0], (len(table), 1))
     kind = "columns by name" if named.quaternion else "positions alone"
     file = _stamped_poses(rows, t_ns, np.hstack([table[:, named.position], turns]), kind)
     return replace(file, other_order=_MISNAMED) if named.quaternion else file
+
+
+def _stamps_by_name(rows: Rows, named: Named, table: Array) -> IntArray:
+    """Return the stamps (N,) ns of rows; raises DataError naming a wrong unit, or stamps of too few digits."""
+
+    def column(at: int, unit_ns: int) -> IntArray:
+        return replace(rows, cells=[[cells[at]] for cells in rows.cells]).stamps(unit_ns)
+
+    if named.nanoseconds is not None:
+        return column(named.stamp, NS_PER_S) + column(named.nanoseconds, 1)
+    _check_digits(rows, table, named.stamp)
+    unit_ns = _unit_ns(table[:, named.stamp]) if named.unit_ns is None else named.unit_ns
+    if unit_ns == NS_PER_S:
+        stamps_ns(rows.path, "time", table[:, named.stamp])
+    return column(named.stamp, unit_ns)
 
 
 def _unit_ns(stamps: Array) -> int:

@@ -13,7 +13,8 @@ _UNITS_NS = {
     "seconds": 10**9,
 }  # fmt: skip
 # The last word of a name but for its unit.
-_STAMPS = ("t", "time", "timestamp", "stamp", "ts", "sec", "secs", "seconds", "nsec", "ns")
+_SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds")
+_STAMPS = ("t", "time", "timestamp", "stamp", "ts", "ns", *_SECONDS, *_NANOSECONDS)
 _POSITIONS = ("", "p", "pos", "position", "t", "trans", "translation", "location", "xyz")
 _QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rot", "rotation")
 _ACCELERATIONS = ("arss", "alpha", "a", "acc", "accel", "acceleration", "accelerometer", "linearacceleration")
@@ -24,13 +25,14 @@ _IN_BRACKETS, _BETWEEN_WORDS = re.compile(r"[\[(](.*?)[\])]"), re.compile(r"[^a-
 class Named(NamedTuple):
     """The columns of a table from 0, quaternions x y z w; ``unit_ns`` is that of the stamps where their name says it.
 
-    A table of positions alone has no quaternions.
+    A table of positions alone has no quaternions. Whole seconds may have their nanoseconds in a column of their own.
     """
 
     stamp: int
     unit_ns: int | None
     position: tuple[int, ...]
     quaternion: tuple[int, ...]
+    nanoseconds: int | None = None
 
 
 def named_columns(names: Sequence[str]) -> Named | None:
@@ -42,7 +44,15 @@ def named_columns(names: Sequence[str]) -> Named | None:
     position = _axes(words, "xyz", _POSITIONS)
     if not stamps or len(position) != 3:
         return None
-    return Named(stamps[0], _unit_ns(names[stamps[0]]), position, _axes(words, "xyzw", _QUATERNIONS))
+    seconds, parts = ([at for at in stamps if words[at][-1] in of_unit] for of_unit in (_SECONDS, _NANOSECONDS))
+    at, rest = (seconds[0], parts[0]) if seconds and parts else (stamps[0], None)
+    return Named(at, _unit_ns(names[at]), position, _axes(words, "xyzw", _QUATERNIONS), rest)
+
+
+def is_of_the_globe(names: Iterable[str]) -> bool:
+    """Say whether a table has latitudes and longitudes."""
+    words = {word for name in names for word in _words(name)}
+    return bool(words & {"lat", "latitude"} and words & {"lon", "long", "lng", "longitude"})
 
 
 def stamp_unit_ns(name: str) -> int | None:
