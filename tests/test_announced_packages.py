@@ -119,23 +119,6 @@ def test_a_module_that_is_no_dataset_is_named(announce: Announce, file: str, tex
         datasets.built_ins()
 
 
-@pytest.mark.parametrize(
-    ("line", "error"),
-    [
-        ("import their_metrics.prats", ModuleNotFoundError),
-        ("from toolkit.geometri import se3", ModuleNotFoundError),
-        ("from toolkit.geometry import se4", ImportError),
-        ("ORDER = ordre", NameError),
-    ],
-)
-@pytest.mark.parametrize("group", [metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP])
-def test_a_typo_still_fails(announce: Announce, group: str, line: str, error: type[Exception]) -> None:
-    announce(group, {"typo.py": line.replace("their_metrics", f"their_{group.rpartition('.')[2]}")})
-    found = {metrics.ENTRY_POINT_GROUP: metrics.describe, datasets.ENTRY_POINT_GROUP: datasets.formats}[group]
-    with pytest.raises(error):
-        found()
-
-
 def test_an_estimators_file_that_is_no_python_is_named_with_its_line(announce: Announce) -> None:
     announce("toolkit.estimators", {"broken.py": "import math\ndef (\n"})
     with pytest.raises(ExtensionError, match=r"broken\.py: line 2 is no Python \(invalid syntax\)"):

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from toolkit import discovery
+from toolkit.discovery import FoundModule
 from toolkit.errors import EstimatorError, ExtensionError
-from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
+from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, EstimatorEntry, discover, find, find_all, ladder
 from toolkit.settings import DEFAULTS
 
 PACKAGE = "temporary_estimators"
@@ -141,3 +142,21 @@ def test_an_entry_point_to_nowhere_is_reported(monkeypatch):
     monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
     with pytest.raises(ExtensionError, match="names gone_package, which is not a package"):
         discover()
+
+
+@pytest.mark.parametrize(
+    ("source", "rung", "change"),
+    [
+        ('RUNG, CHANGE = 30, "+ more"', 30, "+ more"),
+        ('RUNG = 30\nCHANGE: str = "+ more"', 30, "+ more"),
+        ("RUNG: int = 7", 7, ""),
+        ('"""RUNG = 3"""\nother = 4', None, ""),
+        ("import no_such_package\nRUNG = 1\nRUNG = 2", 2, ""),
+        ('RUNG = "high"\ndef f():\n    CHANGE = "x"', None, ""),
+    ],
+)
+def test_a_rung_is_read_without_importing(tmp_path: Path, source: str, rung: int | None, change: str) -> None:
+    path = tmp_path / "one.py"
+    path.write_text(source)
+    entry = EstimatorEntry("one", FoundModule("nowhere.one", path))
+    assert (entry.rung(), entry.change()) == (rung, change)

@@ -4,7 +4,7 @@ The table that GTSAM's issue 2456 asks for. Every variant sees the same draws wi
 causal answers it prints mean and standard error of the heading's NEES (the error about the vertical, squared, over its
 variance) and of the position's RMSE, this as a ratio to that of `invariant` marginals on the same draw.
 
-    python tests/benchmarks/marginals_table.py flight 10 --seeds 30 [--first-seed 700] [--states 50,1]
+    python benchmarks/marginals_table.py flight 10 --seeds 30 [--first-seed 700] [--states 50,1]
 """
 
 import argparse
