@@ -32,6 +32,7 @@ import numpy as np
 
 from filters.kalman.joint import AtFirstEstimates
 from filters.kalman.landmark_map import KnownPoseMapper
+from filters.kalman.online_output import Filter
 from filters.msckf import Msckf
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.indeterminate import with_covariances
@@ -52,12 +53,24 @@ from toolkit.settings.records import DEFAULTS, Outliers
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"
 RULES = {"window": "it keeps every state"}
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "past poses",
+    "long-lived landmarks",
+    "relinearisation",
+    "whole past",
+    "the future",
+)
 DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Batch(setup)
+    causal_pass = Msckf(setup, AtFirstEstimates(), window_s=DEFAULTS.window.seconds("twist"))
+    return Batch(setup, causal_pass, causal_pass.log)
 
 
 class Stage(NamedTuple):
@@ -70,10 +83,10 @@ class Stage(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """The last solution, its graph, and the frames (K,) with the sightings in it."""
+    """The last solution, the linear graph of its covariances, and the frames (K,) with the sightings in it."""
 
     solution: Solution
-    graph: gtsam.NonlinearFactorGraph
+    linear: gtsam.GaussianFactorGraph
     frames: list[StereoFrame]
 
 
@@ -89,22 +102,23 @@ def stages(outliers: Outliers) -> list[Stage]:
 
 
 class Batch:
-    """Keeps every packet and solves for all of them in the end."""
+    """Keeps every packet and solves for all in the end, from the trajectory of a causal pass; ``log`` is said of it."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: Setup, causal_pass: Filter, log: tuple[str, ...] = ()) -> None:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        self._causal_pass = Msckf(setup, AtFirstEstimates(), window_s=DEFAULTS.window.seconds("twist"))
+        self._causal_pass, self._log = causal_pass, log
         self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []
 
-    def step(self, packet: Packet) -> None:
+    def step(self, packet: Packet) -> Estimate | None:
         """Keep the packet and step the causal pass; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
         self._map.add(packet.frame, self._estimates[-1].T_world_imu)
+        return None
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, and for the covariance of every state."""
@@ -115,9 +129,9 @@ class Batch:
         smoothed = self._solved(frames, self._start(known, track_ids))
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
-        trajectory, log = with_covariances(Trajectory.of(states), smoothed.graph.linearize(values), self._motion)
+        trajectory, log = with_covariances(Trajectory.of(states), smoothed.linear, self._motion)
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, (*self._causal_pass.log, *log))
+        return Finished(trajectory, landmarks, smoothed.solution.converged, (*self._log, *log))
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()
@@ -140,17 +154,17 @@ class Batch:
         *softened, last = stages(self._outliers)
         for stage in (*softened, last):
             if stage is last:
-                frames = _placed_by_stereo(self._plausible(frames, values))
-            graph = _with_sightings(motion, frames, StereoFactors(self._rig, stage.threshold, stage.loss))
+                frames = placed_by_stereo(self._plausible(frames, values))
+            graph = with_sightings(motion, frames, StereoFactors(self._rig, stage.threshold, stage.loss))
             # The first solve need not reach its minimum, which would take twice as long without a gain.
             images = None if stage.stopping.at_overshoot else FirstImages.of(frames, self._rig, at_once=overshot)
-            start, order = _only_seen(values, frames), order_of(graph, frames)
+            start, order = only_seen(values, frames), order_of(graph, frames)
             problem = MixedGraph(graph, increments)
             solution = solve(problem, start, stage.stopping, self._progress, stage.name, images, order)
             values, overshot = solution.values, overshot or solution.overshot
             if stage is not last:
-                frames = _without_those_behind(frames, values, self._rig)
-        return Smoothed(solution, graph, frames)
+                frames = without_those_behind(frames, values, self._rig)
+        return Smoothed(solution, graph.linearize(values), frames)
 
     def _motion_factors(self) -> tuple[gtsam.NonlinearFactorGraph, dict[int, GraphIncrement]]:
         """Return the prior and the motion factors, about the causal pass's last bias, and the increments of these."""
@@ -189,9 +203,10 @@ def seen_ids(frames: list[StereoFrame]) -> list[int]:
     return [int(i) for i in np.unique(np.concatenate([frame.track_ids for frame in frames]))]
 
 
-def _with_sightings(
+def with_sightings(
     motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame], maker: StereoFactors
 ) -> gtsam.NonlinearFactorGraph:
+    """Return the graph of the motion and of the frames' sightings; frame k observes from pose X(k)."""
     graph = gtsam.NonlinearFactorGraph(motion)
     for k, frame in enumerate(frames):
         for factor in maker.of(frame, k):
@@ -199,7 +214,7 @@ def _with_sightings(
     return graph
 
 
-def _only_seen(values: gtsam.Values, frames: list[StereoFrame]) -> gtsam.Values:
+def only_seen(values: gtsam.Values, frames: list[StereoFrame]) -> gtsam.Values:
     """Return the values of all states and of the landmarks that some frame sees."""
     landmarks = {L(i) for i in seen_ids(frames)}
     return values.extract([key for key in values.keys() if key in landmarks or kind_of(key) != "l"])  # noqa: SIM118 - not a mapping
@@ -225,7 +240,7 @@ def _poses(values: gtsam.Values, count: int) -> Array:
     return np.array([values.atPose3(X(k)).matrix() for k in range(count)])
 
 
-def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
+def placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
     """Return the frames without left-only sightings of landmarks that no sighting in both images sees any more."""
     if not any(is_left_only(frame.uvs_px).any() for frame in frames):
         return frames
@@ -233,7 +248,8 @@ def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
     return [frame.select(np.isin(frame.track_ids, placed)) for frame in frames]
 
 
-def _without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:
+def without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:
+    """Return the frames without the sightings of landmarks that are behind a camera that saw them."""
     behind = [frame.track_ids[depth_m <= 0.0] for frame, _, depth_m in _residuals(frames, values, rig)]
     dropped = np.concatenate(behind)
     if not dropped.size:

@@ -58,11 +58,16 @@ MOST_MOVED = 0.3
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
+    return OnlineOutput(joint_ekf(setup))
+
+
+def joint_ekf(setup: Setup) -> "JointEkf":
+    """Return the filter that the options ask for."""
     first = AtFirstEstimates(MOST_MOVED) if setup.motion_kind == "imu" else AtFirstEstimates()
     at = linearisation(setup, first)
     in_inverse_depth = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam, at=at)
     beliefs: dict[Scalar, Callable[[Belief], JointBelief]] = {"inverse depth": in_inverse_depth, "metres": JointBelief}
-    return OnlineOutput(JointEkf(setup, at, setup.choice("landmarks", beliefs)))
+    return JointEkf(setup, at, setup.choice("landmarks", beliefs))
 
 
 class Correct(Protocol):

@@ -58,7 +58,7 @@ WITHOUT = {
 }
 
 
-class Window(Protocol):
+class LagWindow(Protocol):
     """The graph of a window, solved at every packet; variables older than its lag are marginalised."""
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
@@ -83,7 +83,7 @@ def build(setup: Setup) -> Estimator:
     return Thinned(setup, FixedLag(setup, lag_s, window_of(setup, round(lag_s * NS_PER_S))))
 
 
-def window_of(setup: Setup, lag_ns: int) -> Window:
+def window_of(setup: Setup, lag_ns: int) -> LagWindow:
     """Return the window that the options ask for; by default GTSAM's incremental one."""
     in_body = InBody(setup.rig.T_imu_cam)
     marginals: dict[Scalar, Coordinates] = {"first": AT_FIRST, "latest": InWorld(), "invariant": in_body}
@@ -97,7 +97,7 @@ def window_of(setup: Setup, lag_ns: int) -> Window:
 class FixedLag:
     """Adds a packet to the window, has it solved, and reads the states in it; the window is GTSAM's by default."""
 
-    def __init__(self, setup: Setup, lag_s: float, window: Window | None = None) -> None:
+    def __init__(self, setup: Setup, lag_s: float, window: LagWindow | None = None) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
         self._tree = window or FixedLagTree(self._lag_ns)
         self._builder = GraphBuilder(setup)

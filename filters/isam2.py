@@ -34,6 +34,18 @@ from toolkit.models.factors import L, landmark_keys
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept; one step a frame, old variables frozen"
 RULES = {"window": "it keeps every state"}
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "past poses",
+    "long-lived landmarks",
+    "relinearisation",
+    "whole past",
+    "the future",
+)
+WITHOUT = {"the future": {"output": "causal"}}
 
 # A landmark tens of kilometres away never stops moving, although no pose moves with it: the last solve converges by
 # the criterion of `batch`.

@@ -32,6 +32,14 @@ from toolkit.models.stereo_adjustment import (
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
 RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, none kept"
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "past poses",
+    "relinearisation",
+)
 
 _ENDING = Ending()
 

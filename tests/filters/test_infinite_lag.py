@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters import ekf
-from filters.batch import Batch
+from filters import batch, ekf
 from filters.fixed_lag import FixedLag
 from filters.smart import Smart
 from tests.filters.conftest import recorded
@@ -34,11 +33,11 @@ def test_an_infinite_lag_is_the_batch(kind, scenario):
     """
     recording = recorded(replace(scenario, camera=replace(scenario.camera, max_tracks=30)), 0.1, seed=3)
     setup, duration_s = recording.setup, recording.sequence.duration_s
-    endless, batch, filtered = kind(setup, 10.0 * duration_s), Batch(setup), ekf.build(setup)
+    endless, solver, filtered = kind(setup, 10.0 * duration_s), batch.build(setup), ekf.build(setup)
     for packet in recording.sequence.packets():
-        for estimator in (endless, batch, filtered):
+        for estimator in (endless, solver, filtered):
             estimator.step(packet)
-    answer, filters_answer = batch.finish(), filtered.finish()
+    answer, filters_answer = solver.finish(), filtered.finish()
     assert answer.converged
     assert largest_difference(endless.finish(), answer) < 1e-4
     assert largest_difference(filters_answer, answer) > 1e-3, "there was something to agree on"
