@@ -16,6 +16,7 @@ from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import CLEAN, Axis, Point, Sweep, run_sweep
 from toolkit.experiment.units import Outcome, Scored
 from toolkit.metrics import Scores
+from toolkit.registry import find
 from toolkit.settings import SettingsError
 from toolkit.settings.reading import settings_of
 
@@ -159,6 +160,14 @@ def test_two_axes_are_crossed_or_each_is_varied_by_itself(short: Plan, tmp_path:
     assert {(row[FRAMES], row["noise.motion_scale"]) for row in rows} == {
         (lost, scale) for lost in (0.0, 0.5) for scale in ("auto", 2.0, 4.0)
     }
+
+
+def test_functions_of_ones_own_are_swept_beside_what_is_named(short: Plan) -> None:
+    mixed = replace(short, own={"mine": find("dead-reckoning").load()})
+    swept = run_sweep(mixed, {FRAMES: [0.5]}, crossed=True)
+    assert swept.estimators == ("dead-reckoning", "mine")
+    one, same = (swept.effects[name, swept.points[1]] for name in swept.estimators)
+    assert (one.over_clean, one.nees) == (same.over_clean, same.nees)
 
 
 @pytest.mark.parametrize(

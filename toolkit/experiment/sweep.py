@@ -34,6 +34,7 @@ from toolkit.experiment.workers import LostUnit
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES
 from toolkit.progress import ProgressFor, silent
+from toolkit.registry import find_all
 from toolkit.settings import Scalar, SettingsError, as_values
 from toolkit.settings.reading import describe
 from toolkit.simulation.faults import INJECTORS
@@ -242,9 +243,8 @@ def run_sweep(
     steps = [[CLEAN, *axis.points] for axis in axes]
     points = product(*steps) if crossed else ([step] for of_axis in steps for step in of_axis)
     unique = tuple(dict.fromkeys(tuple(one for step in point for one in step) for point in points))
-    grid = run_grid(
-        plan, [_trial(name, point) for point in unique for name in plan.estimators], directory, progress_for
-    )
+    names = [*(entry.word for entry in find_all(plan.estimators).values()), *plan.own]
+    grid = run_grid(plan, [_trial(name, point) for point in unique for name in names], directory, progress_for)
     return Sweep(grid, axes, unique, _found_by_the_audit(plan, axes, progress_for))
 
 
