@@ -54,6 +54,8 @@ def test_a_sweep_that_was_stopped_goes_on_and_its_page_shows_it(
     page = Path("run/report.html").read_text()
     assert page.count("data:image/png;base64,") == len(found("run")["figures"]) == 4
     assert "<td>fault:dropped_frames" in page
+    assert vislam("diff", "run", "other") == 3
+    assert "run is of a sweep or an explanation" in one_line()
     assert vislam(*WORDS, "--quiet", "--out", "run") == 0  # in the place of all of it
 
 

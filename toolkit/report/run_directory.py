@@ -61,6 +61,8 @@ if TYPE_CHECKING:
 
 
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
+# What a sweep or an explanation leaves in their place.
+_RESULTS = ("sweep.json", "explanation.json")
 REPORT_TEXT, PAGE = "report.md", "report.html"
 FOLDERS = ("figures", "landmarks", "states", "trajectories")
 
@@ -284,6 +286,8 @@ def read_run(directory: Path) -> RunFiles | SeedsFiles:
     """
     if not os.path.isdir(directory):  # noqa: PTH112 - a name that is too long is no directory either
         raise DataError(f"{directory} is not a directory; give a run directory, as vislam compare writes it")
+    if any((directory / name).is_file() for name in _RESULTS):
+        raise DataError(f"{directory} is of a sweep or an explanation, and no comparison; vislam report shows it")
     if OUTCOMES in files_of_ours(directory) and not (directory / MANIFEST).exists():
         raise DataError(f"{directory} is of a comparison that has not ended; repeat its command, which continues it")
     if not any((directory / name).is_file() for name in (METRICS, SEEDS)):
