@@ -28,6 +28,9 @@ RUNS = {
     "seeds": "compare drive --seeds 8 --max-frames 200 --estimators dead-reckoning,ekf,msckf-fej,ekf-slam",
     "given": f"compare {UCSD}/03.npz --estimators dead-reckoning,seed-ekf,ekf --no-repair",
     "repaired": f"compare {UCSD}/03.npz --estimators dead-reckoning,mapping,seed-ekf,ekf,batch",
+    "stress": "sweep drive --each --seeds 8 --to 20s --over fault:outlier_tracks=0.05,0.15,0.3,0.6 "
+    "--over fault:few_tracks=3,6,12,25 --over fault:camera_clock=0.01,0.02,0.05,0.1 "
+    "--over fault:turned_camera=0.003,0.01,0.03,0.1 --over fault:wrong_noise=0.25,0.5,2,4",
     "ten": f"compare {UCSD}/10_imu_only.npz --estimators dead-reckoning",
 }
 FIGURES = {
@@ -45,6 +48,10 @@ FIGURES = {
     "course_c_given.png": ("given", "figures/top_seed-ekf.png"),
     "course_c_repaired.png": ("repaired", "figures/top_all.png"),
     "course_10.png": ("ten", "figures/top_dead-reckoning.png"),
+    **{
+        f"stress_{fault}.png": ("stress", f"figures/sweep_fault_{fault}.png")
+        for fault in ("outlier_tracks", "few_tracks", "camera_clock", "turned_camera", "wrong_noise")
+    },
 }
 
 
@@ -52,7 +59,8 @@ FIGURES = {
 def run(name: str, folder: Path) -> Path:
     """Return the run directory of a name, made in a folder."""
     out = folder / name
-    status = main([*RUNS[name].split(), "--figures", "all", "--out", str(out)])
+    words = RUNS[name].split()
+    status = main([*words, *(["--figures", "all"] if words[0] == "compare" else []), "--out", str(out)])
     if status not in (0, 1):  # 1: an estimator diverged, which a page may be about
         raise SystemExit(status)
     return out
