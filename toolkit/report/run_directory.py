@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 # What a sweep or an explanation leaves in their place.
-_RESULTS = ("sweep.json", "explanation.json")
+_RESULTS = ("sweep.json", "explain.json")
 REPORT_TEXT, PAGE = "report.md", "report.html"
 FOLDERS = ("figures", "landmarks", "states", "trajectories")
 
