@@ -158,7 +158,7 @@ def test_a_start_that_cannot_be_determined_is_refused_with_the_reason(
 
 def test_kitti00_starts_level_and_at_its_speed(real: Callable[[str], Path]):
     """The truth's world is its first IMU frame, not level: its vertical is what the specific force shows over 14 s."""
-    sequence = with_truth(load_sequence("kitti00"), load_truth(real("kitti00/gt_imu.tum")))
+    sequence = with_truth(load_sequence("kitti00"), *load_truth(real("kitti00/gt_imu.tum")))
     prior, truth, samples = start_from_measurements(sequence), sequence.truth, sequence.motion
     inside = slice(1, -1)
     poses = interpolate_poses(truth.t_ns, truth.T_world_imu, samples.t_ns[inside])

@@ -53,7 +53,7 @@ def test_the_stated_noise_covers_the_scatter_of_the_samples_only_as_densities(se
 
 
 def test_tracks_fit_the_drive_s_truth(sequence: Sequence, real: Callable[[str], Path]) -> None:
-    truth = with_truth(sequence, load_truth(real("kitti00/gt_imu.tum"))).truth
+    truth = with_truth(sequence, *load_truth(real("kitti00/gt_imu.tum"))).truth
     assert truth is not None
     poses = interpolate_poses(truth.t_ns, truth.T_world_imu, sequence.frames_t_ns)
     seen, T_world_cam = sequence.observations, poses @ sequence.rig.T_imu_cam

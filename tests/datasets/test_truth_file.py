@@ -72,7 +72,7 @@ def recording(gyro_radps: Array, start_s: float = START_S) -> Sequence:
 @pytest.mark.parametrize("name", ["ucsd/gt/0027.tum", "kitti00/gt_imu.tum"])
 def test_real_truth_is_accepted_and_refused_w_first(real: Callable[[str], Path], tmp_path: Path, name: str) -> None:
     path = real(name)
-    assert load_truth(path).t_ns.size > 1000
+    assert load_truth(path).truth.t_ns.size > 1000
     for first in (0, 500):
         with pytest.raises(DataError, match="look w first"):
             load_truth(written(tmp_path, w_first(np.loadtxt(path))[first:]))
@@ -161,3 +161,20 @@ def test_an_inverted_trajectory_is_called_inverted_whatever_order_fits_by_chance
         load_truth(path)
     path.write_text(tum.text(Trajectory(t_ns, T_world_imu)))
     load_truth(path)
+
+
+def test_lines_without_a_pose_are_left_out_and_positions_alone_are_told(tmp_path: Path) -> None:
+    rows = table(drive())
+    rows[7, 1:] = np.nan
+    read = load_truth(written(tmp_path, rows))
+    assert read.truth.t_ns.size == COUNT - 1
+    assert "line 9 holds a value that is not finite" in read.facts[0]
+    for quaternion in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)):
+        rows = table(drive())
+        rows[:, 4:] = quaternion
+        alone = load_truth(written(tmp_path, rows))
+        assert alone.facts == ("the truth is of positions alone: its orientations are all one",)
+    positions = load_truth(written(tmp_path, table(drive())[:, :4]))
+    np.testing.assert_array_equal(positions.truth.T_world_imu, alone.truth.T_world_imu)
+    sequence = recording(np.tile([0.0, 0.0, LEFT_TURN_RADPS], (COUNT, 1)))
+    assert with_truth(sequence, *positions).provenance.facts == positions.facts

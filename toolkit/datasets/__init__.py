@@ -196,7 +196,7 @@ def load_sequence(
     source = str(source)
     if is_built_in(source):
         check_built_in(source, frontend)
-        return _told_of_both(built_ins()[source](seed), source)
+        return told_of_both(built_ins()[source](seed), source)
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
     _check_topics(source, reader, frontend)
@@ -213,7 +213,7 @@ def load_sequence(
             raise ExtensionError(f"{source}: load in {file} returned {type_of(sequence)}; it must return a Sequence")
         _check_types(sequence)
         check_stated(sequence)
-    return _told_of_both(sequence, source)
+    return told_of_both(sequence, source)
 
 
 def is_built_in(source: str) -> bool:
@@ -224,7 +224,7 @@ def is_built_in(source: str) -> bool:
     return not (path.exists() and any(reader.recognises(path) for reader in _readers().values()))
 
 
-def _told_of_both(sequence: Sequence, source: str) -> Sequence:
+def told_of_both(sequence: Sequence, source: str) -> Sequence:
     """Return a sequence whose facts say what else is called as its source: a built-in one, or a file or folder here."""
     if source not in built_ins() or not Path(source).exists():
         return sequence

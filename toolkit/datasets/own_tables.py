@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.datasets import vislam_recording
 from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, joined_imu, observations
 from toolkit.datasets.io.tables import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file, find_table
-from toolkit.datasets.io.truth import load_truth, with_truth
+from toolkit.datasets.io.truth import TruthRead, load_truth, with_truth
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, did_you_mean
@@ -105,7 +105,7 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
         gravity_world=_gravity(place, calibration),
     )
     if truth is not None:
-        sequence = with_truth(sequence, _truth(truth))
+        sequence = with_truth(sequence, *_truth(truth))
     return Read(
         sequence, (*_unused(sightings, (*TRACKS, *ONE_ROW, *TWO_ROWS)), *_unused(measured, (*_imu(measured), *TWIST)))
     )
@@ -275,10 +275,10 @@ def _gravity(place: Path, calibration: Mapping[str, Any]) -> Array:
     return fields.constant(_OPTIONAL[1], 3) if _OPTIONAL[1] in fields else np.array(GRAVITY_WORLD)
 
 
-def _truth(given: Table) -> Truth:
+def _truth(given: Table) -> TruthRead:
     if isinstance(given, str | PathLike):
         return load_truth(Path(given))
     table = columns_given("truth", given)
     table.require("|".join(_STAMPS), *TRUTH)
     t_ns = table.stamps()
-    return Truth(t_ns, checked_poses(table.what, list(range(t_ns.size)), t_ns, table.numbers(*TRUTH)))
+    return TruthRead(Truth(t_ns, checked_poses(table.what, list(range(t_ns.size)), t_ns, table.numbers(*TRUTH))), ())

@@ -13,7 +13,7 @@ import numpy as np
 from toolkit.answers import Run
 from toolkit.audit import Audit, Finding, audit, checked_again
 from toolkit.audit.edits import keep_frames
-from toolkit.datasets import check_built_in, load_sequence
+from toolkit.datasets import check_built_in, is_built_in, load_sequence, told_of_both
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
@@ -255,16 +255,16 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
         sequence, wrong = source, why_not_sightings(source)
         if wrong:
             raise DataError(f"{source.name}: {wrong}; correct the sequence (Observations.sorted sorts)")
-    elif source in SCENARIOS:
+    elif source in SCENARIOS and is_built_in(source):
         check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
         if recording.duration_s is not None:
             scenario = replace(scenario, duration_s=recording.duration_s)
-        sequence = simulate(scenario, recording.seed)
+        sequence = told_of_both(simulate(scenario, recording.seed), source)
     else:
         sequence = load_sequence(source, recording.seed, recording.frontend, progress)
     sequence = _with_usable_ids(sequence)
-    return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))
+    return sequence if recording.truth is None else with_truth(sequence, *load_truth(recording.truth))
 
 
 def _with_usable_ids(sequence: Sequence) -> Sequence:

@@ -9,6 +9,7 @@ first do not.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,14 @@ from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.tables import columns_of, read_table
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order, turned
-from toolkit.datasets.trajectories.formats import check_order, checked_poses
+from toolkit.datasets.trajectories.formats import (
+    POSITIONS_ALONE,
+    check_order,
+    checked_poses,
+    known_poses,
+    read_finite_poses,
+    read_rows,
+)
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
@@ -25,6 +33,7 @@ from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence, Truth
 
+OF_POSITIONS = "the truth is of positions alone: its orientations are all one"
 _KIND = "a truth file is TUM text, one pose a line"
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
 _LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
@@ -53,20 +62,40 @@ _HEADINGS = (
 )
 
 
-def load_truth(path: Path) -> Truth:
-    """Read a TUM file.
+class TruthRead(NamedTuple):
+    """A truth, and what to know of it: poses that are left out, orientations that it lacks."""
+
+    truth: Truth
+    facts: tuple[str, ...]
+
+
+def load_truth(path: Path) -> TruthRead:
+    """Read a TUM file, or one of positions or of columns by name, without the lines that hold no finite pose.
 
     Raises DataError, naming the line and the likely cause, where the file is missing, empty or not a table of
-    eight finite numbers a line, time does not increase or is not in seconds, or quaternions are not unit
-    length or look w first.
+    eight numbers a line, time does not increase or is not in seconds, or quaternions are not unit length or look w
+    first.
     """
-    read = tum.read(path, _KIND)
-    check_order(path, read.T_world_imu, tum.other_order)
-    return Truth(read.t_ns, read.T_world_imu)
+    rows = read_rows(path, _KIND)
+    alone = rows.width == len(POSITIONS_ALONE.split())
+    read = read_finite_poses(path) if rows.heading or alone else tum.parse(rows)
+    if read.t_ns is None:
+        raise DataError(f"{path}: has no stamps; {_KIND}")
+    truth = Truth(read.t_ns, read.T_world_imu)
+    left_out = (f"left out of the truth: {read.not_finite}",) if read.not_finite else ()
+    if read.other_order is not None:
+        check_order(path, read.T_world_imu, read.other_order)
+    return TruthRead(truth, (*left_out, OF_POSITIONS) if is_of_positions(truth) else left_out)
 
 
-def with_truth(sequence: Sequence, truth: Truth) -> Sequence:
-    """Return the sequence with this truth.
+def is_of_positions(truth: Truth) -> bool:
+    """Say whether a truth is of positions alone: its orientations are all one, and it moves."""
+    poses = truth.T_world_imu
+    return len(poses) > 2 and np.ptp(poses[:, :3, :3], axis=0).max() == 0.0 < np.ptp(poses[:, :3, 3], axis=0).max()
+
+
+def with_truth(sequence: Sequence, truth: Truth, facts: tuple[str, ...] = ()) -> Sequence:
+    """Return the sequence with this truth, and with what to know of it.
 
     Raises DataError where the two do not overlap in time (both ranges and the likely cause are named), or
     where the measured rates of rotation fit the truth only with its quaternions read w first.
@@ -76,7 +105,8 @@ def with_truth(sequence: Sequence, truth: Truth) -> Sequence:
     # Only the order: the recording is not audited yet, and mixed axes of its own would look like a camera's.
     readings = (in_other_order(tum.other_order),)
     check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
-    return replace(sequence, truth=truth)
+    source = replace(sequence.provenance, facts=(*sequence.provenance.facts, *facts))
+    return replace(sequence, truth=truth, provenance=source)
 
 
 def stamps_within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
@@ -134,9 +164,10 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) ->
 
 def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
     """Return the truth of a recording as :func:`choose_truth`, or None where there is none."""
-    found = {path: _read(path, mav0) for path in _tables(root, mav0)}
-    if not found:
+    read = {path: _read(path, mav0) for path in _tables(root, mav0)}
+    if not read:
         return None
+    found = {path: one.truth for path, one in read.items()}
     scatter = {path: _rate_scatter_radps(truth, imu) for path, truth in found.items()}
     ranked = sorted(scatter.items(), key=lambda item: item[1])
     best, least = ranked[0]
@@ -148,6 +179,9 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
     among = "" if len(ranked) == 1 else ", the better of those in the folder"
     stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * _turning_radps(found[best], imu)) else ""
     reason = f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters}){stranger}"
+    # Orientations that are all one are what a body has that never turns.
+    turns = _turning_radps(found[best], imu) > _MOST_OFF_RADPS
+    reason = "; ".join((reason, *(fact for fact in read[best].facts if turns or fact != OF_POSITIONS)))
     return Choice(found[best], reason)
 
 
@@ -164,30 +198,33 @@ def _heading(path: Path) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
     return next((heading for heading in _HEADINGS if columns.keys() >= set(heading[0])), None)
 
 
-def _read(path: Path, mav0: Path | None) -> Truth:
-    truth = load_truth(path) if path.suffix == ".tum" else _read_csv(path)
-    sensor_yaml = path.parent / "sensor.yaml"
-    if mav0 is None or path.parent.parent != mav0 or not sensor_yaml.is_file():
-        return truth
+def _read(path: Path, mav0: Path | None) -> TruthRead:
+    read = load_truth(path) if path.suffix == ".tum" else _read_csv(path)
+    truth, sensor_yaml = read.truth, path.parent / "sensor.yaml"
+    if mav0 is None or path.parent.parent != mav0 or not sensor_yaml.is_file() or is_of_positions(truth):
+        return read
     imu_yaml = mav0 / "imu0/sensor.yaml"
     # Beside a camchain there need be none: the body is the IMU then.
     T_body_imu = extrinsic(read_fields(imu_yaml)) if is_regular(imu_yaml) else np.eye(4)
     T_sensor_imu = se3_inverse(extrinsic(read_fields(sensor_yaml))) @ T_body_imu
     if np.array_equal(T_sensor_imu, np.eye(4)):
-        return truth
+        return read
     # Velocity and biases are the tracked sensor's own, not the IMU's.
-    return Truth(truth.t_ns, truth.T_world_imu @ T_sensor_imu)
+    return TruthRead(Truth(truth.t_ns, truth.T_world_imu @ T_sensor_imu), read.facts)
 
 
-def _read_csv(path: Path) -> Truth:
-    """Read poses and, where all are there, velocities and biases; stamps stay whole numbers."""
+def _read_csv(path: Path) -> TruthRead:
+    """Read finite poses and, where all are there, velocities and biases; stamps stay whole numbers."""
     pose, rest = _heading(path) or _HEADINGS[0]
     complete = columns_of(path).keys() >= set(rest)
     table = read_table(path, pose + rest if complete else pose)
-    T_world_imu = checked_poses(path, list(range(2, len(table.t_ns) + 2)), table.t_ns, table.values[:, :7])
-    if not complete:
-        return Truth(table.t_ns, T_world_imu)
-    return Truth(table.t_ns, T_world_imu, table.values[:, 7:10], table.values[:, 10:16])
+    kept = known_poses(table.values[:, :7])
+    t_ns, values = table.t_ns[kept], table.values[kept]
+    T_world_imu = checked_poses(path, (2 + np.flatnonzero(kept)).tolist(), t_ns, values[:, :7])
+    lost = int((~kept).sum())
+    facts = (f"{lost} of its {kept.size} poses are not finite and left out",) if lost else ()
+    truth = Truth(t_ns, T_world_imu, values[:, 7:10], values[:, 10:16]) if complete else Truth(t_ns, T_world_imu)
+    return TruthRead(truth, (*facts, OF_POSITIONS) if is_of_positions(truth) else facts)
 
 
 def _rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:

@@ -459,12 +459,12 @@ OPENVINS_COV = replace(
 )
 # Of two that have the same width the header decides: more columns of EuRoC and OpenVINS may be anything.
 _SAYS_SO: tuple[Stamped, ...] = (EUROC_COV, OPENVINS_COV)
-_POSITIONS_ALONE = "t x y z"
+POSITIONS_ALONE = "t x y z"
 _MISNAMED = OtherOrder(-1, "w first", f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
 FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
 _KIND = (
     f"there are {', '.join(f'{name} ({one.columns})' for name, one in FORMATS.items())}, positions "
-    f"({_POSITIONS_ALONE}), and tables whose heading names their columns"
+    f"({POSITIONS_ALONE}), and tables whose heading names their columns"
 )
 
 
@@ -494,7 +494,7 @@ def read_finite_poses(path: Path, cov_convention: CovConvention | None = None) -
     with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
         if named is not None and not _is_usual(named, rows):
             return _by_name(rows, named)
-        if rows.width == len(_POSITIONS_ALONE.split()):
+        if rows.width == len(POSITIONS_ALONE.split()):
             return _by_name(rows, Named(0, None, (1, 2, 3), ()))
         if _begins_with_row_numbers(rows):
             raise DataError(f"{path}: the first column is the number of the row, and stamps come first; remove it")
@@ -523,7 +523,7 @@ def _is_usual(named: Named, rows: Rows) -> bool:
 
 def _by_name(rows: Rows, named: Named) -> PosesFile:
     """Return the poses in columns that names say, or the positions alone; raises DataError as a format does."""
-    table = rows.numbers(rows.width, ", ".join(rows.heading) or _POSITIONS_ALONE)
+    table = rows.numbers(rows.width, ", ".join(rows.heading) or POSITIONS_ALONE)
     t_ns = _stamps_by_name(rows, named, table)
     turns = table[:, named.quaternion] if named.quaternion else np.tile([0.0, 0.0, 0.0, 1.0], (len(table), 1))
     kind = "columns by name" if named.quaternion else "positions alone"
