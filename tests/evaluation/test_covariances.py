@@ -1,6 +1,7 @@
 """Files with covariances: scored as their errors are, wrong conventions named, two estimates compared without truth."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,22 @@ def test_a_consistent_estimate_is_found_so_in_every_score(scene, vislam) -> None
     assert "nees_pose_mean" not in run["notes"]
 
 
+def test_over_runs_the_scores_have_intervals_and_the_nees_its_band(scene, vislam, capsys) -> None:
+    for seed in range(4):
+        Path(f"run{seed}.tum").write_text(tum.text_with_covariances(estimate(scene, seed)))
+    assert vislam("evaluate", "truth.tum", *(f"est=run{seed}.tum" for seed in range(4)), "--out", "out") == 0
+    text = capsys.readouterr().out
+    rows = [" ".join(line.split()) for line in text.splitlines() if line.startswith("est ")]
+    pose = next(row for row in rows if row.startswith("est pose 4 "))
+    mean, low, high, band = re.match(r"est pose 4 (\S+) \((\S+) \.\. (\S+)\) (\S+ \.\. \S+)", pose).groups()
+    runs = json.loads(Path("out/evaluation.json").read_text())["runs"]
+    values = [run["metrics"]["nees_pose_mean"] for run in runs]
+    assert float(mean) == pytest.approx(np.mean(values), rel=0.01)
+    assert float(low) < 1.0 < float(high)
+    # Chi-square with 24 degrees of freedom over 24: 12.40 and 39.36 at 2.5 and 97.5 %.
+    assert band == "0.52 .. 1.64"
+
+
 @pytest.mark.parametrize(
     ("said", "meant"),
     [
@@ -74,13 +91,16 @@ def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam) -> None
     assert "said to be" not in run["notes"].get("nees_pose_mean", "")
 
 
-def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam) -> None:
+def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam, capsys) -> None:
     written(estimate(scene), "", "pos-rot/fixed")
     run = run_of(vislam)
     assert run["metrics"]["nees_pose_mean"] is None
     best = "name it with --cov-convention; the truth fits them best as pos-rot/left or pos-rot/fixed"
     assert best in run["notes"]["nees_pose_mean"]
     assert run["metrics"]["ate_se3_m"] < 0.5
+    capsys.readouterr()
+    assert vislam("evaluate", "truth.tum", "est.tum") == 0
+    assert "no value: the file does not say what its covariances mean" in capsys.readouterr().out
     said = run_of(vislam, "--cov-convention", "pos-rot/fixed")
     assert said["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=0.06)
 

@@ -126,7 +126,7 @@ _DIGITS, _LENGTH = 9, 16
 _TIMES = "times.txt"
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
-_NONE = "the file states no covariance"
+NO_COVARIANCE = "the file states no covariance"
 _NO_CONVENTION = "the file does not say what its covariances mean: name it with --cov-convention"
 _OF_TWO = (
     "the truth states covariances: differences are compared with the sum of both, and what both share is not found"
@@ -415,7 +415,7 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
     """
     covariances = file.covariances
     if covariances is None:
-        return Scores.none(_NEES_KEYS, _NONE)
+        return Scores.none(_NEES_KEYS, NO_COVARIANCE)
     cov = covariances.of(file.T_world_imu)
 
     def errors(cov: Array) -> StatedErrors:

@@ -9,21 +9,25 @@ import base64
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 from msgspec import UNSET
 from msgspec.structs import replace
 
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
-from toolkit.evaluation.scoring import METRICS
+from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE
 from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedRecord, Quartiles, RunRecord, StandingRecord
+from toolkit.experiment.statistics import mean_interval
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
+from toolkit.metrics.parts.consistency import nees_band
+from toolkit.metrics.uncertainty import REGIONS_PERCENT
 from toolkit.report.html import filled_page, source
 from toolkit.report.text import (
     MISSING,
@@ -40,6 +44,7 @@ from toolkit.report.text import (
     heading,
     in_html,
     in_markdown,
+    listed,
     markdown_section,
     number,
     section,
@@ -55,6 +60,13 @@ _USUAL = (
     *("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "rpe_100m_percent", "kitti_t_percent"),
     *("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
 )
+# Blocks of a stated covariance: in words, degrees of freedom, and the metric that is its energy score.
+_BLOCKS = {
+    "pose": ("pose", 6, ""),
+    "ori": ("orientation", 3, "energy_ori_deg"),
+    "pos": ("position", 3, "energy_pos_m"),
+}
+_UNCERTAINTY = "stated uncertainty: means over the runs (95 % interval over the runs)"
 _OF_ORIENTATION = (
     *("ate_none_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent"),
     *("kitti_r_deg_per_m", "end_drift_percent"),
@@ -153,6 +165,42 @@ def _quartiles(found: Quartiles | None, metric: Metric, unit: ShownUnit) -> str:
     return " .. ".join(cell(q, metric, unit) for q in (found.lower_quartile, found.upper_quartile))
 
 
+def uncertainty_table(evaluation: EvaluatedSystems) -> Table | None:
+    """Return how well stated covariances fit the errors, a row a system and block; None where none is stated.
+
+    Values are means over all runs that are ok, with their 95 % intervals over the runs by Student's t. The band is that
+    of a consistent system's NEES of one pose, averaged over as many runs.
+    """
+    rows = []
+    for system in evaluation.systems:
+        runs = [run.metrics for run in evaluation.runs if run.estimator == system and run.status == "ok"]
+        for block, (name, dof, energy) in _BLOCKS.items():
+            values = [run[f"nees_{block}_mean"] for run in runs if run.get(f"nees_{block}_mean") is not None]
+            if not values:
+                continue
+            low, high = nees_band(dof, len(values))
+            keys = [f"inside_{percent}_{block}_percent" for percent in REGIONS_PERCENT]
+            means = [_over_runs(runs, key).partition(" ")[0] for key in keys]
+            scores = (_over_runs(runs, f"log_score_{block}"), _over_runs(runs, energy) if energy else MISSING)
+            nees = _over_runs(runs, f"nees_{block}_mean")
+            rows.append((system, name, str(len(values)), nees, f"{low:.2f} .. {high:.2f}", *means, *scores))
+    heads = [("system", "", ""), ("of the", "", ""), ("runs", "", ""), ("NEES", "", ""), ("band", "95 %", "")]
+    heads += [("inside", f"{percent} %", "%") for percent in REGIONS_PERCENT]
+    heads += [("log", "score", ""), ("energy", "score", "deg, m")]
+    return Table(tuple(heads), tuple(rows), labels=2) if rows else None
+
+
+def _over_runs(runs: Sequence[Mapping[str, float | int | None]], key: str) -> str:
+    """Return the mean of a metric over runs, with the interval where there are several."""
+    values = np.array([value for run in runs if (value := run.get(key)) is not None], dtype=float)
+    if not values.size:
+        return MISSING
+    found = mean_interval(values)
+    if values.size == 1:
+        return number(found.value)
+    return f"{number(found.value)} ({number(found.low)} .. {number(found.high)})"
+
+
 def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what is evaluated and on which terms."""
     truths = evaluation.truths
@@ -216,6 +264,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         told = [key for key in scored if run.notes.get(key)] + [
             k for k in _OF_ORIENTATION if lacks and run.notes.get(k) == lacks
         ]
+        told += ["nees_pose_mean"] if run.notes.get("nees_pose_mean", NO_COVARIANCE) != NO_COVARIANCE else []
         for key in (key for key in dict.fromkeys(told) if run.notes[key] not in run.log):
             text = run.notes[key] if run.metrics.get(key) is not None else f"no value: {run.notes[key]}"
             about = remarks.setdefault(text, _RemarkScope({}, {}))
@@ -224,7 +273,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         first, *others = about.whose
         more = f" and {len(others)} more" if others else ""
         whose = "" if len(about.whose) == len(evaluation.cells) else f" of {first}{more}"
-        yield f"{', '.join(metric.key for metric in METRICS if metric.key in about.keys)}{whose}: {text}"
+        yield f"{listed(metric.key for metric in METRICS if metric.key in about.keys)}{whose}: {text}"
 
 
 class _RemarkScope(NamedTuple):
@@ -240,6 +289,8 @@ def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = 
     lines += ["", as_text(leaderboard_table(evaluation, columns)), ""]
     if len(evaluation.sequences) > 1:
         lines += [f"{evaluation.ranked_by.name}, median over the runs", "", as_text(sequences_table(evaluation)), ""]
+    if (stated := uncertainty_table(evaluation)) is not None:
+        lines += [_UNCERTAINTY, "", as_text(stated), ""]
     lines += section("pairs", paired_lines(evaluation), width)
     lines += section("fails", failure_lines(evaluation), width)
     lines += section("notes", note_lines(evaluation), width)
@@ -252,6 +303,8 @@ def evaluation_markdown(evaluation: EvaluatedSystems, columns: tuple[Metric, ...
     parts.append(as_markdown(leaderboard_table(evaluation, columns)))
     if len(evaluation.sequences) > 1:
         parts += [f"## {evaluation.ranked_by.name} by sequence", as_markdown(sequences_table(evaluation))]
+    if (stated := uncertainty_table(evaluation)) is not None:
+        parts += [f"## {_UNCERTAINTY.capitalize()}", as_markdown(stated)]
     parts += markdown_section("Pairs", paired_lines(evaluation))
     parts += markdown_section("Failed", failure_lines(evaluation))
     parts += markdown_section("Notes", note_lines(evaluation))
@@ -264,6 +317,8 @@ def evaluation_latex(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] =
     parts.append(as_latex(leaderboard_table(evaluation, columns)))
     if len(evaluation.sequences) > 1:
         parts.append(as_latex(sequences_table(evaluation)))
+    if (stated := uncertainty_table(evaluation)) is not None:
+        parts += [f"% {_UNCERTAINTY}\n{as_latex(stated)}"]
     return "\n\n".join(parts) + "\n"
 
 
@@ -354,6 +409,8 @@ def leaderboard_page(evaluation: EvaluatedSystems, figures: str = "") -> str:
         name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
         cards.append(_card(name, _html_table(sequences_table(evaluation))))
     cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
+    if (stated := uncertainty_table(evaluation)) is not None:
+        cards.append(_card(_UNCERTAINTY.capitalize(), _html_table(stated)))
     cards += [_card("Figures", figures)] if figures else []
     for name, lines in (
         ("Is it more than chance?", paired_lines(evaluation)),
