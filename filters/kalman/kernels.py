@@ -34,10 +34,11 @@ LEAST_RAY = 1e-6
 Arrays = tuple[Any, ...]
 _ROW, _MATRIX, _STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 _MASK = types.boolean[:, ::1]
-# T_cam_world (W, 4, 4) of the window's poses; T_cam_world and T_world_imu (W, 4, 4) where Jacobians are evaluated.
-_WINDOW = types.Tuple((_STACK, _STACK, _STACK))
-# fx, fy, cx, cy px and baseline m (5,); the whiteners (3, 3) of sightings in both images and in the left one alone.
-_CAMERA = types.Tuple((_ROW, _MATRIX, _MATRIX))
+# T_world_imu (W, 4, 4) of the window's poses, at present and where Jacobians are evaluated.
+_WINDOW = types.Tuple((_STACK, _STACK))
+# fx, fy, cx, cy px and baseline m (5,); the whiteners (3, 3) of sightings in both images and in the left one alone;
+# T_cam_imu (4, 4).
+_CAMERA = types.Tuple((_ROW, _MATRIX, _MATRIX, _MATRIX))
 # The least disparity px and the least depth m.
 _LIMITS = types.Tuple((types.float64, types.float64))
 # As NumPy does, a division by zero gives infinity.
@@ -45,8 +46,11 @@ _OPTIONS = {"error_model": "numpy"}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Return a function that kernels may call; it is compiled for the first of them that does."""
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
+    """Return a function that kernels may call; it is compiled for the first of them that does, and inlined.
+
+    LLVM by itself leaves some as calls that pass every array as ten values; the kernels then take 1.2 times as long.
+    """
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True, **_OPTIONS)(function)
 
 
 def kernel(*signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -77,6 +81,21 @@ def sighted(used: BoolArray | Array, f: int, where: IntArray) -> int:
 
 
 @compiled
+def in_camera(poses: Array, camera: Arrays) -> Array:
+    """Return T_cam_world (W, 4, 4), without the last row, of poses T_world_imu (W, 4, 4)."""
+    T_cam_imu, T = camera[3], np.empty(poses.shape)
+    for j in range(poses.shape[0]):
+        for i in range(3):
+            T[j, i, 3] = T_cam_imu[i, 3]
+            for d in range(3):
+                T[j, i, d] = 0.0
+                for c in range(3):
+                    T[j, i, d] += T_cam_imu[i, c] * poses[j, d, c]
+                T[j, i, 3] -= T[j, i, d] * poses[j, d, 3]
+    return T
+
+
+@compiled
 def moved(T: Array, j: int, points: Array, f: int) -> tuple[float, float, float]:
     """Return point f transformed by motion j of T (W, 4, 4)."""
     x, y, z = points[f, 0], points[f, 1], points[f, 2]
@@ -99,10 +118,10 @@ def linearise_point(
 ) -> float:
     """Write the rows ``[H_f r]`` of track t's sighting j to A, from row ``at`` on; return the depth of point f.
 
-    The residual is taken at the present pose, the Jacobian where the window is linearised.
+    ``window`` has T_cam_world (W, 4, 4), for the residual, and T_cam_world and T_world_imu (W, 4, 4) for the Jacobian.
     """
     T_cam_world, T_cam_world_at, _ = window
-    intrinsics, whitener, left_whitener = camera
+    intrinsics, whitener, left_whitener, _ = camera
     fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     x, y, depth = moved(T_cam_world, j, points, f)
     z = divisible(depth)
@@ -392,6 +411,8 @@ def reflect_landmark_away(A: Array, n: int, V: Array) -> None:
     """
     for k in range(3):
         squared = 0.0
+        for i in range(k):
+            V[k, i] = 0.0
         for i in range(k, n):
             squared += A[i, k] * A[i, k]
         alpha = A[k, k] + math.copysign(math.sqrt(squared), A[k, k])
@@ -431,24 +452,36 @@ def worst_sighting(S: Array, m: int, V: Array, r: Array, B: Array) -> int:
 
 
 @compiled
-def constrain(rows: Arrays, where: IntArray, m: int, V: Array, D: Array, H: Array, residuals: Array, end: int) -> int:
+def constrain(rows: Arrays, where: IntArray, m: int, V: Array, G: Array, H: Array, residuals: Array, end: int) -> int:
     """Append the rows of ``Q^T [H_x r]`` from the fourth on to H (n, 6 W) and ``residuals`` (n,); return the new end.
 
-    D is work space for H_x in the columns of the poses from the first to the last that saw the track.
+    The reflections ``Q^T = (1 - v_3 v_3^T) (1 - v_2 v_2^T) (1 - v_1 v_1^T)`` take ``sum_k v_k g_k^T`` from H_x, with
+    ``g_k = H_x^T v_k - sum_{l < k} (v_l^T v_k) g_l``. A row of H_x depends on its own pose alone. G is work space for
+    g_k (3, 6 m); H is zero where it was not yet written.
     """
     A, J = rows
-    n, first, last = 3 * m, 6 * where[0], 6 * where[m - 1] + 6
-    for i in range(n):
-        for c in range(first, last):
-            D[i, c] = 0.0
-        for c in range(6):
-            D[i, 6 * where[i // 3] + c] = J[i, c]
+    n = 3 * m
     reflect_landmark_away(A, n, V)
     for k in range(3):
-        reflect(V, k, D, n, first, last)
+        for c in range(6 * m):
+            G[k, c] = 0.0
+        for i in range(k, n):
+            at = np.uint64(6 * (i // 3))
+            for c in range(np.uint64(6)):
+                G[k, at + c] += V[k, i] * J[i, c]
+        for before in range(k):
+            overlap = 0.0
+            for i in range(k, n):
+                overlap += V[before, i] * V[k, i]
+            for c in range(6 * m):
+                G[k, c] -= overlap * G[before, c]
     for i in range(3, n):
-        for c in range(H.shape[1]):
-            H[end, c] = D[i, c] if first <= c < last else 0.0
+        x, y, z = V[0, i], V[1, i], V[2, i]
+        for k in range(m):
+            at, to = np.uint64(6 * k), np.uint64(6 * where[k])
+            for c in range(np.uint64(6)):
+                own = J[i, c] if i // 3 == k else 0.0
+                H[end, to + c] = own - x * G[0, at + c] - y * G[1, at + c] - z * G[2, at + c]
         residuals[end] = A[i, 3]
         end += 1
     return end
@@ -470,18 +503,19 @@ def test_tracks(
     """
     uvs_px, seen = sightings
     bounds, mismatched_factor = gate
-    here = (window[0], window[0], window[2])
+    T_cam_world = in_camera(window[0], camera)
+    here, window_at = (T_cam_world, T_cam_world, window[0]), (T_cam_world, in_camera(window[1], camera), window[1])
     count, longest = seen.shape
     most = 3 * longest
     points, reliable, nis = np.zeros((count, 3)), np.empty(count, dtype=np.bool_), np.empty(count)
     dof, worst = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     where = np.empty(longest, dtype=np.int64)
     A, whitened, B, J = np.empty((most, 4)), np.empty((most, 4)), np.empty((most, 4)), np.empty((most, 6))
-    S, V, D = np.empty((most, most)), np.empty((3, most)), np.empty((most, 2 * most))
+    S, V, G = np.empty((most, most)), np.empty((3, most)), np.empty((3, 2 * most))
     rows = 0
     for f in range(count):
         rows += max(3 * sighted(seen, f, where) - 3, 0)
-    H, residuals, tracks, end = np.empty((rows, 2 * most)), np.empty(rows), np.empty(rows, dtype=np.int64), 0
+    H, residuals, tracks, end = np.zeros((rows, 2 * most)), np.empty(rows), np.empty(rows, dtype=np.int64), 0
     for f in range(count):
         m = sighted(seen, f, where)
         n, nis[f], dof[f], worst[f] = 3 * m, np.inf, 3 * m - 3, -1
@@ -490,7 +524,7 @@ def test_tracks(
         reliable[f] = triangulate(points, f, uvs_px, where, m, here, camera, limits)
         if not reliable[f] or m < 2:
             continue
-        linearise(points, f, uvs_px, where, m, window, camera, (A, J))
+        linearise(points, f, uvs_px, where, m, window_at, camera, (A, J))
         carry_cov(where, m, J, P, S)
         cholesky(S, n)
         for i in range(n):
@@ -502,7 +536,7 @@ def test_tracks(
         for i in range(3, n):
             nis[f] += whitened[i, 3] * whitened[i, 3]
         if nis[f] < bounds[dof[f]]:
-            begin, end = end, constrain((A, J), where, m, V, D, H, residuals, end)
+            begin, end = end, constrain((A, J), where, m, V, G, H, residuals, end)
             for i in range(begin, end):
                 tracks[i] = f
         elif nis[f] > mismatched_factor * bounds[dof[f]]:
@@ -510,16 +544,15 @@ def test_tracks(
     return points, reliable, nis, dof, worst, H[:end], residuals[:end], tracks[:end]
 
 
-@kernel(types.Tuple((_STACK, _MASK)), _MATRIX, _STACK, _CAMERA, types.float64)
-def start_landmarks(sightings: Arrays, points: Array, T_cam_world: Array, camera: Arrays, least_px: float) -> None:
-    """Write a first guess of the landmarks of those of F tracks that have none; ``points`` (F, 3) is NaN for none."""
+@compiled
+def start_landmark(sightings: Arrays, points: Array, f: int, where: IntArray, here: Arrays, least_px: float) -> None:
+    """Write a first guess of track f's landmark to ``points[f]`` if there is none, which is NaN."""
     uvs_px, seen = sightings
-    where = np.empty(seen.shape[1], dtype=np.int64)
-    for f in range(seen.shape[0]):
-        if math.isnan(points[f, 0]):
-            m = sighted(seen, f, where)
-            if m < 2 or not start_point(points, f, uvs_px, where, m, T_cam_world, camera, least_px)[0]:
-                points[f, 0] = np.nan
+    T_cam_world, camera = here
+    if math.isnan(points[f, 0]):
+        m = sighted(seen, f, where)
+        if m < 2 or not start_point(points, f, uvs_px, where, m, T_cam_world, camera, least_px)[0]:
+            points[f, 0] = np.nan
 
 
 @compiled
@@ -532,27 +565,38 @@ def add_pose(J: Array, A: Array, at: int, D: Array, d: Array, j: int) -> None:
             D[j, a, c] += x * J[at, c] + y * J[at + 1, c] + z * J[at + 2, c]
 
 
-@kernel(types.Tuple((_STACK, _MATRIX, _MATRIX)), _WINDOW, _CAMERA, types.float64)
+_TRACKS = types.Tuple((_STACK, _MASK, _MATRIX, _MATRIX))
+
+
+@kernel(_TRACKS, _WINDOW, _CAMERA, _LIMITS)
 def normals_in_view(
-    tracks: Arrays, window: Arrays, camera: Arrays, least_m: float
+    tracks: Arrays, window: Arrays, camera: Arrays, limits: Arrays
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """Return the normal equations of F tracks without their newest sightings, and the rows of the newest.
 
-    ``tracks`` are (uL, uR, v) (F, W, 3) px, the weights of the sightings (F, W), 0 for those that do not count, and the
-    landmarks (F, 3); the newest pose, the last one, has seen all. Returns the least depth (F,) of each, 0 where a track
-    does not count: it is behind one of its cameras, or lacks right images and its earlier sightings do not determine
-    the landmark; ``N = [H_f r]^T [H_f r]`` (F, 4, 4); the newest A (3 F, 4); ``B = H_f^T H_x`` (3 F, 6 W); the newest J
-    (3 F, 6); ``H_x^T H_x``, one block (W, 6, 6) a pose, and ``H_x^T r`` (6 W,) of the others.
+    ``tracks`` are (uL, uR, v) (F, W, 3) px, which were seen (F, W), their weights (F, W), 0 where one does not count,
+    and the landmarks (F, 3), NaN for none; a landmark starts here once two sightings allow it. Returns the least depth
+    (F,) of each, 0 where a track does not count: it has no landmark, the newest pose (the last) does not see it, it is
+    behind one of its cameras, or it lacks right images and its earlier sightings do not determine the landmark. In the
+    last two cases its landmark and its weights are forgotten. Then ``N = [H_f r]^T [H_f r]`` (F, 4, 4); the newest A
+    (3 F, 4); ``B = H_f^T H_x`` (3 F, 6 W); the newest J (3 F, 6); ``H_x^T H_x``, one block (W, 6, 6) a pose, and
+    ``H_x^T r`` (6 W,) of the others.
     """
-    uvs_px, weights, points = tracks
+    uvs_px, seen, weights, points = tracks
+    least_px, least_m = limits
+    T_cam_world = in_camera(window[0], camera)
+    window_at = (T_cam_world, in_camera(window[1], camera), window[1])
     count, longest = weights.shape
     depths, N, B = np.zeros(count), np.zeros((count, 4, 4)), np.zeros((3 * count, 6 * longest))
     A_newest, J_newest = np.zeros((3 * count, 4)), np.zeros((3 * count, 6))
     D, d = np.zeros((longest, 6, 6)), np.zeros(6 * longest)
     where, A, J = np.empty(longest, dtype=np.int64), np.empty((3 * longest, 4)), np.empty((3 * longest, 6))
     for f in range(count):
+        start_landmark((uvs_px, seen), points, f, where, (T_cam_world, camera), least_px)
+        if math.isnan(points[f, 0]) or not seen[f, longest - 1]:
+            continue
         m, left_only = sighted(weights, f, where), False
-        nearest = linearise(points, f, uvs_px, where, m, window, camera, (A, J))
+        nearest = linearise(points, f, uvs_px, where, m, window_at, camera, (A, J))
         last = 3 * m - 3
         for k in range(m):
             left_only = left_only or math.isnan(uvs_px[f, where[k], 1])
@@ -564,6 +608,9 @@ def normals_in_view(
                     J[i, c] *= root
         add_normals(A, 0, last, N, f)
         if not nearest > least_m or (left_only and not is_determined(N, f, nearest)):
+            points[f, 0] = np.nan
+            for j in range(longest):
+                weights[f, j] = seen[f, j]
             continue
         depths[f] = nearest
         for i in range(3):
@@ -626,37 +673,38 @@ def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
 
 
 @kernel(
+    _TRACKS,
     types.Tuple((_ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW)),
     types.Tuple((_MATRIX, _MATRIX)),
-    _MATRIX,
-    types.Tuple((types.int64[::1], _ROW, _ROW)),
+    types.Tuple((_ROW, _ROW)),
 )
-def add_newest(normals: Arrays, by_root: Arrays, points: Array, gate: Arrays) -> tuple[Array, Array]:
+def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, gate: Arrays) -> Array:
     """Gate the newest sightings of F tracks, add them, and eliminate the landmarks.
 
     ``normals`` are those of :func:`normals_in_view` without B; ``by_root`` are J R of the newest sightings (3 F, 6 W)
-    and B R (3 F, 6 W), with R the root of the covariance of the poses; ``gate`` has the degrees of freedom of the
-    newest sightings (F,) and, at each number of them, the bound of the NIS (4,) and Huber's threshold (4,).
+    and B R (3 F, 6 W), with R the root of the covariance of the poses; ``gate`` has, at 0 to 3 degrees of freedom, the
+    bound of the NIS (4,) and Huber's threshold (4,).
 
-    Returns the weights of the newest sightings (F,) and the landmarks' part e (3 F,) of the vector. In place, B R
-    becomes E, ``H_x^T H_x`` and ``H_x^T r`` those of all sightings, and the points (F, 3) move by a Gauss-Newton step
-    of at most a fifth of their least depth. The information on errors of unit covariance is then
+    Returns the landmarks' part e (3 F,) of the vector. In place, the newest sightings get their weights, B R becomes E,
+    ``H_x^T H_x`` and ``H_x^T r`` those of all sightings, and the landmarks move by a Gauss-Newton step of at most a
+    fifth of their least depth. The information on errors of unit covariance is then
     ``R^T H_x^T H_x R - E^T E`` and ``R^T H_x^T r - E^T e``.
     """
+    uvs_px, _, weights, points = tracks
     depths, N, A, J, D, d = normals
     JR, BR = by_root
-    dof, bounds, thresholds = gate
+    bounds, thresholds = gate
     count, last = depths.size, D.shape[0] - 1
-    weights, e, H, S = np.zeros(count), np.zeros(3 * count), np.empty((3, JR.shape[1])), np.empty((1, 4, 4))
+    e, H, S = np.zeros(3 * count), np.empty((3, JR.shape[1])), np.empty((1, 4, 4))
     for f in range(count):
         if depths[f] == 0.0:
             continue
         innovate(f, N, A, JR, BR, H, S)
         x, y, z = solve(S, 0, 0.0, 0.0, right_side(S, 0))
         nis = x * S[0, 3, 0] + y * S[0, 3, 1] + z * S[0, 3, 2]
-        if nis < bounds[dof[f]]:
-            weights[f] = min(1.0, thresholds[dof[f]] / math.sqrt(max(nis, 1e-12)))
-        root = math.sqrt(weights[f])
+        dof = 2 if math.isnan(uvs_px[f, last, 1]) else 3
+        weights[f, last] = min(1.0, thresholds[dof] / math.sqrt(max(nis, 1e-12))) if nis < bounds[dof] else 0.0
+        root = math.sqrt(weights[f, last])
         for i in range(3 * f, 3 * f + 3):
             for c in range(4):
                 A[i, c] *= root
@@ -673,12 +721,12 @@ def add_newest(normals: Arrays, by_root: Arrays, points: Array, gate: Arrays) ->
         points[f, 1] += share * y
         points[f, 2] += share * z
         eliminate(f, N, BR, e)
-    return weights, e
+    return e
 
 
 def _what_was_compiled() -> tuple[str, ...]:
     """Return a line about the compilation, if it was not done before."""
-    stats = [each.stats for each in (test_tracks, start_landmarks, normals_in_view, add_newest)]
+    stats = [each.stats for each in (test_tracks, normals_in_view, add_newest)]
     if all(each.cache_hits for each in stats):
         return ()
     kept = all(each.cache_path for each in stats)

@@ -130,10 +130,6 @@ class WindowTracks:
         self._keep(~rows)
         return taken
 
-    def forget_landmarks(self, rows: IntArray) -> None:
-        """Forget the landmarks of some tracks, and what was found of their sightings."""
-        self.points[rows], self.weights[rows] = np.nan, self.seen[rows]
-
     def _keep(self, rows: BoolArray) -> None:
         if not rows.all():
             self.track_ids, self.points, self.weights = self.track_ids[rows], self.points[rows], self.weights[rows]
@@ -151,18 +147,12 @@ class WindowPoses(NamedTuple):
     poses_at: Array
     cov: Array
 
-    def for_kernels(self, rig: StereoRig) -> tuple[Array, Array, Array]:
-        """Return T_cam_world (W, 4, 4) at present and where poses are linearised, and T_world_imu there."""
-        now = se3_inverse(self.poses @ rig.T_imu_cam)
-        at = now if self.poses_at is self.poses else se3_inverse(self.poses_at @ rig.T_imu_cam)
-        return now, at, np.ascontiguousarray(self.poses_at)
-
 
 @lru_cache(maxsize=4)
-def camera_for_kernels(rig: StereoRig) -> tuple[Array, Array, Array]:
-    """Return intrinsics and baseline (5,), and the whiteners (3, 3) of sightings in both images and the left alone."""
+def camera_for_kernels(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
+    """Return intrinsics and baseline (5,), whiteners (3, 3) of both images and of the left alone, and T_cam_imu."""
     intrinsics = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.baseline_m])
-    return intrinsics, np.array(rig.whitener, order="C"), stereo.left_whitener(rig)
+    return intrinsics, np.array(rig.whitener, order="C"), stereo.left_whitener(rig), se3_inverse(rig.T_imu_cam)
 
 
 class AcceptedTracks(NamedTuple):
@@ -200,7 +190,7 @@ def _tested(
 
     points, reliable, nis, dof, worst, H, residuals, track = kernels.test_tracks(
         (sightings.uvs_px, sightings.seen),
-        window.for_kernels(rig),
+        (window.poses, window.poses_at),
         np.ascontiguousarray(window.cov),
         camera_for_kernels(rig),
         (LEAST_DISPARITY_PX, LEAST_DEPTH_M),
@@ -213,7 +203,7 @@ def _tested(
         roots = np.sqrt(weights)[track]
         H, residuals = roots[:, None] * H, roots * residuals
     passed = AcceptedTracks(sightings.select(accepted), points[accepted], weights[accepted], H, residuals)
-    mismatched = np.flatnonzero(reliable & (worst >= 0))
+    mismatched = np.flatnonzero(worst >= 0)
     less = sightings.select(mismatched)
     less.seen[np.arange(mismatched.size), worst[mismatched]] = False
     return passed, less.select(less.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
@@ -228,37 +218,31 @@ def given_tracks_in_view(
     """
     from filters.kalman import kernels
 
-    camera, kernel_window = camera_for_kernels(rig), window.for_kernels(rig)
-    kernels.start_landmarks((tracks.uvs_px, tracks.seen), tracks.points, kernel_window[0], camera, LEAST_DISPARITY_PX)
-    rows = np.flatnonzero(tracks.seen[:, -1] & ~np.isnan(tracks.points[:, 0]))
-    uvs_px, weights, points = tracks.uvs_px[rows], tracks.weights[rows], tracks.points[rows]
+    in_view = tracks.uvs_px, tracks.seen, tracks.weights, tracks.points
+    poses, limits = (window.poses, window.poses_at), (LEAST_DISPARITY_PX, LEAST_DEPTH_M)
     depths_m, *of_points, between, H_newest, of_poses, vector = kernels.normals_in_view(
-        (uvs_px, weights, points), kernel_window, camera, LEAST_DEPTH_M
+        in_view, poses, camera_for_kernels(rig), limits
     )
-    usable = depths_m > 0.0
-    if not usable.any():
-        tracks.forget_landmarks(rows)
+    if not depths_m.any():
         return joint.core
     root = regular_root(window.cov)
     size = len(root)
     by_root = H_newest @ root[-6:], times_root(between, root)
-    dof = np.zeros(len(rows), dtype=np.int64) + stereo.degrees_of_freedom(uvs_px[:, -1])
-    normals = (depths_m, *of_points, H_newest, of_poses, vector)
-    of_newest, eliminated = kernels.add_newest(normals, by_root, points, (dof, *_limits(gate)))
-    tracks.points[rows], tracks.weights[rows, -1] = points, of_newest
-    tracks.forget_landmarks(rows[~usable])
+    normals = depths_m, *of_points, H_newest, of_poses, vector
+    eliminated = kernels.add_newest(in_view, normals, by_root, _limits(gate.probability, gate.huber))
 
     matrix = transposed_root_times(root, (of_poses @ root.reshape(-1, 6, size)).reshape(size, size))
     matrix, vector = without_products(matrix, by_root[1]), root.T @ vector - by_root[1].T @ eliminated
     return _corrected(joint, root, rig.track_weight * matrix, rig.track_weight * vector)
 
 
-def _limits(gate: FrameGate) -> tuple[Array, Array]:
+@lru_cache(maxsize=4)
+def _limits(probability: float | None, huber: float | None) -> tuple[Array, Array]:
     """Return the bound of the NIS (4,) and Huber's threshold (4,), infinite without that loss, at 0 to 3 degrees."""
     thresholds = np.full(4, np.inf)
-    if gate.huber is not None:
-        thresholds[2:] = huber_threshold(np.array([2, 3]), gate.huber)
-    return gate.bounds(3), thresholds
+    if huber is not None:
+        thresholds[2:] = huber_threshold(np.array([2, 3]), huber)
+    return FrameGate(probability).bounds(3), thresholds
 
 
 def _corrected(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:

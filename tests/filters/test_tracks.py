@@ -88,7 +88,7 @@ def found_of(sightings, window, rig, probability=0.95):
     bounds = chi2_bound(np.arange(3 * sightings.seen.shape[1] + 1), probability)
     return kernels.test_tracks(
         (sightings.uvs_px, sightings.seen),
-        window.for_kernels(rig),
+        (window.poses, window.poses_at),
         np.ascontiguousarray(window.cov),
         camera_for_kernels(rig),
         (LEAST_DISPARITY_PX, LEAST_DEPTH_M),
