@@ -117,8 +117,7 @@ class FrameGate:
         return np.asarray(self._table(dof).bound[dof])
 
     def _table(self, dof: IntArray | int) -> "_Table":
-        most = max(dof, 1) if isinstance(dof, int) else int(np.max(dof, initial=1))
-        return _table(self.probability, most.bit_length())
+        return _table(self.probability, _bits(dof))
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test innovations of NIS (N,) and ``dof`` (N,), and count them; return which pass (N,).
@@ -154,7 +153,7 @@ class FrameGate:
         """
         if self.huber is None:
             return self.track_weight * accepted.astype(float)
-        return np.where(accepted, self.track_weight * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
+        return np.where(accepted, self.track_weight * huber_weights(nis, _thresholds(self.huber, _bits(dof))[dof]), 0.0)
 
     def info(self) -> dict[str, float]:
         """Return the counts and sums under the keys of an Estimate's info."""
@@ -173,6 +172,17 @@ class _Table(NamedTuple):
 
     bound: Array
     expected: Array
+
+
+def _bits(dof: IntArray | int) -> int:
+    """Return how many bits the largest number of degrees of freedom has."""
+    return (max(dof, 1) if isinstance(dof, int) else int(np.max(dof, initial=1))).bit_length()
+
+
+@lru_cache(maxsize=64)
+def _thresholds(sigma: float, bits: int) -> Array:
+    """Return Huber's threshold at each number of degrees of freedom of at most ``bits`` bits."""
+    return huber_threshold(np.arange(2**bits), sigma)
 
 
 @lru_cache(maxsize=64)
