@@ -1,5 +1,6 @@
 """Trajectories as people have them: a table of what is given and what must come of it (2 s)."""
 
+import ast
 import gzip
 import json
 from collections.abc import Callable
@@ -9,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import toolkit
 from toolkit.datasets.trajectories import kitti
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import read_evaluation
 from toolkit.geometry import Array, about_z, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp, so3_exp
 
 S = 10**9
+TOOLKIT = Path(toolkit.__file__).parent
 POINT = np.zeros(3)
 
 
@@ -124,12 +127,12 @@ ROS = ",".join(f"field.pose.position.{axis}" for axis in "xyz")
     ],
 )
 def test_columns_are_read_by_their_names(scene, vislam, heading: str, row: str) -> None:
-    t_ns = scene.stamps(10.0)
+    t_ns = scene.stamps(4.0)
     Path("s.csv").write_text(f"{heading}\n" * bool(heading) + rows(t_ns, scene.estimated(t_ns, 0.07), row))
     assert vislam("evaluate", "truth.tum", "s.csv", "--out", "out", "--quiet") == 0
     metrics = metrics_of()[0]
-    assert metrics["pairs"] == 600
-    assert metrics["ate_se3_m"] == pytest.approx(0.07 * np.sqrt(3.0), rel=0.1)
+    assert metrics["pairs"] == 240
+    assert metrics["ate_se3_m"] == pytest.approx(0.07 * np.sqrt(3.0), rel=0.15)
     assert metrics["ate_se3_deg"] < 2.0
 
 
@@ -212,13 +215,15 @@ def test_poses_of_kitti_have_the_stamps_beside_them(scene, vislam) -> None:
     assert metrics_of()[0]["pairs"] == 200
 
 
-def test_gzipped_trajectories_are_read(tree) -> None:
-    for path in (*Path("results").rglob("*.tum"), *Path("truths").iterdir()):
-        Path(f"{path}.gz").write_bytes(gzip.compress(path.read_bytes()))
-        path.unlink()
-    assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
+def test_gzipped_trajectories_are_read(scene, vislam) -> None:
+    t_ns = scene.stamps(4.0)
+    for name in ("truths/A.tum", "results/good/A/1.tum", "results/good/A/2.tum"):
+        written = scene.write(name, t_ns, scene.poses_at(t_ns))
+        Path(f"{name}.gz").write_bytes(gzip.compress(written.read_bytes()))
+        written.unlink()
+    assert vislam("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
     runs = read_evaluation(Path("out/evaluation.json")).runs
-    assert {(run.sequence, run.run) for run in runs} == {(f"S{s}", str(r)) for s in range(7) for r in range(3)}
+    assert {(run.sequence, run.run) for run in runs} == {("A", "1"), ("A", "2")}
 
 
 def sorted_lines(lines: list[str]) -> list[str]:
@@ -319,11 +324,124 @@ ADVICE: list[tuple[Lines, list[tuple[str, Lines]]]] = [
 ]  # fmt: skip
 
 
+SOUND: list[str] = []  # the lines before they were spoilt
+
+
+def as_rows(row: str) -> Lines:
+    """Write the poses of lines in another format."""
+
+    def written(lines: list[str]) -> list[str]:
+        positions, rotations = poses_of(lines)
+        stamps_ns = np.array([int(Decimal(line.split()[0]) * S) for line in lines])
+        return rows(stamps_ns, se3(rotations, positions), row).splitlines()
+
+    return written
+
+
+def exchanged_columns(lines: list[str], order: tuple[int, ...], mark: str) -> list[str]:
+    return [mark.join(line.split(mark)[i] for i in order) for line in lines]
+
+
+STATE = "{t} {qw:.9f} {qx:.9f} {qy:.9f} {qz:.9f} {x:.9f} {y:.9f} {z:.9f} 0 0 0 0 0 0 0 0 0"
+HEADING = "i,t,x,y,z,qx,qy,qz,qw"
+ADVICE += [
+    (
+        as_rows(f"{{n}},{COMMAS},{QUATERNION}"),
+        [(
+            "EuRoC's order is qw,qx,qy,qz: move the eighth column before the fifth",
+            lambda lines: exchanged_columns(lines, (0, 1, 2, 3, 7, 4, 5, 6), ","),
+        )],
+    ),
+    (
+        as_rows(STATE),
+        [("OpenVINS' order is qx qy qz qw: move the scalar behind the others", lambda lines: moved(lines, 1, 4))],
+    ),
+    (
+        lambda lines: [line.replace(" ", ",") for line in lines],
+        [("a TUM file has blanks between its columns", lambda lines: [line.replace(",", " ") for line in lines])],
+    ),
+    (
+        lambda lines: [HEADING, *as_rows(f"{{i}},{{t}},{COMMAS},{W_FIRST}")(lines)],
+        [("exchange the names in the heading", lambda lines: ["i,t,x,y,z,qw,qx,qy,qz", *lines[1:]])],
+    ),
+    (
+        lambda lines: [f"{float(t):e} {rest}" for t, _, rest in (line.partition(" ") for line in lines)],
+        [("write all digits of them, as %.9f does for seconds", lambda _: SOUND)],
+    ),
+    (
+        lambda lines: rewritten(lines, se3(poses_of(lines)[1], poses_of(lines)[0][:, [1, 0, 2]])),
+        [("write both in the same", lambda x: rewritten(x, se3(poses_of(x)[1], poses_of(x)[0][:, [1, 0, 2]])))],
+    ),
+    (
+        lambda lines: exchanged_columns(lines, (0, 4, 5, 6, 7, 1, 2, 3), " "),
+        [("check the order of the columns", lambda lines: exchanged_columns(lines, (0, 5, 6, 7, 1, 2, 3, 4), " "))],
+    ),
+    (
+        lambda lines: [*lines[:9], lines[9].split()[0] + " 1e12 0 0 0 0 0 1", *lines[10:]],
+        [("check its unit, or remove the line", lambda lines: lines[:9] + lines[10:])],
+    ),
+    (lambda lines: lines[:1], [("write the whole trajectory", lambda _: SOUND)]),
+    (
+        lambda lines: ["timestamp,latitude,longitude,altitude", *as_rows(f"{{t}},{COMMAS}")(lines)],
+        [("convert them to metres (ENU, UTM)", lambda lines: ["timestamp,x,y,z", *lines[1:]])],
+    ),
+    (
+        lambda lines: [line.split()[0] + " nan nan nan 0 0 0 1" for line in lines],
+        [("no line holds a position that is finite; write it again", lambda _: SOUND)],
+    ),
+    (
+        lambda lines: [line.replace(".", ",").replace(" ", ";") for line in lines],
+        [("with a point in numbers", lambda lines: [line.replace(",", ".").replace(";", " ") for line in lines])],
+    ),
+]  # fmt: skip
+# What is followed in a test of its own, or names what is expected and nothing to do.
+ELSEWHERE = {
+    "multiply each pose by the inverse of the extrinsic (about {}) from the right": "of a body with other axes",
+    "put {} with a stamp in seconds for each pose beside it, or give both without stamps": "poses of KITTI",
+    "shift the one or the other with --offset, or allow more with --max-dt": "test_evaluate, an offset",
+    "write a pose for each, or a format with stamps": "a file of another length",
+    "write a pose for every frame": "KITTI's lines are frames",
+    "expected {}": "names the columns",
+    "expected {}{}": "names the columns",
+    "give at least two": "a truth of one pose",
+    "leave out the convention of covariances": "an option that is of no use",
+    "choose a format with stamps": "of export",
+}
+
+
+def advice_in(file: str) -> set[str]:
+    """Return what the messages of a module say to do: the end of each text with a semicolon that is no docstring."""
+    tree = ast.parse(Path(TOOLKIT, file).read_text())
+    nodes = list(ast.walk(tree))
+    documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    inside = {
+        id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node) if part is not node
+    }
+    found = set()
+    for node in nodes:
+        if id(node) in documented | inside or not isinstance(node, ast.JoinedStr | ast.Constant):
+            continue
+        parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+        text = "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in parts)
+        if "; " in text and not text.startswith("#"):
+            found.add(text.rpartition("; ")[2])
+    return {advice for advice in found if advice.replace("{}", "").strip()}
+
+
+def test_every_advice_about_a_trajectory_is_followed_in_a_test() -> None:
+    followed = [advice for _, steps in ADVICE for advice, _ in steps]
+    modules = ("datasets/trajectories/formats.py", "datasets/trajectories/belonging.py", "evaluation/scoring.py")
+    for advice in set().union(*map(advice_in, modules)) - ELSEWHERE.keys():
+        longest = max(advice.split("{}"), key=len).strip(" :")
+        assert any(longest in one or one in longest for one in followed), advice
+
+
 @pytest.mark.parametrize("of", range(len(ADVICE)))
 def test_who_follows_an_advice_has_a_file_that_is_read(scene, vislam, capsys, of: int) -> None:
     spoil, steps = ADVICE[of]
-    t_ns = scene.stamps(10.0, 0.0, 40.0)
-    lines = spoil(rows(t_ns, scene.poses_at(t_ns) @ se3_exp(noise(t_ns.size)), TUM).splitlines())
+    t_ns = scene.stamps(5.0, 0.0, 40.0)
+    SOUND[:] = rows(t_ns, scene.poses_at(t_ns) @ se3_exp(noise(t_ns.size)), TUM).splitlines()
+    lines = spoil(SOUND)
     for advice, follow in steps:
         Path("s.tum").write_text("\n".join(lines) + "\n")
         assert vislam("evaluate", "truth.tum", "s.tum", "--quiet") == 3
@@ -331,7 +449,7 @@ def test_who_follows_an_advice_has_a_file_that_is_read(scene, vislam, capsys, of
         lines = follow(lines)
     Path("s.tum").write_text("\n".join(lines) + "\n")
     assert vislam("evaluate", "truth.tum", "s.tum", "--out", "out", "--quiet") == 0
-    assert metrics_of()[0]["ate_se3_deg"] < 1.0
+    assert metrics_of()[0]["ate_se3_m"] < 0.2
 
 
 def noise(count: int) -> Array:
