@@ -62,6 +62,26 @@ class Observations:
         """Return the rows of a mask (N,) or the rows of an index (M,), in that order."""
         return Observations(self.frame[rows], self.track_id[rows], self.uv_px[rows])
 
+    @property
+    def by_track(self) -> IntArray:
+        """The order (N,) that lists the sightings track by track, each track by frame."""
+        return np.lexsort((self.frame, self.track_id))
+
+    def split(self, starts: BoolArray) -> IntArray:
+        """Return track ids (N,) in which a new track begins at every row of the mask ``starts`` (N,).
+
+        The first part of each track keeps its id; new ids follow the largest one there is.
+        """
+        order = self.by_track
+        track_id = self.track_id[order]
+        first_of_track = np.diff(track_id, prepend=-1) != 0
+        first_of_track[:1] = True
+        part = np.cumsum(starts[order] & ~first_of_track)
+        part_at_first = np.maximum.accumulate(np.where(first_of_track, part, 0))
+        renamed = np.empty_like(track_id)
+        renamed[order] = np.where(part > part_at_first, track_id.max(initial=-1) + part, track_id)
+        return renamed
+
     @classmethod
     def sorted(cls, frame: IntArray, track_id: IntArray, uv_px: Array) -> "Observations":
         """Build from frames (N,), track ids (N,) and sightings (N, 3) px in any order."""
@@ -191,6 +211,22 @@ class Sequence:
             return self
         kept = self.observations.select(self.observations.frame < max_frames)
         return replace(self, frames_t_ns=self.frames_t_ns[:max_frames], observations=kept)
+
+    def with_frames(self, kept: IntArray) -> Self:
+        """Return the sequence with the frames ``kept`` (M,), in that order, without the sightings of the others.
+
+        A prior is the state at the first frame: it is dropped where the first frame changes.
+        """
+        new_index = np.full(self.frame_count, -1)
+        new_index[kept] = np.arange(kept.size)
+        seen = self.observations.select(new_index[self.observations.frame] >= 0)
+        observations = Observations.sorted(new_index[seen.frame], seen.track_id, seen.uv_px)
+        prior = self.prior if kept.size > 0 and kept[0] == 0 else None
+        return replace(self, frames_t_ns=self.frames_t_ns[kept], observations=observations, prior=prior)
+
+    def with_samples(self, kept: BoolArray | IntArray) -> Self:
+        """Return the sequence with the motion samples of a mask (S,) or an index (M,), in that order."""
+        return replace(self, motion=self.motion.of(self.motion.t_ns[kept], self.motion.values[kept]))
 
     def content_hash(self, digits: int | None = None) -> str:
         """Return a SHA-256 over everything an estimator can see and the truth it is scored on.

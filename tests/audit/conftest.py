@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit, fault
-from toolkit.audit.edits import keep_samples
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.sequence import Observations, Sequence, content_digest
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -61,7 +60,7 @@ def time_order(sequence: Sequence) -> Plant:
     planted = with_observations(sequence, frame=swapped[sequence.observations.frame])
     planted = replace(planted, frames_t_ns=sequence.frames_t_ns[swapped])
     samples = np.sort(np.append(np.arange(len(sequence.motion.t_ns)), [5, 20]))
-    return Plant("time-order", keep_samples(planted, samples), 1 + 2)
+    return Plant("time-order", planted.with_samples(samples), 1 + 2)
 
 
 def time_gap(sequence: Sequence) -> Plant:
@@ -73,7 +72,7 @@ def outside_motion(sequence: Sequence) -> Plant:
     """Let the motion samples reach from frame 5 to the last frame but three."""
     t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
     first, last = np.searchsorted(t_ns, frames[5], side="right") - 1, np.searchsorted(t_ns, frames[-4])
-    return Plant("outside-motion", keep_samples(sequence, np.arange(first, last + 1)), 5 + 3)
+    return Plant("outside-motion", sequence.with_samples(np.arange(first, last + 1)), 5 + 3)
 
 
 def no_disparity(sequence: Sequence) -> Plant:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3
 from toolkit.models.camera_motion import camera_motion
@@ -110,9 +109,9 @@ def test_no_25_s_of_a_drive_put_a_camera_elsewhere_that_is_where_it_should_be(na
     """Turns that are few or wide leave it open; to the wrong place it goes from neither, nor from the inverse's."""
     whole = audited(name).sequence
     right = whole.rig.T_imu_cam
-    part = keep_frames(whole, np.arange(first, first + 250))
+    part = whole.with_frames(np.arange(first, first + 250))
     in_time = (part.motion.t_ns >= part.frames_t_ns[0]) & (part.motion.t_ns <= part.frames_t_ns[-1])
-    part = keep_samples(part, in_time)
+    part = part.with_samples(in_time)
     np.testing.assert_allclose(audit(part).sequence.rig.T_imu_cam, right, atol=1e-12)
     inverse = se3(right[:3, :3], -right[:3, :3] @ right[:3, 3])
     position = audit(replace(part, rig=replace(part.rig, T_imu_cam=inverse))).sequence.rig.T_imu_cam[:3, 3]
@@ -150,10 +149,10 @@ GORE = "openvins_sim/udel_gore_rect_s0"
 
 def part(name: str, begin: int, end: int) -> Sequence:
     """Return the frames of a recording from one to another, with the samples around them."""
-    frames = keep_frames(load_sequence(str(recording(name))), np.arange(begin, end))
+    frames = load_sequence(str(recording(name))).with_frames(np.arange(begin, end))
     around_ns = np.array([-200_000_000, 200_000_000]) + frames.frames_t_ns[[0, -1]]
     t_ns = frames.motion.t_ns
-    return keep_samples(frames, (t_ns >= around_ns[0]) & (t_ns <= around_ns[1]))
+    return frames.with_samples((t_ns >= around_ns[0]) & (t_ns <= around_ns[1]))
 
 
 def warnings_of(outcome: Audit) -> dict[str, str]:

@@ -9,7 +9,6 @@ import pytest
 from tests.audit.conftest import LONGER_S, details, recording
 from toolkit.audit import audit
 from toolkit.audit.clocks import camera_offset, change_of_offset
-from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.timing import LARGEST_ERROR_S, OFFSET_SIGMAS, clock_change, clock_jump, uneven_stamps
 from toolkit.sequence import Sequence
@@ -39,8 +38,8 @@ def test_a_pause_of_both_streams_is_no_jump_for_the_vehicle_goes_on(scenario: st
     step_s = float(np.diff(sound.frames_s[:2])[0])
     begin_s, end_s = sound.duration_s / 2.0 + step_s * np.array([0.4, 2.6])
     samples_s = sound.elapsed_s(sound.motion.t_ns)
-    there = keep_frames(sound, np.flatnonzero((sound.frames_s < begin_s) | (sound.frames_s > end_s)))
-    paused = keep_samples(there, (samples_s < begin_s) | (samples_s > end_s))
+    there = sound.with_frames(np.flatnonzero((sound.frames_s < begin_s) | (sound.frames_s > end_s)))
+    paused = there.with_samples((samples_s < begin_s) | (samples_s > end_s))
     assert paused.frame_count < sound.frame_count
     assert clock_jump(Evidence(paused)) is None
 
@@ -49,12 +48,12 @@ def test_a_frame_and_a_sample_that_are_there_twice_are_repeats_and_not_a_jump() 
     sound = recording("drive", 1, 6.0)
     row, seen = 30, sound.observations
     sample = int(np.searchsorted(sound.motion.t_ns, sound.frames_t_ns[row]))
-    twice = keep_frames(sound, np.sort(np.append(np.arange(sound.frame_count), row)))
+    twice = sound.with_frames(np.sort(np.append(np.arange(sound.frame_count), row)))
     copied = np.flatnonzero(seen.frame == row)
     frame = np.append(np.where(seen.frame > row, seen.frame + 1, seen.frame), np.full(copied.size, row + 1))
     rows = np.append(np.arange(len(seen)), copied)
     twice = replace(twice, observations=type(seen).sorted(frame, seen.track_id[rows], seen.uv_px[rows]))
-    found = {f.fault: f for f in audit(keep_samples(twice, np.sort(np.append(np.arange(61), sample)))).findings}
+    found = {f.fault: f for f in audit(twice.with_samples(np.sort(np.append(np.arange(61), sample)))).findings}
     assert "clock-jump" not in found
     assert found["time-order"].count == 2 and "sorted by time" in found["time-order"].detail
 
@@ -75,7 +74,7 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_r
     samples_s = standing.elapsed_s(standing.motion.t_ns)
     for leap_s in (0.5, 2.0):
         kept = [(t_s < at_s - 0.5 * leap_s) | (t_s > at_s + 0.5 * leap_s) for t_s in (standing.frames_s, samples_s)]
-        paused = keep_samples(keep_frames(standing, np.flatnonzero(kept[0])), kept[1])
+        paused = standing.with_frames(np.flatnonzero(kept[0])).with_samples(kept[1])
         leap_ns = round(leap_s * 1e9)
         frames_t_ns = standing.frames_t_ns + np.where(standing.frames_s > at_s, leap_ns, 0)
         moved = replace(standing.motion, t_ns=standing.motion.t_ns + np.where(samples_s > at_s, leap_ns, 0))
@@ -87,7 +86,7 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_r
 def with_frames_lost(sequence: Sequence) -> Sequence:
     lost = np.random.default_rng(5).uniform(size=sequence.frame_count) < 0.3
     lost[[0, -1]] = False
-    return keep_frames(sequence, np.flatnonzero(~lost))
+    return sequence.with_frames(np.flatnonzero(~lost))
 
 
 @pytest.mark.parametrize("fault", [faults.alternate_frames_late, faults.frame_jitter])
@@ -107,13 +106,13 @@ def test_stamps_that_the_cameras_motion_does_not_follow_are_reported(scenario: s
 @pytest.mark.parametrize("scenario", LONGER_S)
 def test_frames_that_are_lost_or_uneven_as_stamped_or_of_a_vehicle_that_stands_are_not_accused(scenario: str) -> None:
     sound = recording(scenario, 71, 10.0, varied=True)
-    by_turns = keep_frames(sound, np.flatnonzero(np.isin(np.arange(sound.frame_count) % 5, (0, 2))))
+    by_turns = sound.with_frames(np.flatnonzero(np.isin(np.arange(sound.frame_count) % 5, (0, 2))))
     for sequence in (sound, with_frames_lost(sound), faults.camera_clock(sound, 0.03), by_turns):
         assert uneven_stamps(Evidence(sequence)) is None
     parked = faults.standstill(recording("drive", 71, 10.0), 60.0, 1)
     stands_ns = parked.motion.t_ns[np.abs(parked.motion.values[:, :3]).max(axis=1) < 0.05]
     at_rest = np.flatnonzero((parked.frames_t_ns > stands_ns[0]) & (parked.frames_t_ns < stands_ns[-1]))
-    jittered = faults.frame_jitter(keep_frames(parked, at_rest[10:-10]), 0.015, 3)
+    jittered = faults.frame_jitter(parked.with_frames(at_rest[10:-10]), 0.015, 3)
     assert uneven_stamps(Evidence(jittered)) is None
 
 

@@ -7,7 +7,7 @@
 
 The kinds share ``intervals`` (both motions from frame to frame), ``one_step`` (residuals of the tracks),
 ``alignment`` (a regression of the camera's translation), ``self_calibration`` (an adjustment whose equations are in
-``bundle``), ``clocks``, ``robust`` (statistics) and ``edits`` (of a sequence).
+``bundle``), ``clocks`` and ``robust`` (statistics).
 
 Faults report values that are impossible, so that NumPy's warnings about them are not shown.
 """

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.edits import keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import (
     FORCES,
@@ -77,7 +76,7 @@ def not_finite(evidence: Evidence) -> Symptom | None:
     if bad_sightings:
         remedy = replace(remedy, observations=sequence.observations.select(sightings))
     if bad_samples:
-        remedy = keep_samples(remedy, samples)
+        remedy = remedy.with_samples(samples)
     return Symptom(
         count=bad_sightings + bad_samples,
         detail=detail,
@@ -128,7 +127,7 @@ def implausible(evidence: Evidence) -> Symptom | None:
     if sightings.any():
         remedy = replace(remedy, observations=sequence.observations.select(~sightings))
     if samples.any():
-        remedy = keep_samples(remedy, ~samples)
+        remedy = remedy.with_samples(~samples)
     return Symptom(
         count=int(sightings.sum() + samples.sum()),
         detail=(
@@ -235,7 +234,7 @@ def stuck_samples(evidence: Evidence) -> Symptom | None:
         why = "too long to be bridged: check the driver and the cables"
         return Symptom(int(stuck.sum()), detail, why, remedy=None, spoils_vision=True)
     why = "repeated samples are dropped; the others bridge the gap"
-    return Symptom(int(stuck.sum()), detail, why, keep_samples(sequence, ~stuck))
+    return Symptom(int(stuck.sum()), detail, why, sequence.with_samples(~stuck))
 
 
 def _repeats(rows: Mapping[str, BoolArray], step_s: float) -> str:

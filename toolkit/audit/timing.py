@@ -8,7 +8,6 @@ import numpy as np
 
 from toolkit.audit.bundle import CHANGE, LATE
 from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
-from toolkit.audit.edits import keep_frames, keep_samples
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities, usual_step_s
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
@@ -142,7 +141,7 @@ def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
     Nothing is yielded where the camera stands, hardly rotates, or its motion is not known.
     """
     kept = np.arange(max(frame - AROUND, 0), min(frame + AROUND + 2, sequence.frame_count))
-    camera = camera_motion(replace(keep_frames(sequence, kept), frames_t_ns=NS_PER_S * np.arange(kept.size)))
+    camera = camera_motion(replace(sequence.with_frames(kept), frames_t_ns=NS_PER_S * np.arange(kept.size)))
     here = int(np.flatnonzero(kept == frame)[0])
     if not camera.known[here]:
         return
@@ -215,9 +214,9 @@ def time_order(evidence: Evidence) -> Symptom | None:
 def _sorted(sequence: Sequence) -> Sequence:
     """Return the sequence with stamps in order, without repeats and invalid ones."""
     if _late(sequence.frames_t_ns):
-        sequence = keep_frames(sequence, _in_order(sequence.frames_t_ns))
+        sequence = sequence.with_frames(_in_order(sequence.frames_t_ns))
     if _late(sequence.motion.t_ns):
-        sequence = keep_samples(sequence, _in_order(sequence.motion.t_ns))
+        sequence = sequence.with_samples(_in_order(sequence.motion.t_ns))
     return sequence
 
 
@@ -260,11 +259,11 @@ def _longest_part(sequence: Sequence, frame_part: IntArray, sample_part: IntArra
     Where the samples have another number of jumps than the frames, their longest part is taken.
     """
     part = int(np.argmax(np.bincount(frame_part)))
-    kept = keep_frames(sequence, np.flatnonzero(frame_part == part))
+    kept = sequence.with_frames(np.flatnonzero(frame_part == part))
     if not sample_part.max(initial=0):
         return kept
     of_part = part if sample_part.max() == frame_part.max() else int(np.argmax(np.bincount(sample_part)))
-    return keep_samples(kept, sample_part == of_part)
+    return kept.with_samples(sample_part == of_part)
 
 
 def _kept(part: Sequence, whole: Sequence) -> str:
@@ -314,7 +313,7 @@ def outside_motion(evidence: Evidence) -> Symptom | None:
         count=count,
         detail=f"{count} of {sequence.frame_count} frames lie outside the time of the motion samples",
         treatment="cut off",
-        remedy=keep_frames(sequence, np.flatnonzero(covered)),
+        remedy=sequence.with_frames(np.flatnonzero(covered)),
     )
 
 
@@ -355,7 +354,7 @@ def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
         count=holes.size,
         detail=f"{holes.size} hole(s) in the motion samples, the longest of {longest_s:.2f} s",
         treatment=f"the longest stretch without one is kept: {kept.size} of {sequence.frame_count} frames",
-        remedy=keep_frames(sequence, kept),
+        remedy=sequence.with_frames(kept),
     )
 
 
@@ -767,7 +766,7 @@ def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
     shifted = replace(sequence, frames_t_ns=sequence.frames_t_ns + round(offset_s * NS_PER_S))
     motion_t_ns = sequence.motion.t_ns
     inside = (shifted.frames_t_ns >= motion_t_ns[0]) & (shifted.frames_t_ns <= motion_t_ns[-1])
-    return shifted if inside.all() else keep_frames(shifted, np.flatnonzero(inside))
+    return shifted if inside.all() else shifted.with_frames(np.flatnonzero(inside))
 
 
 # Where only a change larger than this (s) would be found, the finding is undecided and says so.

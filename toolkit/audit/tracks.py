@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.edits import by_track, split
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import LEAST_INTERVALS, interval_means, is_comparable
 from toolkit.audit.one_step import CORRELATION_SIGMAS, MOST_CORRELATION, errors_are_independent
@@ -53,7 +52,7 @@ def returning_tracks(evidence: Evidence) -> Symptom | None:
     the id again for another point, an estimator takes two points for one.
     """
     observations = evidence.sequence.observations
-    order = by_track(observations)
+    order = observations.by_track
     same_track = np.diff(observations.track_id[order]) == 0
     absent = np.diff(observations.frame[order]) - 1
     returns = np.zeros(len(observations), dtype=bool)
@@ -68,7 +67,7 @@ def returning_tracks(evidence: Evidence) -> Symptom | None:
         treatment="the track ends before its absence and a new one starts after it",
         remedy=replace(
             evidence.sequence,
-            observations=Observations.sorted(observations.frame, split(observations, returns), observations.uv_px),
+            observations=Observations.sorted(observations.frame, observations.split(returns), observations.uv_px),
         ),
     )
 
@@ -156,10 +155,10 @@ def _typical_step_px(intervals: int, pairs: Neighbours, step_px: Array) -> Array
 def _cut_tracks(sequence: Sequence, repeated: BoolArray) -> Sequence:
     """Drop the repeated sightings (N,) and give their tracks a new id from the next frame on."""
     observations = sequence.observations
-    order = by_track(observations)
+    order = observations.by_track
     starts = np.zeros(len(observations), dtype=bool)
     starts[order[1:]] = repeated[order[:-1]]
-    track_id, kept = split(observations, starts), ~repeated
+    track_id, kept = observations.split(starts), ~repeated
     cut = Observations.sorted(observations.frame[kept], track_id[kept], observations.uv_px[kept])
     return replace(sequence, observations=cut)
 
@@ -416,7 +415,7 @@ class _Beginnings(NamedTuple):
 
 
 def _beginnings(observations: Observations) -> _Beginnings:
-    order = by_track(observations)
+    order = observations.by_track
     track_id, frame = observations.track_id[order], observations.frame[order]
     disparity = disparity_px(observations.uv_px)[order]
     follows = (np.diff(track_id) == 0) & (np.diff(frame) == 1) & (disparity[:-1] > LEAST_DISPARITY_PX)

@@ -12,7 +12,6 @@ import numpy as np
 
 from toolkit.answers import Run
 from toolkit.audit import Audit, Finding, audit, checked_again
-from toolkit.audit.edits import keep_frames
 from toolkit.datasets import check_built_in, is_built_in, load_sequence, told_of_both
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
@@ -302,7 +301,7 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
         )
     provenance = sequence.provenance
     extended = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
-    taken = replace(keep_frames(sequence, kept), provenance=extended)
+    taken = replace(sequence.with_frames(kept), provenance=extended)
     return taken if part.every == 1 else _with_truth_at_frames(taken)
 
 

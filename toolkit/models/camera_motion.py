@@ -79,7 +79,7 @@ class Neighbours(NamedTuple):
 def neighbours(observations: Observations) -> Neighbours:
     """Pair each sighting with the same track's sighting in the next frame, where there is one."""
     frame, track_id = observations.frame, observations.track_id
-    by_track = np.lexsort((frame, track_id))
+    by_track = observations.by_track
     follows = (np.diff(track_id[by_track]) == 0) & (np.diff(frame[by_track]) == 1)
     before, after = by_track[:-1][follows], by_track[1:][follows]
     in_time = np.argsort(frame[before], kind="stable")

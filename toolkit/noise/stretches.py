@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from toolkit.audit.edits import keep_frames
 from toolkit.geometry import Array, IntArray
 from toolkit.initialization.first_guess import guess_with_imu
 from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior, StereoRig
@@ -60,7 +59,7 @@ class Stretch:
     @classmethod
     def of(cls, sequence: Sequence, first: int, count: int) -> "Stretch":
         """Return ``count`` frames of a sequence from the ``first`` on."""
-        whole = keep_frames(sequence, np.arange(first, first + count))
+        whole = sequence.with_frames(np.arange(first, first + count))
         part = replace(whole, track_budget=min(TRACKS, sequence.track_budget or TRACKS))
         packets = tuple(part.packets())
         used = len(part.visible) / max(len(whole.visible), 1)
