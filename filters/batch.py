@@ -64,6 +64,7 @@ INGREDIENTS = (
     "whole past",
     "the future",
 )
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 DEFAULT = True
 
 

@@ -31,7 +31,7 @@ RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the othe
 DEFAULT = True
 OPTIONS = {"landmark_uncertainty": (True, False)}
 INGREDIENTS = ("landmark uncertainty", "biases", "long-lived landmarks")
-WITHOUT = {"landmark uncertainty": {"landmark_uncertainty": False}}
+WITHOUT = {"biases": {"noise.biases": "fixed"}, "landmark uncertainty": {"landmark_uncertainty": False}}
 
 
 def build(setup: Setup) -> Estimator:

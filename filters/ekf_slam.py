@@ -50,7 +50,11 @@ INGREDIENTS = (
     "inverse depth",
     "long-lived landmarks",
 )
-WITHOUT = {"consistent linearisation": {"linearisation": "latest"}, "inverse depth": {"landmarks": "metres"}}
+WITHOUT = {
+    "biases": {"noise.biases": "fixed"},
+    "consistent linearisation": {"linearisation": "latest"},
+    "inverse depth": {"landmarks": "metres"},
+}
 
 # With an IMU a landmark may have moved from its first estimate by this share of its distance before it is restarted.
 MOST_MOVED = 0.3

@@ -52,6 +52,7 @@ INGREDIENTS = (
     "relinearisation",
 )
 WITHOUT = {
+    "biases": {"noise.biases": "fixed"},
     "cross-covariances": {"cross_covariances": False},
     "consistent linearisation": {"marginals": "latest"},
     "past poses": {"window.most_states": 1},

@@ -47,6 +47,7 @@ INGREDIENTS = (
     "long-lived landmarks",
     "relinearisation",
 )
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 # Length of a step in standard deviations of the updated state.
 NEGLIGIBLE_STEP = 1e-4
 MOST_STEPS, MOST_HALVINGS = 10, 6

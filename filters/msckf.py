@@ -33,6 +33,7 @@ from toolkit.models.gating import FEWEST_SIGHTINGS, FrameGate
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
 INGREDIENTS = ("landmark uncertainty", "biases", "cross-covariances", "past poses")
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 
 def build(setup: Setup) -> Estimator:

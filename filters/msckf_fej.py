@@ -7,6 +7,7 @@ from toolkit.estimator import Estimator, Setup
 CITES = ("mourikis2007msckf", "li2013high")
 RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 INGREDIENTS = ("landmark uncertainty", "biases", "cross-covariances", "consistent linearisation", "past poses")
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 
 def build(setup: Setup) -> Estimator:

@@ -16,7 +16,7 @@ INGREDIENTS = (
     "past poses",
     "long-lived landmarks",
 )
-WITHOUT = {"consistent linearisation": {"linearisation": "latest"}}
+WITHOUT = {"biases": {"noise.biases": "fixed"}, "consistent linearisation": {"linearisation": "latest"}}
 
 
 def build(setup: Setup) -> Estimator:

@@ -31,6 +31,7 @@ INGREDIENTS = (
     "inverse depth",
     "long-lived landmarks",
 )
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 
 def build(setup: Setup) -> Estimator:

@@ -32,7 +32,7 @@ INGREDIENTS = (
     "whole past",
     "the future",
 )
-WITHOUT = {"the future": {"output": "causal"}}
+WITHOUT = {"biases": {"noise.biases": "fixed"}, "the future": {"output": "causal"}}
 
 
 def build(setup: Setup) -> Estimator:

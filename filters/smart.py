@@ -40,6 +40,7 @@ INGREDIENTS = (
     "past poses",
     "relinearisation",
 )
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 _ENDING = Ending()
 

@@ -121,6 +121,10 @@ class TwistNoise:
         velocity, gyro = factor * self.velocity_noise_density, factor * self.gyro_noise_density
         return replace(self, velocity_noise_density=velocity, gyro_noise_density=gyro)
 
+    def with_biases_held(self, share: float) -> Self:
+        """Return the noise with a share of the random walk."""
+        return replace(self, gyro_random_walk=share * self.gyro_random_walk)
+
 
 @dataclass(frozen=True)
 class ImuNoise:
@@ -138,6 +142,11 @@ class ImuNoise:
         """Return the noise with its white densities scaled; the random walks stay."""
         accel, gyro = factor * self.accel_noise_density, factor * self.gyro_noise_density
         return replace(self, accel_noise_density=accel, gyro_noise_density=gyro)
+
+    def with_biases_held(self, share: float) -> Self:
+        """Return the noise with a share of the random walks."""
+        accel, gyro = share * self.accel_random_walk, share * self.gyro_random_walk
+        return replace(self, accel_random_walk=accel, gyro_random_walk=gyro)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,3 +234,8 @@ class Prior:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
+
+    def with_biases_held(self, share: float) -> Self:
+        """Return the prior with the biases' standard deviations reduced to a share."""
+        scale = np.repeat([1.0, share], [9, 6])
+        return replace(self, cov=self.cov * np.outer(scale, scale))

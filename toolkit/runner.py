@@ -24,7 +24,7 @@ from toolkit.errors import DataError, EstimatorError, in_words, one_line
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.measurements import Packet, Prior
+from toolkit.measurements import Packet, Prior, TwistChangeNoise
 from toolkit.models.motion import motion_model
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
@@ -32,6 +32,9 @@ from toolkit.settings import DEFAULTS, Settings
 from toolkit.settings.records import Scalar
 from toolkit.threads import on_one_thread
 
+# Biases that are fixed keep this share of the standard deviations of their start and walk: none of it matters, and with
+# none at all covariances would have no inverse.
+_HELD = 1e-3
 # Linux: writing to this file resets the peak memory that is read here (proc(5)).
 _RESETS_PEAK, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
@@ -123,13 +126,16 @@ def setup_of(
     progress: Progress = SILENT,
 ) -> Setup:
     """Return what an estimator knows of a sequence before the first packet, with the model of its motion."""
+    noise = sequence.noise
+    if settings.noise.biases == "fixed" and not isinstance(noise, TwistChangeNoise):
+        noise, prior = noise.with_biases_held(_HELD), prior.with_biases_held(_HELD)
     return Setup(
         sequence.rig,
-        sequence.noise,
+        noise,
         prior,
         sequence.gravity_world,
         sequence.motion_kind,
-        motion_model(sequence.noise, sequence.gravity_world),
+        motion_model(noise, sequence.gravity_world),
         settings,
         options or {},
         progress,

@@ -8,10 +8,11 @@ import pytest
 
 from toolkit import runner
 from toolkit.answers import Run
-from toolkit.registry import find
+from toolkit.registry import find, ladder
 from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings, Window
-from toolkit.simulation import DRIVE, simulate
+from toolkit.settings.records import Noise
+from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
 
@@ -77,3 +78,22 @@ def test_the_losses_of_batch_decide_how_it_gets_there_and_hardly_where(outliers)
     default, other = answer("batch"), answer("batch", outliers)
     assert not same(default, other)
     assert np.abs(default.final.positions - other.final.positions).max() < 0.02
+
+
+@cache
+def flown() -> Sequence:
+    return simulate(replace(FLIGHT, duration_s=0.5, camera=replace(FLIGHT.camera, max_tracks=25)), 2)
+
+
+@pytest.mark.parametrize("name", [one.name for one in ladder() if "biases" in one.ingredients()])
+@pytest.mark.parametrize("sequence", [recording, flown], ids=["twists", "imu"])
+def test_fixed_biases_stay_where_they_start(name, sequence):
+    """Theirs is a thousandth of the start's standard deviation, for filter and smoother alike (2 s)."""
+    prior = sequence().prior
+    sigma = np.sqrt(np.diag(prior.cov))[12:]
+    settings = Settings(noise=Noise(biases="fixed"))
+    run = runner.run(name, find(name).load(), sequence(), prior, settings=settings)
+    assert run.status == "ok", run.log
+    assert (np.abs(run.final.bias[:, 3:] - prior.bias[3:]) < 0.01 * sigma).all()
+    stated = np.sqrt(np.diagonal(run.final.cov, axis1=1, axis2=2))[:, -3:]
+    assert (stated < 0.002 * sigma).all()

@@ -163,6 +163,9 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     bridge_gaps: Annotated[
         bool, _about("where frames have no track in common, measured twists before and after predict the twist, too")
     ] = True
+    biases: Annotated[
+        Literal["estimated", "fixed"], _about("biases of the motion samples: estimated, or fixed where they start")
+    ] = "estimated"
 
 
 class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
