@@ -1,7 +1,7 @@
 """Textured images of a scene whose geometry is known, through cameras with distortion, and folders of them.
 
-A wall with a texture and a board before it; each pixel's ray is cut with the nearer plane, so that places, disparities
-and occlusions are exact.
+A wall with a texture and a board before it, rendered as recordings are: places, disparities and occlusions are exact
+(tests/simulation/test_filming.py).
 """
 
 import shutil
@@ -15,7 +15,8 @@ import pytest
 from toolkit.frontend import Camera, RectifiedPair, already_rectified, rectified
 from toolkit.frontend.cameras import Image
 from toolkit.geometry import Array, se3, so3_exp
-from toolkit.simulation.renderer import Eye
+from toolkit.simulation.renderer import Eye, light
+from toolkit.simulation.surfaces import Panel
 
 SIZE = (320, 240)
 BASELINE_M = 0.12
@@ -28,48 +29,17 @@ RECTIFIED = se3(np.eye(3), np.array([-BASELINE_M, 0.0, 0.0]))
 WALL_M, BOARD_M = 3.0, 1.6
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A wall at ``WALL_M`` and a board at ``BOARD_M`` before its right half, in the first left camera's axes."""
-
-    wall: Array
-    board: Array
-
-    def seen(self, camera: Camera, T_cam_scene: Array, noise: float = 1.0, seed: int = 0) -> Image:
-        """Return what a camera sees, with noise of some grey values."""
-        T_scene_cam = np.linalg.inv(T_cam_scene)
-        directions = _rays(camera) @ T_scene_cam[:3, :3].T
-        grey = _hit(self.wall, T_scene_cam[:3, 3], directions, WALL_M)[0]
-        before, x = _hit(self.board, T_scene_cam[:3, 3], directions, BOARD_M)
-        grey = np.where(x > 0.0, before, grey)
-        noisy = grey + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
-        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-
-
-def scene(seed: int = 3) -> Scene:
-    """Return a scene whose textures have corners of several sizes."""
-    rng = np.random.default_rng(seed)
-    return Scene(_texture(rng), _texture(rng))
-
-
-def _texture(rng: np.random.Generator) -> Array:
-    coarse = cv2.resize(rng.uniform(40, 215, (60, 60)), (1200, 1200), interpolation=cv2.INTER_LINEAR)
-    fine = cv2.GaussianBlur(rng.uniform(-160, 160, (1200, 1200)), (0, 0), 2.0)
-    return np.asarray(coarse + 2.0 * fine, dtype=np.float64)
-
-
-def _rays(camera: Camera) -> Array:
-    """Return the direction (height, width, 3) of each pixel."""
-    eye = Eye.of(camera)
-    return np.stack([eye.x, eye.y, np.ones_like(eye.x)], axis=2).astype(np.float64)
-
-
-def _hit(texture: Array, origin: Array, directions: Array, depth_m: float) -> tuple[Array, Array]:
-    """Return the texture where rays meet a plane, 4 mm a texel, and the x of the places."""
-    reach = (depth_m - origin[2]) / directions[..., 2]
-    places = origin + reach[..., None] * directions
-    column, row = (np.mod(places[..., i] / 0.004 + 600.0, 1198.0).astype(np.float32) for i in (0, 1))
-    return np.asarray(cv2.remap(texture, column, row, cv2.INTER_LINEAR)), places[..., 0]
+def seen(seed: int, camera: Camera, T_cam_scene: Array, of_noise: int) -> Image:
+    """Return what a camera sees of a wall and of a board before its right half, with noise of a grey value."""
+    towards_camera = np.diag([1.0, -1.0, -1.0])
+    panels = [
+        Panel(se3(towards_camera, np.array([left_m, 4.0, depth_m])), (8.0, 8.0), texture, (float(seed), 1.0))
+        for left_m, depth_m, texture in ((-4.0, WALL_M, 2), (0.0, BOARD_M, 1))
+    ]
+    grey = light(panels, Eye.of(camera), np.linalg.inv(T_cam_scene))
+    return np.clip(np.rint(grey + np.random.default_rng(of_noise).normal(0.0, 1.0, grey.shape)), 0, 255).astype(
+        np.uint8
+    )
 
 
 def along(k: int, speed_m: float = 0.015) -> Array:
@@ -107,14 +77,9 @@ class Filmed:
 
 def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3, every: int = 1) -> list[Pair]:
     """Return the images of both cameras along the motion, of one frame in so many."""
-    shown = scene(seed)
-    return [
-        (
-            shown.seen(cameras[0], along(k), seed=2 * k),
-            shown.seen(cameras[1], T_right_left @ along(k), seed=2 * k + 1),
-        )
-        for k in range(0, every * frames, every)
-    ]
+    poses = [(k, along(k)) for k in range(0, every * frames, every)]
+    left, right = cameras
+    return [(seen(seed, left, T, 2 * k), seen(seed, right, T_right_left @ T, 2 * k + 1)) for k, T in poses]
 
 
 @pytest.fixture(scope="session")

@@ -155,9 +155,8 @@ def _second_run(document: Document) -> Document:
     return run
 
 
-@pytest.mark.parametrize(
-    ("spoil", "wanted"),
-    [
+BROKEN: dict[str, list[tuple[Callable[[Document], object], str]]] = {
+    "metrics.json": [
         (lambda d: _second_run(d)["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
         (lambda d: _second_run(d)["notes"].clear(), "is null, and notes does not say why"),
         (
@@ -175,39 +174,26 @@ def _second_run(document: Document) -> Document:
         (lambda d: d["audit"].append({"fault": "gap", "count": 1, "repaired": True}), "audit[0]: lacks detail"),
         (lambda d: d.pop("runs"), "the document: lacks runs"),
     ],
-)
-def test_broken_metrics_are_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
-    document = old("metrics.json")
-    spoil(document)
-    assert wanted in refused("metrics.json", document)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "wanted"),
-    [
+    "report.json": [
         (lambda d: d["runs"][0]["nees"]["pose"].pop(), "runs[0].nees: pose has 11 entries, t_s has 12"),
         (lambda d: d["runs"][0]["rotation"].pop(), "runs[0].rotation: expected list of length 3, got 2"),
         (lambda d: d["steps"][0]["t_s"].pop(), "steps[0]: step_ms has 12 entries, t_s has 11"),
     ],
-)
-def test_a_broken_report_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
-    document = old("report.json")
-    spoil(document)
-    assert wanted in refused("report.json", document)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "wanted"),
-    [
+    "check.json": [
         (lambda d: d.update(passed=False), "the document: passed does not fit failures"),
         (lambda d: d.update(failures=1), "the document: failures does not count the verdicts that fail"),
         (lambda d: d["verdicts"][0].update(fails=True), "verdicts[0]: fails does not fit the finding 'same'"),
     ],
-)
-def test_a_broken_check_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
-    document = old("check.json")
+}
+
+
+@pytest.mark.parametrize(("name", "spoil", "wanted"), [(name, *row) for name, rows in BROKEN.items() for row in rows])
+def test_a_broken_document_is_refused_with_the_place(
+    name: str, spoil: Callable[[Document], object], wanted: str
+) -> None:
+    document = old(name)
     spoil(document)
-    assert wanted in refused("check.json", document)
+    assert wanted in refused(name, document)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -290,9 +276,6 @@ def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Compari
     built = metrics_document(rescored(comparison, lambda _: scores))
     assert parse(to_text(built), MetricsDocument) == built
     assert built.runs[0].metrics["ate_se3_m"] is None
-
-
-Document = dict[str, Any]
 
 
 def build(comparison: Comparison) -> Document:

@@ -90,7 +90,7 @@ def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording
     assert scores["pairs"] == recording.frame_count - 2
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence, seed: int) -> None:
     truth, rng = truth_of(recording), np.random.default_rng(seed)
     jitter = se3_exp(rng.normal(0.0, [0.02] * 3 + [0.2] * 3, (len(truth), 6)))
