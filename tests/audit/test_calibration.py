@@ -26,7 +26,7 @@ from toolkit.audit.bundle import (
 )
 from toolkit.audit.calibration import JUDGED, doubtful, hidden, lever_arm, wrong
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
+from toolkit.audit.self_calibration import PRIOR, SelfCalibration, _windows, self_calibration
 from toolkit.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from toolkit.measurements import ImuMotion, ImuNoise, MotionKind
 from toolkit.models.imu import predict, preintegrate, preintegration_params
@@ -227,7 +227,7 @@ def test_one_window_says_nothing_of_a_change_of_the_clock() -> None:
     found = fitted(recorded(FLIGHT, 0))
     assert found.windows == 1
     assert found.value[CHANGE] == pytest.approx(0.0, abs=1e-9)
-    assert found.error[CHANGE] == pytest.approx(OFF_BY[CHANGE], rel=1e-3)
+    assert found.error[CHANGE] == pytest.approx(PRIOR["imu"][CHANGE], rel=1e-3)
 
 
 def sure(unknown: int, value: float) -> SelfCalibration:

@@ -58,9 +58,6 @@ MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 
 SETTLED = 0.4
 # A step of more than this many prior standard deviations diverges.
 STRAYED = 10.0
-# Prior standard deviations of the corrections: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. A result
-# beyond them is not accepted.
-OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3, 5.0, 0.1], [2, 2, 1, 3, 3, 1, 1, 3, 3, 1, 1])
 # Least share of the information on the camera's position that is taken to come from the data.
 LEAST_BY_DATA = 1e-3
 # The first unknowns are those of a rectified pair. The errors of the right image are fixed at zero, and estimated only
@@ -68,25 +65,25 @@ LEAST_BY_DATA = 1e-3
 # all others they would make focal length and baseline less certain.
 _RECTIFIED, RIGHT = RIGHT_SHIFT, slice(RIGHT_SHIFT, COMMON)
 RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}
-# Prior standard deviations with odometry: the position includes that of the point whose velocities are given (m), a
-# twist may describe the interval before or after its stamp (s), and a rotation of the velocities by slip and pitch of
-# cars (rad) replaces the bias of an accelerometer. A result is accepted up to the last two numbers, because the data
-# may not determine the position.
-POINT_M, PAIRING_S, SLIP_RAD, MOST_POINT_M, MOST_SLIP_RAD = 2.0, 0.06, 0.02, 10.0, 0.1
-# With an IMU the position is accepted up to this distance (m), far beyond its prior: `lever_arm` reports it.
-MOST_LEVER_M = 2.0
-
-
-def _beside_odometry(point_m: float, slip_rad: float) -> Array:
-    slip = np.full(3, slip_rad)
-    return np.concatenate([OFF_BY[:8], np.full(3, point_m), [PAIRING_S], OFF_BY[12:16], slip, OFF_BY[RIGHT_SHIFT:]])
-
-
-PRIOR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(POINT_M, SLIP_RAD)}
-NEAR: dict[MotionKind, Array] = {
-    "imu": np.concatenate([OFF_BY[:8], np.full(3, MOST_LEVER_M), OFF_BY[11:]]),
-    "twist": _beside_odometry(MOST_POINT_M, MOST_SLIP_RAD),
-}
+# Of the unknowns in the order of `bundle`, how many they are, and for an IMU and odometry the standard deviation of the
+# prior and the largest result that is accepted. The position is accepted far beyond its prior: `lever_arm` reports it.
+_UNKNOWNS = (
+    (2, 0.2, 0.2, 0.2, 0.2),  # logarithms of the focal lengths
+    (2, 70.0, 70.0, 70.0, 70.0),  # principal point, px
+    (1, 0.2, 0.2, 0.2, 0.2),  # logarithm of the baseline
+    (3, 0.3, 0.3, 0.3, 0.3),  # rotation of the camera, rad
+    (3, 0.3, 2.0, 2.0, 10.0),  # its position, with odometry also that of the point whose velocities are given, m
+    (1, 0.03, 0.03, 0.06, 0.06),  # its clock, s; a twist may describe the interval before or after its stamp
+    (1, 0.1, 0.1, 0.1, 0.1),  # the change of that, s
+    (3, 0.1, 0.1, 0.1, 0.1),  # bias of the gyro, rad/s
+    (3, 0.3, 0.3, 0.02, 0.1),  # bias of the accelerometer, m/s^2; rotation of velocities by slip and pitch, rad
+    (1, 5.0, 5.0, 5.0, 5.0),  # columns of the right image, px
+    (1, 0.1, 0.1, 0.1, 0.1),  # roll of the right camera, rad
+)
+_COUNTS, *_SIZES = zip(*_UNKNOWNS, strict=True)
+_OF_IMU, _NEAR_IMU, _OF_TWIST, _NEAR_TWIST = (np.repeat(size, _COUNTS) for size in _SIZES)
+PRIOR: dict[MotionKind, Array] = {"imu": _OF_IMU, "twist": _OF_TWIST}
+NEAR: dict[MotionKind, Array] = {"imu": _NEAR_IMU, "twist": _NEAR_TWIST}
 
 
 class SelfCalibration(NamedTuple):
@@ -108,7 +105,7 @@ class SelfCalibration(NamedTuple):
     @property
     def position(self) -> Position:
         """The camera's position without its prior, by the share of the information that comes from the data."""
-        by_data = np.maximum(1.0 - (self.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
+        by_data = np.maximum(1.0 - (self.error[LEVER] / PRIOR["imu"][LEVER]) ** 2, LEAST_BY_DATA)
         root = np.sqrt(by_data)
         return Position(self.value[LEVER] / by_data, self.cov[LEVER, LEVER] / root / root[:, None])
 
