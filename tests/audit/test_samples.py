@@ -256,6 +256,10 @@ def test_gravity_that_was_taken_out_is_no_unit() -> None:
         removed = replace(flight, motion=ImuSamples(motion.t_ns, scale * left, motion.gyro_radps))
         assert "gravity was taken out" in gravity_removed(Evidence(removed)).detail
         assert units(Evidence(removed)) is None
+    at_rest = np.tile([0.1, 0.2, -0.1], (motion.t_ns.size, 1))
+    assert gravity_removed(Evidence(replace(flight, motion=ImuSamples(motion.t_ns, at_rest, motion.gyro_radps))))
+    scaled = replace(flight, motion=ImuSamples(motion.t_ns, 0.3 * motion.accel_mps2, motion.gyro_radps))
+    assert gravity_removed(Evidence(scaled)) is None
     in_g = replace(flight, motion=ImuSamples(motion.t_ns, motion.accel_mps2 / 9.80665, motion.gyro_radps))
     assert gravity_removed(Evidence(in_g)) is None
     assert "it is in g" in units(Evidence(in_g)).detail

@@ -438,9 +438,13 @@ def understated_noise(evidence: Evidence) -> Symptom | None:
     motion, noise = evidence.sequence.motion, evidence.sequence.noise
     if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)) or motion.t_ns.size < LEAST_SAMPLES:
         return None
+    # Noise in another unit is that unit's.
+    force, sensors = force_ratio(evidence.sequence), {"accel": SENSORS["imu"][0], "gyro": SENSORS["imu"][1]}
+    if force is not None and not 1.0 / LEAST_FACTOR < force.value < LEAST_FACTOR:
+        del sensors["accel"]
     step_s, found = usual_step_s(motion.t_ns), list[str]()
     count = max(round(QUIET_S / max(step_s, 1e-6)), LEAST_SAMPLES // 5)
-    for name, (_, _, columns, unit) in zip(("accel", "gyro"), SENSORS["imu"], strict=True):
+    for name, (_, _, columns, unit) in sensors.items():
         parts = np.array_split(motion.values[:, columns], max(len(motion.values) // count, 1))
         measured = float(np.quantile([white_sigma(part).min() for part in parts], QUIETEST))
         stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s) if step_s > 0.0 else np.inf
@@ -530,7 +534,8 @@ def _sizes(sequence: Sequence) -> str:
 
 # A specific force whose median is below this share of gravity lacks it. One in g has a size that hardly changes over a
 # recording, averaged over this time (s): its range is less than this share of it (0.2 in the recordings at hand).
-LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE = 0.5, 0.25, 0.5
+# Below the last share it is a bias alone.
+LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE, MOST_BIAS = 0.5, 0.25, 0.5, 0.06
 
 
 def gravity_removed(evidence: Evidence) -> Symptom | None:
@@ -551,12 +556,14 @@ def gravity_removed(evidence: Evidence) -> Symptom | None:
 
 
 def _lacks_gravity(sequence: Sequence) -> bool:
-    """Say whether a specific force is far below gravity, and not one in g, which is as large and hardly changes."""
+    """Say whether a specific force is far below gravity, and no steady one of another unit or scale.
+
+    At rest little but a bias is left of what lacks it.
+    """
     ratio = force_ratio(sequence)
-    if ratio is None or not ratio.value < LEAST_GRAVITY:
+    if ratio is None or not 0.0 < ratio.value < LEAST_GRAVITY:
         return False
-    is_as_large = _in_other_unit(ratio, FORCES, WITHIN_FACTOR, UNIT_SIGMAS) is not None
-    return not (is_as_large and _range_of_force(sequence) < STEADY_RANGE)
+    return ratio.value < MOST_BIAS or _range_of_force(sequence) > STEADY_RANGE
 
 
 def _range_of_force(sequence: Sequence) -> float:

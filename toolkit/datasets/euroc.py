@@ -38,7 +38,7 @@ from toolkit.datasets.io.image_pairs import (
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
 from toolkit.datasets.trajectories.headings import imu_columns
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified
 from toolkit.geometry import Array
@@ -58,6 +58,7 @@ SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 ALL_SIMULATED = "simulated IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
+_BAGS = {".bag", ".db3", ".mcap"}
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
 # With fewer of its images a recording is cut short or a sample: tracks from them would be of another recording.
 _NEARLY_ALL = 0.9
@@ -193,6 +194,11 @@ def _whole(path: Path) -> _Layout:
 
 def _imu(layout: _Layout) -> ImuSamples:
     if layout.mav0 is not None and not is_regular(layout.imu):
+        bags = [path.parent.name for path in sorted(layout.root.glob("*/*")) if _BAGS & set(path.suffixes)]
+        if bags:
+            raise DataError(
+                f"{layout.root}: holds no measurements but those of a bag: name its folder {printable(bags[0])}"
+            )
         raise DataError(
             f"{layout.imu}: cannot be read, and there is no imu0.csv of Kalibr's: name the folder that has mav0, or "
             "rectify images without an IMU and lay them out as KITTI's image_0, image_1 and calib.txt"
