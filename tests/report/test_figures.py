@@ -266,7 +266,7 @@ def test_all_estimators_are_distinguished_and_both_outputs_keep_one_colour() -> 
         looks = [str(stroke_of(comparison, name, output)) for name in names]
         assert len(set(looks)) == len(names)
     lines = {str(stroke_of(comparison, name, output)["linestyle"]) for name in names for output in ("causal", "final")}
-    assert len(lines) == 6
+    assert len(lines) == 8
 
 
 def test_an_estimator_has_one_look_whatever_it_is_compared_with() -> None:

@@ -34,8 +34,8 @@ LANDMARK_COLOUR = "#8a949f"
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
 Dashes = Literal["-", "--", ":"] | tuple[float, tuple[float, ...]]
 _LINE_OF: dict[Output, tuple[Dashes, ...]] = {
-    "causal": ("--", ":", (0.0, (1.0, 3.0))),
-    "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5))),
+    "causal": ("--", ":", (0.0, (1.0, 3.0)), (0.0, (2.0, 1.0, 1.0, 1.0))),
+    "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5)), (0.0, (12.0, 1.5)), (0.0, (9.0, 1.5, 3.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
 # From this many panels on there are four in a row, before that three; two or four make a square.

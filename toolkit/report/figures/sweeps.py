@@ -32,7 +32,7 @@ from toolkit.report.text import number
 # Doses that span more than this factor are laid out by their logarithm.
 _WIDE = 8.0
 # Beyond this a ratio or NEES is drawn at the limit.
-_MOST = 1e4
+_MOST = 1e6
 # Ratios of the darkest shades of a grid.
 _SHADES = (0.5, 50.0)
 _HEIGHT_IN, _PANEL_IN = 2.9, 2.4

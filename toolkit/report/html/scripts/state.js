@@ -67,7 +67,7 @@ function setZoom(caseId, range) {
 }
 
 const COLOURS = 7;
-const DASHES = { causal: [[7, 4], [2, 4], [1, 6]], final: [[], [9, 2, 2, 2], [14, 3]] };
+const DASHES = { causal: [[7, 4], [2, 4], [1, 6], [4, 2, 2, 2]], final: [[], [9, 2, 2, 2], [14, 3], [11, 2, 4, 2]] };
 
 /** Return how a row's line is drawn, as in the figures: its colour, dashed where it knew the past only; past the last colour otherwise. */
 function lookOf(row) {
