@@ -151,7 +151,6 @@ def _later(given: Trajectory, shift_s: float) -> Trajectory:
 
 
 MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str]] = {
-    "w first": (lambda given, _: _rolled(given, 1), "tum", "the quaternions look w first"),
     "w last": (lambda given, _: _rolled(given, -1), "euroc", "the quaternions look w last"),
     "world to IMU": (
         lambda given, _: _turned(given, np.swapaxes(given.T_world_imu[:, :3, :3], 1, 2)),
@@ -163,13 +162,6 @@ MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str
         "kitti",
         "the poses look like the left camera's",
     ),
-    "millimetres": (
-        lambda given, _: Trajectory(given.t_ns, se3(given.T_world_imu[:, :3, :3], 1000.0 * given.positions)),
-        "tum",
-        "it is in millimetres: divide its positions by 1000",
-    ),
-    "own clock": (lambda given, _: _later(given, -1.6e9), "tum", "counts from its own start: add"),
-    "time zone": (lambda given, _: _later(given, 7200.0), "tum", "as time zones are"),
     "another drive": (lambda given, _: _later(given, 5000.0), "tum", "another drive or clock"),
 }
 
