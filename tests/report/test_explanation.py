@@ -1,9 +1,16 @@
 """An explanation's words: they call an effect only what is one, and tell where it was measured (1 s)."""
 
+import re
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
+from toolkit.experiment.comparison import Row
+from toolkit.experiment.contests import Advantage, Contest
+from toolkit.experiment.units import Outcome
+from toolkit.registry import discover
 from toolkit.report.explanation import (
     ContributionRecord,
     ExplanationRecord,
@@ -14,6 +21,7 @@ from toolkit.report.explanation import (
     in_words,
 )
 from toolkit.report.manifest import RecordingRecord, SeedsUsed
+from toolkit.report.verdict import why_sentence
 
 
 def variant(name: str, *without: str) -> VariantRecord:
@@ -117,3 +125,26 @@ def test_without_a_truth_the_error_is_that_of_withheld_tracks_and_called_so() ->
     words = in_words(explanation(metric="heldout_reproj_median_px", intervals="stretches"))
     assert "b predicts withheld tracks 5.10 times as well as a" in words
     assert "the error of withheld tracks, for there is no truth, stretches of the one recording" in words
+
+
+@pytest.mark.parametrize(
+    ("names", "low", "said"),
+    [
+        (("riekf", "ekf-slam", "ekf"), 1.1, "Why: vislam explain with --from ekf --to riekf."),
+        (("riekf", "ekf", "dead-reckoning"), 1.1, "Why: vislam explain with --from ekf --to riekf."),
+        (("riekf", "ekf"), 0.9, ""),
+        (("dead-reckoning", "ekf"), 1.1, ""),
+    ],
+)
+def test_a_verdict_points_to_the_explanation_of_what_is_no_chance(
+    names: tuple[str, ...], low: float, said: str
+) -> None:
+    rows = tuple(Row("causal", (Outcome(0, name, "ok"),)) for name in names)
+    advantages = tuple(Advantage(1.5, low, 2.0, 8, "seeds") for _ in names[1:])
+    assert why_sentence(Contest("accuracy in the end", "ate_yaw_m", rows, advantages)) == said
+
+
+def test_the_page_lists_the_ingredients_that_estimators_declare() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "explain.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `([^`]+)` \|", page, flags=re.MULTILINE))
+    assert listed >= {name for entry in discover().values() for name in entry.ingredients()}

@@ -41,7 +41,7 @@ class Variant:
 
 def called(estimator: str, without: Iterable[str]) -> str:
     """Return how an estimator without some ingredients is called."""
-    lacking = ", ".join(f"no {one}" for one in without)
+    lacking = ", ".join(f"no {one.removeprefix('the ')}" for one in without)
     return f"{estimator} ({lacking})" if lacking else estimator
 
 

@@ -13,6 +13,7 @@ from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near
 from toolkit.files.documents import rounded
 from toolkit.metrics import metrics_called
+from toolkit.registry import discover
 from toolkit.report.text import listed, number
 
 # An estimator is named as nearly as good where its error is within this factor, and it saves this share of the time.
@@ -49,7 +50,7 @@ def verdict(comparison: Comparison) -> str:
         return _of_few(comparison)
     runs = f"{len(comparison.seeds)} seeds" if comparison.over_seeds else "one run"
     best = contest_text(contest_record(contest), runs, contest.rows[0].mark)
-    sentences = (best, _limits(contest), _trust(comparison), _cost(contest))
+    sentences = (best, _limits(contest), _trust(comparison), _cost(contest), why_sentence(contest))
     return " ".join(filter(None, sentences))
 
 
@@ -119,6 +120,21 @@ def contest_text(contest: ContestRecord, runs: str, mark: str) -> str:
     low, high = map(number, next_one.interval)
     factor = f"{number(next_one.ratio)} times ({100 * CONFIDENCE:.0f} %: {low} to {high})"
     return f"{text}; {next_one.estimator} ({value_of(next_one)}) {does} {factor} as much."
+
+
+def why_sentence(contest: Contest) -> str:
+    """Name the command that says why the first is better than the worst of the others; nothing where none can."""
+    able = [
+        row.estimator for row in (contest.rows[0], *(row for row, _ in contest.worse)) if row.estimator in _explained()
+    ]
+    if len(able) < 2 or able[0] != contest.rows[0].estimator:
+        return ""
+    return f"Why: vislam explain with --from {able[-1]} --to {able[0]}."
+
+
+def _explained() -> frozenset[str]:
+    """Return the names of the estimators that say what they have."""
+    return frozenset(name for name, entry in discover().items() if entry.ingredients())
 
 
 def _limits(contest: Contest) -> str:
