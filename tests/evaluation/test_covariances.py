@@ -84,6 +84,18 @@ def test_a_wrong_convention_is_named_with_the_right_one(scene, vislam, said: str
     assert meant in note.partition(": ")[0]
 
 
+def test_errors_that_are_those_of_the_start_show_the_convention_as_well(scene, vislam) -> None:
+    """Placed by its first pose such an estimate would have no errors, which fit any covariance."""
+    t_ns = scene.stamps(20.0)
+    error = se3_exp(ROOT @ np.array([1.0, -1.0, 0.8, 1.2, -0.9, 1.0]))
+    given = Trajectory(t_ns, scene.poses_at(t_ns) @ error, cov=np.tile(COV, (t_ns.size, 1, 1)))
+    written(given, "pos-rot/right", "rot-pos/right")
+    note = run_of(vislam)["notes"]["nees_pose_mean"]
+    assert note.startswith("the covariances are said to be pos-rot/right and fit the errors only as rot-pos/right")
+    written(given)
+    assert "nees_pose_mean" not in run_of(vislam)["notes"]
+
+
 def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam) -> None:
     written(estimate(scene, times=0.01))
     run = run_of(vislam)

@@ -11,7 +11,7 @@ share cancel in it, so that this finds too little, and never too much.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from toolkit.datasets.trajectories.belonging import (
     other_axes,
     range_s,
 )
-from toolkit.datasets.trajectories.covariances import CovConvention
+from toolkit.datasets.trajectories.covariances import CONVENTIONS, CovConvention
 from toolkit.datasets.trajectories.formats import PosesFile, check_order, read_finite_poses, read_rows
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
@@ -418,27 +418,32 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
         return Scores.none(_NEES_KEYS, NO_COVARIANCE)
     cov = covariances.of(file.T_world_imu)
 
-    def errors(cov: Array) -> StatedErrors:
-        return stated_against(cov, estimate, truth, level=level)
+    def errors(cov: Array, *, placed: bool | None) -> StatedErrors:
+        return stated_against(cov, estimate, truth, level=level, placed=placed)
 
-    likelier = likelier_reading(covariances, file.T_world_imu, errors)
-    if cov is None:
-        return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
     try:
-        stated = errors(cov)
+        # The same errors for all readings: in the truth's world if any of them allows it.
+        readings = (covariances.read_as(one, file.T_world_imu) for one in CONVENTIONS.values())
+        placed = not any(_is_in_the_truths_world(errors(one, placed=False)) for one in readings)
+        likelier = likelier_reading(covariances, file.T_world_imu, partial(errors, placed=placed))
+        if cov is None:
+            return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
+        stated = errors(cov, placed=None)
     except Unavailable as reason:
-        return Scores.none(_NEES_KEYS, str(reason))
+        return Scores.none(_NEES_KEYS, _NO_CONVENTION if cov is None else str(reason))
     scores = nees.of_stated(stated) | uncertainty.of_stated(stated)
     remark = "; ".join(filter(None, (likelier, "" if truth.cov is None else _OF_TWO)))
     return scores.remarked(_NEES_KEYS, remark)
 
 
-def stated_against(cov: Array, estimate: Poses, truth: TruthFile, *, level: bool) -> StatedErrors:
+def stated_against(
+    cov: Array, estimate: Poses, truth: TruthFile, *, level: bool, placed: bool | None = None
+) -> StatedErrors:
     """Return the errors of the poses that have a covariance, of (N, d, d), and a true pose, with the covariances.
 
-    They are in the truth's world if the first pose is plausible there under its own covariance. Otherwise the first
-    pose is placed on the truth's, by heading and position alone where the vertical is measured (``level``). Raises
-    Unavailable where there are none.
+    They are in the truth's world, or ``placed``: the first pose is then moved to the truth's, by heading and position
+    alone where the vertical is measured (``level``). Where it is not said they are placed if the first pose is not
+    plausible in the truth's world under its own covariance. Raises Unavailable where there are none.
     """
     met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
     if not met.any():
@@ -446,15 +451,21 @@ def stated_against(cov: Array, estimate: Poses, truth: TruthFile, *, level: bool
     if truth.cov is not None:
         cov = cov[:, :6, :6] + truth.cov[_nearest(truth.t_ns, estimate.t_ns), :6, :6]
     poses, rows = estimate.poses[met], np.flatnonzero(met)
-    errors = BodyErrors(estimate.t_ns[met], rows, se3_inverse(poses) @ true, poses, placed=False)
-    stated = with_covariances(errors, cov)
-    of_all = nees_of(stated)
-    if max(of_all.orientation[0], of_all.position[0]) <= chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0:
-        return stated
+    t_ns = estimate.t_ns[met]
+    if not placed:
+        stated = with_covariances(BodyErrors(t_ns, rows, se3_inverse(poses) @ true, poses, placed=False), cov)
+        if placed is False or _is_in_the_truths_world(stated):
+            return stated
     if not met[0]:
         raise Unavailable(NOT_PLACED)
-    placed = place_first(true[0], poses[0], level).apply(poses)
-    return with_covariances(BodyErrors(errors.t_ns, rows, se3_inverse(placed) @ true, placed, placed=True), cov)
+    moved = place_first(true[0], poses[0], level).apply(poses)
+    return with_covariances(BodyErrors(t_ns, rows, se3_inverse(moved) @ true, moved, placed=True), cov)
+
+
+def _is_in_the_truths_world(stated: StatedErrors) -> bool:
+    """Say whether the first error is plausible under its covariance, in each block."""
+    first = nees_of(stated)
+    return bool(max(first.orientation[0], first.position[0]) <= chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0)
 
 
 def _nearest(t_ns: IntArray, at_ns: IntArray) -> IntArray:
