@@ -10,6 +10,7 @@ share cancel in it, so that this finds too little, and never too much.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -421,16 +422,20 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
     def errors(cov: Array, *, placed: bool | None) -> StatedErrors:
         return stated_against(cov, estimate, truth, level=level, placed=placed)
 
+    def allows_the_truths_world(reading: CovConvention) -> bool:
+        with suppress(Unavailable):
+            return _is_in_the_truths_world(errors(covariances.read_as(reading, file.T_world_imu), placed=False))
+        return False
+
+    # The same errors for all readings: in the truth's world if any of them allows it.
+    placed = not any(map(allows_the_truths_world, CONVENTIONS.values()))
+    likelier = likelier_reading(covariances, file.T_world_imu, partial(errors, placed=placed))
+    if cov is None:
+        return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
     try:
-        # The same errors for all readings: in the truth's world if any of them allows it.
-        readings = (covariances.read_as(one, file.T_world_imu) for one in CONVENTIONS.values())
-        placed = not any(_is_in_the_truths_world(errors(one, placed=False)) for one in readings)
-        likelier = likelier_reading(covariances, file.T_world_imu, partial(errors, placed=placed))
-        if cov is None:
-            return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
         stated = errors(cov, placed=None)
     except Unavailable as reason:
-        return Scores.none(_NEES_KEYS, _NO_CONVENTION if cov is None else str(reason))
+        return Scores.none(_NEES_KEYS, str(reason))
     scores = nees.of_stated(stated) | uncertainty.of_stated(stated)
     remark = "; ".join(filter(None, (likelier, "" if truth.cov is None else _OF_TWO)))
     return scores.remarked(_NEES_KEYS, remark)
