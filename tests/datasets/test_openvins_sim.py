@@ -1,6 +1,7 @@
 """Exports of the OpenVINS simulator: conventions, cuts, and malformed ones."""
 
 import gzip
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,3 +82,12 @@ def test_gzipped_tables_are_the_same_recording(openvins: Path) -> None:
         table.with_suffix(".csv.gz").write_bytes(gzip.compress(table.read_bytes()))
         table.unlink()
     assert load_sequence(str(openvins)).content_hash() == plain
+
+
+def test_an_offset_of_the_clocks_that_is_stated_is_told(openvins: Path) -> None:
+    calibration = openvins / "calib.json"
+    stated = json.loads(calibration.read_text())
+    for offset_s, told in ((0.0, False), (0.0052, True)):
+        calibration.write_text(json.dumps({**stated, "t_cam_to_imu_offset": offset_s}))
+        facts = load_sequence(str(openvins)).provenance.facts
+        assert any("t_cam_to_imu_offset, +5.200 ms" in fact for fact in facts) == told

@@ -8,6 +8,7 @@ Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
 import json
+from collections.abc import Iterator
 from json import JSONDecodeError
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
 
 CITES = ("geneva2020openvins",)
+_RETURNING, _OFFSET = "simulated by OpenVINS; feature ids return after gaps", "t_cam_to_imu_offset"
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
 _IMU_COLUMNS = ("timestamp", "ax", "ay", "az", "gx", "gy", "gz")
 _FEATURE_COLUMNS = ("timestamp", "frame", "feature_id", "uL", "vL", "uR", "vR", "in_left", "in_right")
@@ -75,7 +77,7 @@ def load(path: Path) -> Sequence:
         frames_t_ns=frames_t_ns,
         observations=sightings,
         motion=motion,
-        provenance=Provenance("openvins-sim", str(path), ("simulated by OpenVINS; feature ids return after gaps",)),
+        provenance=Provenance("openvins-sim", str(path), (_RETURNING, *_unused(calibration))),
         truth=_truth(path),
         gravity_world=calibration.constant("gravity_world", 3),
     )
@@ -112,6 +114,13 @@ def _calibration(path: Path) -> Fields:
     fields = Fields(path, dict(flattened(content)))  # without what is no number and no list of them
     fields.require(*_REQUIRED)
     return fields
+
+
+def _unused(calibration: Fields) -> Iterator[str]:
+    """Yield that the clocks differ by what a calibration states, where it does: of which table is not in the export."""
+    offset_s = calibration.number(_OFFSET) if _OFFSET in calibration else 0.0
+    if offset_s:
+        yield f"not used of {calibration.path.name}: {_OFFSET}, {1e3 * offset_s:+.3f} ms; the stamps are as they stand"
 
 
 def _rig(calibration: Fields) -> StereoRig:
