@@ -70,7 +70,7 @@ def results_section(title: str, words: str, table: Table, figures: Mapping[str, 
 
     Raises DataError where a figure is missing.
     """
-    parts = [f"<h2>{in_html(title)}</h2>", f"<p>{in_html(words)}</p>", as_html(table)]
+    parts = [f"<h2>{in_html(title)}</h2>", f"<p>{in_html(words)}</p>", f'<div class="wide">{as_html(table)}</div>']
     parts += [f'<p class="fine">{in_html(line)}</p>' for line in table.under]
     for name, caption in figures.items():
         image = base64.b64encode(read_input(directory / name)).decode("ascii")
