@@ -25,7 +25,7 @@ from toolkit.audit.samples import saturated_samples as saturated
 from toolkit.geometry import Array, interpolate_poses
 from toolkit.measurements import ImuNoise, TwistNoise
 from toolkit.models.noise import white_sigma
-from toolkit.motion_samples import ImuSamples
+from toolkit.motion_samples import ImuSamples, TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -263,6 +263,20 @@ def test_gravity_that_was_taken_out_is_no_unit() -> None:
     in_g = replace(flight, motion=ImuSamples(motion.t_ns, motion.accel_mps2 / 9.80665, motion.gyro_radps))
     assert gravity_removed(Evidence(in_g)) is None
     assert "it is in g" in units(Evidence(in_g)).detail
+
+
+def test_a_camera_far_from_the_origin_of_a_long_vehicle_is_in_no_other_unit() -> None:
+    """Odometry of a point 14 m behind, by which the tracks move as they should; and the same arm in millimetres."""
+    drive = recording("drive")
+    behind_m, motion, arm = np.array([-14.0, 0.0, 0.0]), drive.motion, drive.rig.T_imu_cam.copy()
+    assert isinstance(motion, TwistSamples)
+    arm[:3, 3] -= behind_m
+    v_mps = motion.v_mps + np.cross(motion.w_radps, behind_m)
+    moved = replace(
+        drive, motion=TwistSamples(motion.t_ns, v_mps, motion.w_radps), rig=replace(drive.rig, T_imu_cam=arm)
+    )
+    assert units(Evidence(moved)) is None
+    assert "its translation is in millimetres" in units(Evidence(faults.extrinsic_unit(drive, 1000.0))).detail
 
 
 ORDERS = [((0, 1, 2), (-1.0, -1.0, -1.0)), ((0, 1, 2), (1.0, 1.0, -1.0)), ((1, 0, 2), (1.0, 1.0, 1.0))]

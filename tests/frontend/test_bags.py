@@ -426,6 +426,19 @@ def test_the_baseline_is_between_both_projections_or_that_of_the_transforms(asl:
     assert load_images(str(path)).rig.baseline_m == pytest.approx(expected, rel=1e-9)
 
 
+def test_binning_that_a_calibration_states_is_told_not_to_be_used(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("sqlite")
+    film = bare(ros, asl, (0.0, 0.12))
+    for item in film:
+        if item.topic == "/cam1/camera_info":
+            item.value.binning_x = item.value.binning_y = 2
+    facts = load_sequence(str(ros.write(tmp_path / "binned", film))).provenance.facts
+    (told,) = [fact for fact in facts if "binning" in fact]
+    assert told.startswith(
+        "not used of /cam1/camera_info: binning 2 x 2, region of interest 0 x 0 px; its camera matrix"
+    )
+
+
 def test_transforms_of_tf_that_never_change_mount_the_camera(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("ros1")
     film = bare(ros, asl)

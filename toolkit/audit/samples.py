@@ -585,6 +585,8 @@ WITHIN_FACTOR_OF_SPEED = 1.08
 LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
 # Limits of the time (s) between two frames of a vehicle's camera.
 LEAST_FRAME_S, MOST_FRAME_S = 1e-3, 5.0
+# Residuals of tracks under another unit of the arm over those as given, from which on the arm is as long as given.
+MOST_WORSE = 1.05
 IN_A_PART = " in a part of the recording and not in another"
 # Limits of the baselines of rigs on vehicles, hand-held or flying (m), and the largest distance of a camera from its
 # IMU (m).
@@ -695,6 +697,8 @@ def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
     if evidence.intervals is not None:
         camera = evidence.camera_motion
         given_px, now_px = (median_one_step_px(evidence.sequence, camera, T) for T in (rig.T_imu_cam, T_imu_cam))
+        if now_px > MOST_WORSE * given_px:
+            return None  # a long vehicle: the tracks follow the motion as the arm is given
         summary += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
     remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=T_imu_cam))
     return _WrongUnit(f"{summary}: its translation is in {unit}", remedy)

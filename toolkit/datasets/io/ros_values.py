@@ -6,7 +6,7 @@ baseline; REP 103 (camera axes), REP 104 (rectified images), REP 105 (frames).
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from operator import attrgetter
@@ -357,8 +357,18 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
     stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
     noise = () if twist else (NO_NOISE if stated is None else _STATED,)
     tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
-    notes = (f"calibration from {how} and {tf}", *noise)
+    notes = (f"calibration from {how} and {tf}", *noise, *_unused(*_infos(source)))
     return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)
+
+
+def _unused(topics: Sequence[Topic], infos: Sequence[Any]) -> Iterator[str]:
+    """Yield what calibrations state of a part of the image or of larger pixels, which is not used."""
+    for topic, info in zip(topics, infos, strict=True):
+        region, binned = info.roi, (int(info.binning_x), int(info.binning_y))
+        part = (int(region.width), int(region.height))
+        if max(binned) > 1 or (any(part) and part != _size(info)):
+            stated = f"binning {binned[0]} x {binned[1]}, region of interest {part[0]} x {part[1]} px"
+            yield f"not used of {topic.name}: {stated}; its camera matrix is taken for that of the images as they are"
 
 
 def _not_joined(source: Recorded) -> str:
