@@ -14,8 +14,8 @@ turns, with a dear one every fourth time. Thresholds may be chosen on some draws
 they are. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and
 two by two, as they meet faults, and what any of these comparisons says is a false alarm.
 
-    python benchmarks/status_power.py run 1 runs.jsonl     a line a run; goes on where it was stopped
-    python benchmarks/status_power.py table 1 runs.jsonl   power and false alarms; exit 1 beside the bar
+    python tests/benchmarks/status_power.py run 1 runs.jsonl     a line a run; goes on where it was stopped
+    python tests/benchmarks/status_power.py table 1 runs.jsonl   power and false alarms; exit 1 beside the bar
 
 With --keep DIRECTORY every run is pickled there, and what is there already is evaluated by the code as it is, not run.
 """

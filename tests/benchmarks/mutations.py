@@ -4,8 +4,8 @@ One operator, comparison or number of a module is changed at a time, in a copy o
 function it stands in are run until one fails. A mutant that none of them kills is printed with its line. Survivors are
 to be read: some change nothing (a tolerance, a bound that is never reached), the others name a test that is missing.
 
-    python benchmarks/mutations.py trace TRACE.json [TESTS ...]     once, and whenever the tests change
-    python benchmarks/mutations.py run TRACE.json COUNT [--seed 0] [--modules filters/kalman ...]
+    python tests/benchmarks/mutations.py trace TRACE.json [TESTS ...]     once, and whenever the tests change
+    python tests/benchmarks/mutations.py run TRACE.json COUNT [--seed 0] [--modules filters/kalman ...]
 """
 
 import argparse
@@ -27,7 +27,7 @@ from queue import Queue
 from types import FrameType
 from typing import Any, NamedTuple
 
-PROJECT = Path(__file__).resolve().parents[1]
+PROJECT = Path(__file__).resolve().parents[2]
 MODULES = ("filters", "toolkit/models", "toolkit/metrics")
 TESTS = ("tests/filters", "tests/models", "tests/metrics")
 TRACE_TO = "MUTATIONS_TRACE_TO"

@@ -8,9 +8,9 @@ largest difference of each kind. A difference is measured over max(1, |value|), 
 standard deviations it belongs to. The exit status is 1 where one exceeds the tolerance or an estimator failed, 2 where
 a tree could not be run.
 
-    python benchmarks/same_answers.py REVISION                  both trees, about two runs' time
-    python benchmarks/same_answers.py REVISION --save FILE.npz  run the revision only and keep its answers
-    python benchmarks/same_answers.py --against-saved FILE.npz  run the working tree only, against those
+    python tests/benchmarks/same_answers.py REVISION                  both trees, about two runs' time
+    python tests/benchmarks/same_answers.py REVISION --save FILE.npz  run the revision only and keep its answers
+    python tests/benchmarks/same_answers.py --against-saved FILE.npz  run the working tree only, against those
 """
 
 import argparse
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-PROJECT = Path(__file__).resolve().parents[1]
+PROJECT = Path(__file__).resolve().parents[2]
 CHILD = Path(__file__).with_name("same_answers_child.py")
 SEQUENCES = (
     "kitti00", "0027", "drive", "drive-imu", "drive-realistic", "flight",

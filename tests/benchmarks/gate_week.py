@@ -5,7 +5,7 @@ own code on scores drawn anew: every run's errors are those of its sequence time
 position, rotation and drift alike but for a third of the variance). Four commits of the thirty, drawn at random, make
 every error 5 to 15 % larger, and are taken back before the next one. The bound is 1 %.
 
-    python benchmarks/gate_week.py [WEEKS [RUNS ...]]
+    python tests/benchmarks/gate_week.py [WEEKS [RUNS ...]]
 """
 
 import sys

@@ -1,7 +1,7 @@
 """How well estimators do on real tracks under the measured noise, or under noises that are set.
 
-    python benchmarks/real_tracks.py run results.jsonl [--estimators batch,smart] [--models auto/full] [--seeds 3]
-    python benchmarks/real_tracks.py table results.jsonl
+    python tests/benchmarks/real_tracks.py run results.jsonl [--estimators batch,smart] [--models auto/full] [--seeds 3]
+    python tests/benchmarks/real_tracks.py table results.jsonl
 
 Seven KITTI drives tracked by KLT (folder ``utias`` of the data), whose twists are those of the instrument that gives
 the truth: white noise is added to them, so that there is something to estimate. And drive 0027 of the folder ``ucsd``,

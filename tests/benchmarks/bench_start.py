@@ -4,7 +4,7 @@ Not part of the test run: absolute times belong to a machine. Every row is a pro
 the process did; bytecode is compiled before. A run is three frames of ``drive``: with NumPy, with compiled code that
 was kept, and with `--cold` with nothing kept, which compiles for many seconds.
 
-    python benchmarks/bench_start.py [--repeats 5] [--cold]
+    python tests/benchmarks/bench_start.py [--repeats 5] [--cold]
 """
 
 import argparse

@@ -5,7 +5,7 @@ causal answers it prints mean and standard error of the heading's NEES (the erro
 variance) and of the position's RMSE, this as a ratio to that of `invariant` marginals on the same draw. Runs that did
 not end well are counted; means are over the draws on which all did.
 
-    python benchmarks/marginals_table.py flight 10 --seeds 30 [--first-seed 700] [--states 50]
+    python tests/benchmarks/marginals_table.py flight 10 --seeds 30 [--first-seed 700] [--states 50]
 """
 
 import argparse

@@ -11,10 +11,10 @@ filled up with such as never fail, for they cost power (Holm).
 Intervals are the central 95 % of the rates of pools drawn from the pool (bootstrap over seeds), each with its own
 checks; they hold the chance of the pool as well as of the checks.
 
-    python benchmarks/bench_gate_power.py fill POOL [SEEDS [PROCESSES [ESTIMATOR ...]]]
-    python benchmarks/bench_gate_power.py rates POOL [TESTS [SEEDS_OF_A_CHECK ...]]
-    python benchmarks/bench_gate_power.py turns TIMES REVISION     pairs of times of old and new code in turn
-    python benchmarks/bench_gate_power.py speeds TIMES             what --speed-against sees in them
+    python tests/benchmarks/bench_gate_power.py fill POOL [SEEDS [PROCESSES [ESTIMATOR ...]]]
+    python tests/benchmarks/bench_gate_power.py rates POOL [TESTS [SEEDS_OF_A_CHECK ...]]
+    python tests/benchmarks/bench_gate_power.py turns TIMES REVISION     pairs of times of old and new code in turn
+    python tests/benchmarks/bench_gate_power.py speeds TIMES             what --speed-against sees in them
 """
 
 # ruff: noqa: E402 - the number of threads must be set before NumPy is imported

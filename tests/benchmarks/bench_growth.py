@@ -3,7 +3,7 @@
 Not part of the test run: absolute times belong to a machine. An exponent is the slope of a line through the
 logarithms of processor time, in all (frames) or a frame (all else). Memory is what a run takes above one of two frames.
 
-    python benchmarks/bench_growth.py [tracks] [frames] [window] [landmarks]
+    python tests/benchmarks/bench_growth.py [tracks] [frames] [window] [landmarks]
 """
 
 # ruff: noqa: E402 - the number of threads must be set before NumPy is imported

@@ -6,8 +6,8 @@ that something is wrong: by its status, by its mark (overconfident, timid) or by
 audit that the sound recording has not; what was repaired is no excuse for an error. What must not be is a cell above
 the limit without brackets.
 
-    python benchmarks/fault_table.py                    drive and flight, about ten minutes on one core
-    python benchmarks/fault_table.py 0027.npz --truth 0027.tum --estimators ekf,batch
+    python tests/benchmarks/fault_table.py                    drive and flight, about ten minutes on one core
+    python tests/benchmarks/fault_table.py 0027.npz --truth 0027.tum --estimators ekf,batch
 """
 
 import argparse
