@@ -14,7 +14,7 @@ from toolkit.estimator import Build
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.experiment.stretches import drift_over_stretches, held_out_over_stretches, no_stretches
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics import Evaluation, Scores, repeated, score_run
+from toolkit.metrics import Evaluation, Scores, repeated, scores_of
 from toolkit.metrics.parts.consistency import body_errors, nees_over_time, nis_over_time
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.progress import Progress
@@ -167,8 +167,7 @@ def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, 
         except Unavailable:
             pass  # the scores have the reason
         drift_m, heldout_px = drift_over_stretches(evaluation), held_out_over_stretches(evaluation)
-    scores = score_run(run, output, sequence, requested)
-    return Scored(scores, nees_pose, position_m, _nis_dof(evaluation), drift_m, heldout_px)
+    return Scored(scores_of(evaluation, requested), nees_pose, position_m, _nis_dof(evaluation), drift_m, heldout_px)
 
 
 def _nis_dof(evaluation: Evaluation) -> float | None:

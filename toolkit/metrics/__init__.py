@@ -38,6 +38,7 @@ __all__ = [
     "repeated",
     "requests_of",
     "score_run",
+    "scores_of",
     "unavailable",
     "without_requests",
 ]
@@ -180,7 +181,12 @@ def score_run(run: Run, output: Output, sequence: Sequence, requested: Collectio
     ExtensionError where a file scores other keys than it declares; an error inside a metric is a defect and passes
     through.
     """
-    evaluation, scores = Evaluation(run, output, sequence), Scores({})
+    return scores_of(Evaluation(run, output, sequence), requested)
+
+
+def scores_of(evaluation: Evaluation, requested: Collection[str] = ()) -> Scores:
+    """Score what is evaluated, as :func:`score_run` does; what the evaluation has computed already is used."""
+    scores = Scores({})
     with np.errstate(all="ignore"):  # a diverged run may overflow; the value is then None with its reason
         for file in _files():
             scores |= file.scored(evaluation, requested)
