@@ -74,7 +74,7 @@ def test_a_result_is_saved_and_a_recording_and_its_truth_are_paths_or_strings(tm
     for recording, file in ((RECORDING, truth), (str(RECORDING), str(truth))):
         compared = toolkit.compare(recording, "dead-reckoning", truth=file, max_frames=FRAMES, workers=1).comparison
         assert compared.sequence.truth is not None
-        assert compared.sequence.truth.t_ns.tolist() == load_truth(truth).t_ns.tolist()
+        assert compared.sequence.truth.t_ns.tolist() == load_truth(truth).truth.t_ns.tolist()
 
 
 def test_estimators_are_one_name_several_or_the_default_ones(result: Result) -> None:
