@@ -27,7 +27,7 @@ GROUP = "uncertainty"
 REGIONS_PERCENT = (50, 90, 95)
 _BLOCKS = {"pose": ("the pose", 6), "ori": ("the orientation", 3), "pos": ("the position", 3)}
 _SHORT = {"pose": "pose", "ori": "rot", "pos": "pos"}
-# Nodes of the quadrature: it is exact to 1e-9 for standard deviations that differ a thousandfold.
+# Nodes of the quadrature: exact to 1e-12, and to some 1e-9 where standard deviations differ a thousandfold.
 _NODES = 96
 METRICS = (
     *(
