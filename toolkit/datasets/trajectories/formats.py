@@ -553,6 +553,8 @@ def _unit_ns(stamps: Array) -> int:
 
 def _begins_with_row_numbers(rows: Rows) -> bool:
     """Say whether the first column counts the rows, and the second increases as stamps do."""
+    if rows.cells[0][0].partition(".")[0] not in ("0", "1"):
+        return False
     try:
         first, second = np.array([[float(cell) for cell in cells[:2]] for cells in rows.cells]).T
     except ValueError:
