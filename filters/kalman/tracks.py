@@ -254,7 +254,7 @@ def _corrected(joint: JointBelief, root: Array, matrix: Array, vector: Array) ->
     core = joint.core
     to_core = divided_by_root(root, joint.cov[joint.clone_columns, : core.layout.size].copy())
     matrix.flat[:: len(matrix) + 1] += 1.0
-    halves = divided_by_root(cholesky_root(matrix), np.column_stack([to_core, vector]))
+    halves = divided_by_root(cholesky_root(matrix), np.concatenate([to_core, vector[:, None]], axis=1))
     half = halves[:, :-1]
     delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
     moved = core.displaced(delta, se3_exp(delta[POSE]))
