@@ -168,6 +168,10 @@ def explain(
     """
     given = dict(options)
     own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
+    if own:
+        raise SettingsError(
+            "own has functions, which cannot say what they have; give the path of a file with INGREDIENTS"
+        )
     usual = default_ends() if None in (start, goal) else ("", "")
     plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, own, settings, given)
     return ExplainResult(run_explanation(plan, str(start or usual[0]), str(goal or usual[1]), kept))

@@ -40,7 +40,10 @@ from toolkit.errors import printable
     WORKERS,
     SCHEDULER,
     output("what explain.json holds, no table", "the run directory has everything"),
-    examples=("vislam explain drive --from ekf --to ekf-slam --seeds 3 --until 3s --out runs/why",),
+    examples=(
+        "vislam explain drive --from ekf --to ekf-slam --until 3s --estimators ekf,ekf-slam --out runs/why",
+        "vislam report runs/why",
+    ),
 )
 def explain(options: argparse.Namespace) -> int:
     """Run what lies between two estimators on one recording, and say what each ingredient in which they differ brings:

@@ -219,7 +219,7 @@ def _shown(found: ExplanationRecord) -> Iterator[str]:
     parts = [part for part in found.parts if _is_shown(part)]
     for i, part in enumerate(parts):
         name = part.ingredient.capitalize() + (", the largest effect" if i == 0 and len(parts) > 1 else "")
-        clauses = [_clause(one, kind) for kind, one in kinds(found, part)]
+        clauses = [_clause(one, kind) for _, kind, one in placed(found, part)]
         yield f"{name}: {'; '.join(clauses)}{'; the order matters' if part.order_matters else ''}."
 
 
@@ -227,13 +227,14 @@ def _is_shown(part: IngredientRecord) -> bool:
     return any(one.shown for one in part.effects)
 
 
-def kinds(found: ExplanationRecord, part: IngredientRecord) -> Iterator[tuple[Kind, ContributionRecord]]:
-    """Yield the effects of an ingredient, each with what is done there: it is added to one or taken from another."""
-    if len(part.effects) == 1:
-        yield "taken" if part.effects[0].more == found.gap.more else "added", part.effects[0]
-    elif part.effects:
-        yield "added", part.effects[0]
-        yield "taken", part.effects[1]
+def placed(found: ExplanationRecord, part: IngredientRecord) -> Iterator[tuple[bool, Kind, ContributionRecord]]:
+    """Yield the effects of an ingredient: whether it tells of the second estimator, what is done there, and the effect.
+
+    It is taken from an estimator that has it; as near to the first as there is a pair it is added, else taken away.
+    """
+    for i, effect in enumerate(part.effects):
+        of_second = i == 1 or (len(part.effects) == 1 and effect.more == found.gap.more)
+        yield of_second, "taken" if of_second or effect.more == found.gap.less else "added", effect
 
 
 def where(kind: Kind, effect: ContributionRecord) -> str:
@@ -260,7 +261,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
         does = "seems to have an effect" if len(likely) == 1 else "seem to have effects"
         count = sum(len(part.effects) for part in found.parts)
         these = _listed(likely)
-        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance: more runs tell."
+        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance: more data would tell."
     if rest := [part for part in silent if part not in likely]:
         yield f"Nothing that {over(found)} can show is brought by {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
@@ -286,7 +287,7 @@ def explanation_table(found: ExplanationRecord) -> Table:
     keys = [key for key in names if any(getattr(one, key) for one in effects)]
     rows = [("all of it", f"from {found.gap.less} to {found.gap.more}", *_cells(found.gap, keys))]
     for part in found.parts:
-        for i, (kind, one) in enumerate(kinds(found, part)):
+        for i, (_, kind, one) in enumerate(placed(found, part)):
             rows.append(("" if i else part.ingredient, where(kind, one), *_cells(one, keys)))
         if not part.effects:
             rows.append((part.ingredient, "no two differ in it alone", *(MISSING for _ in keys)))

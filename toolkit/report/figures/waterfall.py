@@ -4,11 +4,11 @@ what the second loses without it.
 
 import math
 from collections.abc import Iterator
-from typing import Literal
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
 
-from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, kinds, where
+from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, placed, where
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
@@ -20,15 +20,35 @@ from toolkit.report.figures.style import (
 )
 from toolkit.report.text import number
 
-_FIRST, _LAST = "#0072B2", "#D55E00"
-_COLOUR_OF = {"from": "#5b6670", "added": _FIRST, "taken": _LAST}
+_FIRST, _LAST, _WHOLE = "#0072B2", "#D55E00", "#5b6670"
 # Bars of effects that may be chance are pale.
 _PALE = 0.3
 _ROW_IN, _AROUND_IN, _BAR = 0.46, 0.9, 0.38
-# The axis has room for this part of the gap, and at least a factor of this size, on either side.
-_ROOM, _LEAST_ROOM = 0.35, math.log(1.3)
+# The axis has this room on either side of the bars, which it cuts where they reach further than the second.
+_ROOM, _MOST = math.log(1.25), math.log(30.0)
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 _FINE_TICKS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.6, 1.8, 2.0)
+
+
+class _Bar(NamedTuple):
+    """A bar: its row, colour, the line that it starts from, its effect and what is done there.
+
+    It goes to the left where an ingredient is taken away.
+    """
+
+    row: float
+    colour: str
+    start: float
+    effect: ContributionRecord
+    kind: Kind | None
+
+    @property
+    def ends(self) -> tuple[float, float, float]:
+        """Return where the bar ends, and its interval."""
+        one, sign = self.effect.error, -1.0 if self.kind == "taken" else 1.0
+        assert one is not None
+        end, *interval = (self.start + sign * math.log(value) for value in (one.factor, one.low, one.high))
+        return end, min(interval), max(interval)
 
 
 def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
@@ -37,11 +57,16 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
     if whole is None:
         return
     parts, gap = [part for part in found.parts if part.effects], math.log(whole.factor)
+    bars = [_Bar(0.0, _WHOLE, 0.0, found.gap, None)]
+    for row, part in enumerate(parts, start=1):
+        top = row - 0.5 * _BAR * (len(part.effects) - 1)
+        for k, (of_second, kind, effect) in enumerate(placed(found, part)):
+            bars.append(_Bar(top + k * _BAR, *((_LAST, gap) if of_second else (_FIRST, 0.0)), effect, kind))
     figure = new_figure(_AROUND_IN + _ROW_IN * (1 + len(parts)))
-    axes, words = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 0.9))
-    least, most = min(0.0, gap), max(0.0, gap)
-    room = max(_ROOM * (most - least), _LEAST_ROOM)
-    axes.set_xlim(least - room, most + room)
+    axes, words = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.0))
+    ends = [0.0, gap, *(bar.ends[0] for bar in bars if bar.effect.error is not None)]
+    least, most = (min(max(end, min(0.0, gap) - _MOST), max(0.0, gap) + _MOST) for end in (min(ends), max(ends)))
+    axes.set_xlim(least - _ROOM, most + _ROOM)
     axes.set_ylim(len(parts) + 0.6, -0.7)
     style_axes(axes, "", f"times as accurate as {start}", "")
     _log_ticks(axes)
@@ -50,39 +75,36 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
         axes.axvline(at, color=colour, linewidth=1.0)
         axes.annotate(
             name, (at, 1.0), (0.0, 3.0), xycoords=("data", "axes fraction"), textcoords="offset points",
-            color=colour, fontsize=TICK_PT, ha="right" if at == least else "left",
+            color=colour, fontsize=TICK_PT, ha="right" if at == min(0.0, gap) else "left",
         )  # fmt: skip
     words.axis("off")
     words.set_xlim(0.0, 1.0)
-    _effect(axes, words, 0.0, found.gap, "from", 0.0)
-    for row, part in enumerate(parts, start=1):
-        for k, (kind, effect) in enumerate(kinds(found, part)):
-            place = row + (k - 0.5 * (len(part.effects) - 1)) * _BAR
-            _effect(axes, words, place, effect, kind, gap if kind == "taken" else 0.0)
+    for bar in bars:
+        _draw(axes, words, bar)
     yield NamedFigure(
         "waterfall",
-        f"What each ingredient brings {start} (blue, from the left) and what {goal} loses without it (orange, from the "
-        "right), or the pairs of estimators nearest to them, with 95 % intervals; pale: no more than chance. The bars "
-        "need not add up.",
+        f"What each ingredient brings {start} or the pair of estimators nearest to it (blue, to the right where it is "
+        f"added, to the left where it is taken away), and what {goal} loses without it, or the pair nearest to that "
+        "(orange), with 95 % intervals; pale: no more than chance. The bars need not add up.",
         figure,
     )
 
 
-def _effect(
-    axes: Axes, words: Axes, row: float, effect: ContributionRecord, kind: Kind | Literal["from"], start: float
-) -> None:
-    """Draw a bar with its interval, to the left where an ingredient is taken away, and say beside it what it is."""
-    one, sign = effect.error, -1.0 if kind == "taken" else 1.0
+def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
+    """Draw a bar with its interval, and say beside it what it is."""
+    one, effect = bar.effect.error, bar.effect
     told = f"{effect.ok} of {effect.runs} ended well"
-    is_sure = effect.shown or (kind == "from" and one is not None and one.is_off)
+    is_sure = effect.shown or (bar.kind is None and one is not None and one.is_off)
     if one is not None:
-        width, *ends = (sign * math.log(value) for value in (one.factor, one.low, one.high))
-        axes.barh(row, width, _BAR, start, color=_COLOUR_OF[kind], alpha=1.0 if is_sure else _PALE)
-        axes.plot([start + end for end in ends], [row, row], color="black", linewidth=1.0, marker="|", markersize=5.0)
+        end, *interval = bar.ends
+        axes.barh(bar.row, end - bar.start, _BAR, bar.start, color=bar.colour, alpha=1.0 if is_sure else _PALE)
+        axes.plot(interval, [bar.row, bar.row], color="black", linewidth=1.0, marker="|", markersize=5.0)
         told = f"{number(one.factor)} ({number(one.low)}-{number(one.high)})"
-    words.text(0.0, row, told, fontsize=SMALL_PT, color=_COLOUR_OF[kind] if is_sure else MUTED_COLOUR, va="center")
-    told = "" if kind == "from" else where(kind, effect)
-    words.text(0.36, row, told, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
+    colour = bar.colour if is_sure else MUTED_COLOUR
+    words.text(0.0, bar.row, told, fontsize=SMALL_PT, color=colour, va="center")
+    if bar.kind is not None:
+        at = where(bar.kind, effect)
+        words.text(0.38, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
 
 
 def _log_ticks(axes: Axes) -> None:
