@@ -21,7 +21,7 @@ from toolkit.geometry import Array
 
 CHANGES_PERCENT = (5.0, 10.0, 20.0)
 WANTED, MOST_RUNS = 0.9, 200
-_QUANTILES = (np.arange(40) + 0.5) / 40.0
+_QUANTILES = (np.arange(20) + 0.5) / 20.0
 
 
 @dataclass(frozen=True)
@@ -87,5 +87,6 @@ def _chances(excess: Array, counts: Array, one_run: float, known: float, sequenc
     dof = 2.0 * (counts - 1.0) * sequences
     limit = stdtrit(dof, 1.0 - rate)
     shift = excess[:, None, None] / (errors[None, None, :] / np.sqrt(counts)[None, :, None])
-    missed = nctdtr(dof[None, :, None], shift, limit[None, :, None])
+    # Farther from the limit the chance to miss is none, and the function has no value.
+    missed = nctdtr(dof[None, :, None], np.minimum(shift, 30.0), limit[None, :, None])
     return np.where(excess[:, None] > 0.0, 1.0 - missed.mean(axis=-1), 0.0)
