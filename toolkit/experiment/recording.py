@@ -356,6 +356,8 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
         return sequence
     thinned = replace(sequence, track_budget=budget)
     given = len(thinned.visible) / max(len(sequence.visible), 1)
+    if given == 1.0:
+        return sequence
     fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
     facts = (*sequence.provenance.facts, fact)
     return replace(thinned, provenance=replace(sequence.provenance, facts=facts))

@@ -174,7 +174,7 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
     budget: Annotated[
         Annotated[int, Meta(ge=10, le=10_000)] | None,
         _about("most tracks a frame that estimators get, spread over image and depth, the oldest first", none="all"),
-    ] = None
+    ] = 200
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
