@@ -1,6 +1,7 @@
 """The contract of every metric file, and the keys that metrics.json promises."""
 
 import re
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from toolkit import metrics
 from toolkit.answers import Run, Timings
 from toolkit.estimate import Landmarks, Trajectory
+from toolkit.evaluation.against_baseline import Align, scored_metrics
+from toolkit.evaluation.scoring import TIME_COVERAGE
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS
 from toolkit.geometry import se3
 from toolkit.measurements import StereoRig, TwistNoise
@@ -80,6 +83,8 @@ def test_no_two_columns_have_the_same_name():
 
 def test_every_metric_the_gate_checks_has_a_name_there():
     checked = {COVERAGE, *DEFAULT_BOUNDS.simulated, *DEFAULT_BOUNDS.recorded}
+    for align in get_args(Align):
+        checked |= {key for key in scored_metrics(align) if key != TIME_COVERAGE}
     assert checked == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
 
 

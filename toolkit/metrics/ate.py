@@ -50,6 +50,7 @@ METRICS = (
         "RMSE of position after fitting rotation, translation and scale (m)",
         "m",
         ("ATE", "Sim(3)"),
+        gate_name="position error (ATE, Sim(3))",
         in_contract=True,
     ),
     Metric(
