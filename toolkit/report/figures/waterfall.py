@@ -104,7 +104,7 @@ def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
     words.text(0.0, bar.row, told, fontsize=SMALL_PT, color=colour, va="center")
     if bar.kind is not None:
         at = where(bar.kind, effect)
-        words.text(0.38, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
+        words.text(0.43, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
 
 
 def _log_ticks(axes: Axes) -> None:
