@@ -108,7 +108,8 @@ def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
         in words
     )
     assert "What tea brings cannot be measured: no two estimators differ in that alone." in words
-    assert "Oil (1.14 to 1.26) seems to have an effect; among 3 tests that may be chance" in words
+    assert "Perhaps the error is smaller with oil (1.14 to 1.26); among 3 tests that may be chance" in words
+    assert "need not multiply to the whole" in words
     assert [row[:3] for row in explanation_table(found).rows if row[0] in ("pepper", "tea")] == [
         ("pepper", "added to a", "2 of 8 ok"),
         ("tea", "no two differ in it alone", "-"),

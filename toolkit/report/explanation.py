@@ -183,7 +183,7 @@ def _factor_record(one: Paired) -> FactorRecord:
 
 def in_words(found: ExplanationRecord) -> str:
     """Return an explanation in plain sentences, which call only that an effect which is more than chance."""
-    return " ".join([_gap(found), *_shown(found), *_not_shown(found)])
+    return " ".join([_gap(found), *_shown(found), *_not_shown(found), *_beside(found)])
 
 
 def _gap(found: ExplanationRecord) -> str:
@@ -219,7 +219,7 @@ def _shown(found: ExplanationRecord) -> Iterator[str]:
     parts = [part for part in found.parts if _is_shown(part)]
     for i, part in enumerate(parts):
         name = part.ingredient.capitalize() + (", the largest effect" if i == 0 and len(parts) > 1 else "")
-        clauses = [_clause(one, kind) for _, kind, one in placed(found, part)]
+        clauses = [_clause(one, kind, _tests(found)) for _, kind, one in placed(found, part)]
         yield f"{name}: {'; '.join(clauses)}{'; the order matters' if part.order_matters else ''}."
 
 
@@ -242,7 +242,12 @@ def where(kind: Kind, effect: ContributionRecord) -> str:
     return f"added to {effect.less}" if kind == "added" else f"taken from {effect.more}"
 
 
-def _clause(effect: ContributionRecord, kind: Kind) -> str:
+def _tests(found: ExplanationRecord) -> int:
+    """Return how many effects on the error are tested together."""
+    return sum(len(part.effects) for part in found.parts)
+
+
+def _clause(effect: ContributionRecord, kind: Kind, tests: int) -> str:
     at = where(kind, effect)
     if effect.error is None:
         return f"{at}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
@@ -250,22 +255,43 @@ def _clause(effect: ContributionRecord, kind: Kind) -> str:
         return f"{at}, nothing is shown ({effect.error.range()})"
     change = effect.error.inverse() if kind == "added" else effect.error
     size, by = ("larger", change) if change.factor > 1.0 else ("smaller", change.inverse())
-    becomes = "the error becomes" if effect.shown else "the error may become (chance is not excluded)"
-    return f"{at}, {becomes} {number(by.factor, _DIGITS)} times {size} ({by.range()})"
+    change_told = f"{number(by.factor, _DIGITS)} times {size} ({by.range()})"
+    if effect.shown:
+        return f"{at}, the error becomes {change_told}"
+    return f"{at}, it seems to become {change_told}, which may be chance among {tests} tests"
 
 
 def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     """Yield what may be chance, of which some look like more where they are tested alone, and what is not known."""
     silent = [part for part in found.parts if part.effects and not _is_shown(part)]
     if likely := [part for part in silent if any(one.error and one.error.is_off for one in part.effects)]:
-        does = "seems to have an effect" if len(likely) == 1 else "seem to have effects"
-        count = sum(len(part.effects) for part in found.parts)
-        these = _listed(likely)
-        yield f"{these[:1].upper()}{these[1:]} {does}; among {count} tests that may be chance: more data would tell."
+        for size, of in (("smaller", _helps), ("larger", _harms)):
+            if some := [part for part in likely if of(part)]:
+                chance = f"among {_tests(found)} tests that may be chance: more data would tell"
+                yield f"Perhaps the error is {size} with {_listed(some)}; {chance}."
     if rest := [part for part in silent if part not in likely]:
         yield f"Nothing that {over(found)} can show is brought by {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
         yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
+
+
+def _beside(found: ExplanationRecord) -> Iterator[str]:
+    """Yield how effects must not be read, where more than one is told."""
+    if found.gap.error is not None and _tests(found) > 1:
+        yield (
+            "Bare ranges are of the error without an ingredient over that with it, near the former estimator and near "
+            "the latter; each effect holds beside what else the estimators there have, so they need not multiply to "
+            "the whole."
+        )
+
+
+def _helps(part: IngredientRecord) -> bool:
+    """Say whether what looks like more than chance of an ingredient makes the error smaller with it."""
+    return any(one.error is not None and one.error.low > 1.0 for one in part.effects)
+
+
+def _harms(part: IngredientRecord) -> bool:
+    return not _helps(part)
 
 
 def _listed(parts: Sequence[IngredientRecord]) -> str:
