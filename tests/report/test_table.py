@@ -24,6 +24,7 @@ from toolkit.report.comparison_table import (
     explained_metrics,
     header_lines,
     noise_line,
+    rules_line,
     shown_metrics,
 )
 from toolkit.report.comparison_text import comparison_text, report_text
@@ -60,6 +61,13 @@ def test_pairs_and_coverage_that_all_rows_share_stand_above_the_table(shared_by_
     same = shared_by_all(pairs=120.0, coverage_percent=97.5)
     assert comparison_text(same).splitlines()[1] == "scored: coverage 97.5 %, pairs 120"
     assert "pairs" not in as_text(comparison_table(same))
+
+
+def test_a_budget_of_tracks_that_leaves_some_out_stands_above_the_table(comparison: Comparison) -> None:
+    assert "tracks a frame" not in rules_line(comparison)
+    limited = replace(comparison, sequence=replace(comparison.sequence, track_budget=12))
+    visible = len(comparison.sequence.visible) / comparison.sequence.frame_count
+    assert f"at most 12 of {visible:.0f} tracks a frame" in rules_line(limited)
 
 
 def test_a_mark_stands_below_how_the_run_ended_and_beside_it_in_markdown() -> None:

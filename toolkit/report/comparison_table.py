@@ -4,6 +4,7 @@ Which metrics have a column by default is in the metrics' records (:mod:`toolkit
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -157,17 +158,24 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
 
 
 def rules_line(comparison: Comparison) -> str:
-    """Return the rules that estimators had in common: the window, whether its cap binds, the outlier policy."""
+    """Return the rules that estimators had in common: the window, whether its cap binds, outliers, budget of tracks."""
     settings, sequence = comparison.settings, comparison.sequence
     window = settings.window
     left_out = _left_out(sequence, window)
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
+    budget = sequence.track_budget
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outlier_summary(settings.outliers)}"
+        f"{'' if budget is None else f'; at most {budget} of {_visible_a_frame(sequence):.0f} tracks a frame'}"
         f"{'' if settings.noise.bridge_gaps else '; gaps between tracks not bridged'}"
         f"{'; started from the truth' if settings.start == 'truth' else ''}"
     )
+
+
+def _visible_a_frame(sequence: Sequence) -> float:
+    """Return how many of its tracks estimators could be given, in the mean over the frames."""
+    return len(replace(sequence, track_budget=None).visible) / sequence.frame_count
 
 
 _MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
