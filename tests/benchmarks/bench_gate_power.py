@@ -36,10 +36,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import gate_pool
 
+from toolkit.experiment.statistics import holm
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
 from toolkit.gate.case_check import changed_metrics
-from toolkit.gate.significance import Pairs, Where, holm
+from toolkit.gate.significance import Pairs, Where
 from toolkit.progress import silent
 
 CASES = {"flight": 2.5, "drive": 25.0}

@@ -85,8 +85,8 @@ def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted: st
         for effect in (part.first, part.last):
             assert effect is not None
             assert effect.on_error is not None
-            one, direct = effect.on_error, PLANTED[planted] if part.ingredient == planted else 0.0
-            assert one.low <= direct <= one.high, part.ingredient
+            (_, low, high), direct = effect.on_error.interval, PLANTED[planted] if part.ingredient == planted else 0.0
+            assert low <= direct <= high, part.ingredient
             assert effect.shown == (part.ingredient == planted)
 
 

@@ -5,8 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from toolkit.experiment.statistics import paired_p
-from toolkit.gate.significance import holm, smallest_detectable
+from toolkit.experiment.statistics import holm, paired_p
+from toolkit.gate.significance import smallest_detectable
 
 
 @pytest.mark.parametrize("n", [2, 5, 24, 400])

@@ -20,11 +20,10 @@ from toolkit.answers import Status
 from toolkit.errors import DataError, one_line
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
-from toolkit.experiment.statistics import quantiles_of_all
+from toolkit.experiment.statistics import holm, quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE
-from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric, Scores
 from toolkit.progress import SILENT, Progress

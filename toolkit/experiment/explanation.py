@@ -21,11 +21,10 @@ import numpy as np
 from toolkit.errors import EstimatorError
 from toolkit.experiment.comparison import NEES, Row
 from toolkit.experiment.contests import HELD_OUT, accuracy_of
-from toolkit.experiment.grid import Grid, run_grid
+from toolkit.experiment.grid import Grid, prepared_case, run_grid
 from toolkit.experiment.ingredients import Edge, Pairings, Variant, compared, variants_of
 from toolkit.experiment.pipeline import Plan
-from toolkit.experiment.recording import prepare
-from toolkit.experiment.statistics import Paired, holm
+from toolkit.experiment.statistics import LEVEL, Paired, holm
 from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.progress import ProgressFor, silent
@@ -112,14 +111,14 @@ def run_explanation(
     Steps between the two are variants of the plan's estimators. Outcomes are kept in a directory and found there again.
     Raises as :func:`toolkit.experiment.grid.run_grid` and :func:`toolkit.experiment.ingredients.compared` do.
     """
-    ends = find_all((start, goal))
     steps = {name: one for name, one in find_all(plan.estimators).items() if _is_usable(one)}
+    entries = {**find_all((start, goal)), **steps}
     settings = msgspec.structs.replace(plan.settings, metrics=Metrics(bound=len(plan.seeds) > 1))
-    plan = replace(plan, settings=settings)
-    case = prepare(plan.recording(plan.sources[0], plan.seeds[0]))
-    variants = [one for entry in {**ends, **steps}.values() for one in variants_of(entry, settings, case)]
+    plan = replace(plan, settings=settings, estimators=tuple(entry.word for entry in entries.values()))
+    case = prepared_case(plan, progress_for)
+    variants = [one for entry in entries.values() for one in variants_of(entry, settings, case)]
     found = compared(find(start).name, find(goal).name, variants)
-    return explained(found, run_grid(plan, {one.trial: None for one in _all(found)}, directory, progress_for))
+    return explained(found, run_grid(plan, {one.trial: None for one in _all(found)}, directory, progress_for, case))
 
 
 def default_ends() -> tuple[str, str]:
@@ -187,8 +186,8 @@ def _tested(effects: Mapping[Edge, Contribution]) -> dict[Edge, Contribution]:
 def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:
     """Return those of several differences that are more than chance."""
     known = {key: one for key, one in tests.items() if one is not None}
-    found = holm(one.p for one in known.values())
-    return {key: one for (key, one), is_found in zip(known.items(), found, strict=True) if is_found}
+    adjusted = holm(np.array([one.p for one in known.values()])).tolist()
+    return {key: one for (key, one), p in zip(known.items(), adjusted, strict=True) if p <= LEVEL}
 
 
 def _size(part: Ingredient) -> float:

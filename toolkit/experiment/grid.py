@@ -18,6 +18,7 @@ from toolkit.experiment.outcome_store import NOWHERE, settings_of_a_run
 from toolkit.experiment.pipeline import Job, Plan, located, outcomes_of, prepared_cases, store_of, workers_of
 from toolkit.experiment.recording import WHOLE, Prepared
 from toolkit.experiment.units import Outcome, Unit
+from toolkit.experiment.workers import Workers
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import EstimatorEntry, check_options, find
 from toolkit.settings import Scalar, SettingsError, as_values
@@ -97,18 +98,32 @@ class Grid:
                     yield GridRecord(*about, "final", "", None, one.status)
 
 
-def run_grid(
-    plan: Plan, trials: Iterable[Trial], directory: Path | None = None, progress_for: ProgressFor = silent
-) -> Grid:
-    """Run trials on the plan's one source under its seeds; outcomes are kept in a directory and found there again.
+def prepared_case(plan: Plan, progress_for: ProgressFor = silent) -> Prepared:
+    """Make the plan's one source ready under its first seed.
 
-    Raises SettingsError, EstimatorError or DataError where a trial or the recording cannot be used, before any run.
+    Raises SettingsError, EstimatorError or DataError where there is not one, or it cannot be used.
     """
     if len(plan.sources) != 1:
         raise SettingsError(f"{len(plan.sources)} sequences are given; a grid of experiments is on one")
+    (case,) = prepared_cases(plan, Workers(1), progress_for)  # a single one is prepared in this process
+    return case
+
+
+def run_grid(
+    plan: Plan,
+    trials: Iterable[Trial],
+    directory: Path | None = None,
+    progress_for: ProgressFor = silent,
+    case: Prepared | None = None,
+) -> Grid:
+    """Run trials on the plan's one source under its seeds; outcomes are kept in a directory and found there again.
+
+    ``case`` is the source under the first seed, where it is ready already. Raises SettingsError, EstimatorError or
+    DataError where a trial or the recording cannot be used, before any run.
+    """
     plans = {trial: _plan_of(plan, trial) for trial in trials}
     with workers_of(plan) as workers:
-        (case,) = prepared_cases(plan, workers, progress_for)
+        case = case or prepared_case(plan, progress_for)
         for faults in dict.fromkeys(trial.faults for trial in plans):
             planted(case.sequence, faults, plan.seeds[0])
         with closing(NOWHERE if directory is None else store_of(plan, case, directory)) as store:

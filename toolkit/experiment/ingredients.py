@@ -19,6 +19,7 @@ from toolkit.experiment.grid import Trial
 from toolkit.experiment.recording import Prepared
 from toolkit.registry import EstimatorEntry
 from toolkit.settings import Scalar, Settings, as_values
+from toolkit.settings.reading import value_at
 
 GATE, NOISE, FUTURE = "gate and loss", "measured noise", "the future"
 OUTPUT, _REPAIR = "output", "repair of "
@@ -98,13 +99,7 @@ def _full_keys(estimator: str, taking: Mapping[str, Scalar]) -> dict[str, Scalar
 
 def _are_set(values: Mapping[str, Any], taking: Mapping[str, Scalar]) -> bool:
     """Say whether all settings of one ingredient have the values already that take it away."""
-    return all(_value_at(values, key) == value for key, value in taking.items())
-
-
-def _value_at(values: Any, key: str) -> object:
-    for part in key.split("."):
-        values = values.get(part) if isinstance(values, Mapping) else None
-    return values
+    return all(value_at(values, key) == value for key, value in taking.items())
 
 
 def _shared(values: Mapping[str, Any], case: Prepared) -> dict[str, Mapping[str, Scalar]]:
@@ -112,7 +107,7 @@ def _shared(values: Mapping[str, Any], case: Prepared) -> dict[str, Mapping[str,
     found: dict[str, Mapping[str, Scalar]] = {}
     measured = case.measured
     if measured is not None and (measured.tracks.value, measured.motion.value) != (1.0, 1.0):
-        found[NOISE] = {key: value for key, value in _STATED.items() if _value_at(values, key) == "auto"}
+        found[NOISE] = {key: value for key, value in _STATED.items() if value_at(values, key) == "auto"}
     return found | {f"{_REPAIR}{one.fault}": {} for one in case.findings if one.repaired}
 
 

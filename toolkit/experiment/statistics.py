@@ -58,7 +58,7 @@ class QuantilesOfAll:
 
 
 # Level of the test (false alarms for equal estimators), and power to be reached with enough seeds.
-_LEVEL, _POWER = 0.05, 0.9
+LEVEL, _POWER = 0.05, 0.9
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,10 @@ class Paired:
     error: float
 
     @property
-    def low(self) -> float:
-        """Return the lower end of the 95 % interval of the mean, by Student's t."""
-        return self.mean - float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
-
-    @property
-    def high(self) -> float:
-        """Return the upper end of that interval."""
-        return 2.0 * self.mean - self.low
+    def interval(self) -> "Interval":
+        """Return the mean with its 95 % interval by Student's t."""
+        reach = float(stdtrit(self.n - 1, 1.0 - LEVEL / 2.0)) * self.error
+        return Interval(self.mean, self.mean - reach, self.mean + reach)
 
     @property
     def p(self) -> float:
@@ -89,14 +85,15 @@ class Paired:
     @property
     def is_significant(self) -> bool:
         """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
-        return abs(self.mean) > float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
+        _, low, high = self.interval
+        return not low <= 0.0 <= high
 
     @property
     def seeds_needed(self) -> float:
         """Return how many seeds tell a difference as large as this apart with 90 % chance; infinite for none."""
         if self.mean == 0.0:
             return math.inf
-        quantiles = float(ndtri(1.0 - _LEVEL / 2.0) + ndtri(_POWER))
+        quantiles = float(ndtri(1.0 - LEVEL / 2.0) + ndtri(_POWER))
         return self.n * (quantiles * self.error / self.mean) ** 2
 
 
@@ -109,18 +106,19 @@ def paired(one: Iterable[float | None], other: Iterable[float | None]) -> Paired
     return Paired(given.size, float(given.mean()), float(standard_error(given)))
 
 
-def holm(p: Iterable[float], level: float = _LEVEL) -> list[bool]:
-    """Say which of several tests find something, so that the chance of any false finding is at most ``level``.
+def holm(p_values: Array) -> Array:
+    """Return Holm's adjusted p-values (..., m): those at most ``rate`` are rejected with that family-wise rate.
 
-    The step-down test of Holm, "A simple sequentially rejective multiple test procedure" (Scand. J. Statist. 6, 1979).
+    Of m true null hypotheses one or more is rejected with at most that probability, however the tests depend on each
+    other: the k-th smallest p-value counts (m - k + 1) fold, and none counts less than a smaller one.
     """
-    given = list(p)
-    found = [False] * len(given)
-    for rank, i in enumerate(sorted(range(len(given)), key=given.__getitem__)):
-        if not given[i] <= level / (len(given) - rank):
-            break
-        found[i] = True
-    return found
+    given = np.asarray(p_values, dtype=float)
+    order = np.argsort(given, axis=-1)
+    weights = np.arange(given.shape[-1], 0, -1)
+    stepped = np.maximum.accumulate(np.take_along_axis(given, order, axis=-1) * weights, axis=-1)
+    adjusted = np.empty_like(given)
+    np.put_along_axis(adjusted, order, np.minimum(stepped, 1.0), axis=-1)
+    return adjusted
 
 
 def paired_p(differences: Array, margin: float | Array = 0.0) -> Array:
@@ -164,17 +162,12 @@ def mean_interval(values: Array) -> Interval:
     mean = float(np.mean(values))
     if len(values) < 2:
         return Interval(mean, -math.inf, math.inf)
-    return _within(mean, float(standard_error(np.asarray(values))), len(values))
+    return Paired(len(values), mean, float(standard_error(np.asarray(values)))).interval
 
 
 def jackknife_interval(estimate: Callable[..., float], *rows: Array) -> Interval:
     """Return an estimate from arrays (M, ...) in order of time, with its interval by :mod:`toolkit.jackknife`."""
-    return _within(estimate(*rows), jackknife_error(estimate, *rows), STRETCHES)
-
-
-def _within(value: float, error: float, count: int) -> Interval:
-    reach = float(stdtrit(count - 1, 1.0 - _LEVEL / 2.0)) * error
-    return Interval(value, value - reach, value + reach)
+    return Paired(STRETCHES, estimate(*rows), jackknife_error(estimate, *rows)).interval
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from toolkit.jackknife import STRETCHES
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import find_all
 from toolkit.settings import Scalar, SettingsError, as_values
-from toolkit.settings.reading import describe
+from toolkit.settings.reading import describe, value_at
 from toolkit.simulation.faults import INJECTORS
 
 FAULT = "fault:"
@@ -80,7 +80,7 @@ class Axis:
         else:
             about = next((setting for setting in describe() if setting.key == name), None)
             unit, meaning = ("", "an option of an estimator") if about is None else (about.unit, about.meaning)
-            axis = cls(name, given, _value_at(as_values(plan.settings), name), unit, meaning)
+            axis = cls(name, given, value_at(as_values(plan.settings), name), unit, meaning)
         varied = tuple(value for value in axis.values if value != axis.clean)
         if not varied:
             raise SettingsError(f"{name}: there is no value to vary it over but that of the clean recording")
@@ -103,12 +103,6 @@ class Axis:
         clean = float(self.clean) if isinstance(self.clean, int | float) else math.nan
         below, above = (sorted(dose for dose in doses if dose < clean), sorted(dose for dose in doses if dose > clean))
         return tuple(side for side in (tuple(below[::-1]), tuple(above)) if side)
-
-
-def _value_at(values: Mapping[str, Any], key: str) -> Scalar | None:
-    for part in key.split("."):
-        values = values.get(part, {}) if isinstance(values, Mapping) else {}
-    return None if isinstance(values, Mapping) else values
 
 
 class Effect(NamedTuple):

@@ -25,11 +25,12 @@ import numpy as np
 from scipy.special import ndtri
 
 from toolkit.errors import printable
+from toolkit.experiment.statistics import holm
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import SPEED, Baseline, BaselineError, Case
 from toolkit.gate.case_check import CaseVerdicts
 from toolkit.gate.measuring import recordings_of
-from toolkit.gate.significance import POWER, holm
+from toolkit.gate.significance import POWER
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
 from toolkit.progress import Progress, ProgressFor

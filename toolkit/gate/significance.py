@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-from toolkit.experiment.statistics import paired_p, standard_error
+from toolkit.experiment.statistics import holm, paired_p, standard_error
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
@@ -260,21 +260,6 @@ def percent_text(change: float) -> str:
 def geometric_mean(values: Array) -> float:
     """Return the geometric mean of values (n,), whose ratio is the mean change."""
     return float(np.exp(log_of(values).mean()))
-
-
-def holm(p_values: Array) -> Array:
-    """Return Holm's adjusted p-values (..., m): those at most ``rate`` are rejected with that family-wise rate.
-
-    Of m true null hypotheses one or more is rejected with at most that probability, however the tests depend on each
-    other: the k-th smallest p-value counts (m - k + 1) fold, and none counts less than a smaller one.
-    """
-    given = np.asarray(p_values, dtype=float)
-    order = np.argsort(given, axis=-1)
-    weights = np.arange(given.shape[-1], 0, -1)
-    stepped = np.maximum.accumulate(np.take_along_axis(given, order, axis=-1) * weights, axis=-1)
-    adjusted = np.empty_like(given)
-    np.put_along_axis(adjusted, order, np.minimum(stepped, 1.0), axis=-1)
-    return adjusted
 
 
 def smallest_detectable(differences: Array, rate: float, power: float) -> float:

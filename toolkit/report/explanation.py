@@ -177,7 +177,7 @@ def _variant(one: Variant) -> VariantRecord:
 
 def _factor_record(one: Paired) -> FactorRecord:
     most = math.log(_MOST)
-    factor, low, high = (rounded(math.exp(min(max(end, -most), most))) for end in (one.mean, one.low, one.high))
+    factor, low, high = (rounded(math.exp(min(max(end, -most), most))) for end in one.interval)
     return FactorRecord(factor=factor, low=low, high=high)
 
 

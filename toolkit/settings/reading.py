@@ -126,6 +126,14 @@ def with_changes(given: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[s
     return result
 
 
+def value_at(values: Mapping[str, Any], key: str) -> Any:
+    """Return the value that nested values have at ``section.key``, None where they have none there."""
+    at: Any = values
+    for part in key.split("."):
+        at = at.get(part) if isinstance(at, Mapping) else None
+    return None if isinstance(at, Mapping) else at
+
+
 def assigned(text: str) -> tuple[str, Any]:
     """Return key and value of ``section.key=value``; raises SettingsError where it is none."""
     key, equals, value = text.partition("=")
