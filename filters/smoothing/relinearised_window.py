@@ -24,6 +24,8 @@ from toolkit.models.factors import L, kind_of, linear_factor
 # A step that lowers the error, half a sum of squares in sigma, by no more than this is the last.
 _NEGLIGIBLE = 1e-6
 _MOST_STEPS, _MOST_HALVINGS = 10, 6
+# Under a robust loss the weights change with every step, and the steps shorten slowly.
+_UNSOLVED = f"the window was not solved to its minimum in {_MOST_STEPS} steps; further such windows are not listed"
 _UNIT = gtsam.noiseModel.Unit.Create(1)
 
 
@@ -160,6 +162,7 @@ class RelinearisedWindow:
         self._states: list[tuple[int, list[int]]] = []
         self._landmarks: dict[int, int] = {}
         self._tree = gtsam.GaussianBayesTree()
+        self._is_told = False
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Add a packet's factors and values at a time, and solve; return the recoveries.
@@ -229,7 +232,7 @@ class RelinearisedWindow:
         for factor in self._factors:
             graph.add(factor)
         try:
-            self._iterate(graph)
+            converged = self._iterate(graph)
         except RuntimeError as refusal:
             key = variable_named(refusal)
             if kind_of(key) != "l":
@@ -238,10 +241,16 @@ class RelinearisedWindow:
             line = f"landmark {track_id} made the system indeterminate and was dropped"
             again = self.drop([track_id])
             return Recovery([line, *again.log], {track_id} | again.dropped)
-        return Recovery([], set())
+        if converged or self._is_told:
+            return Recovery([], set())
+        self._is_told = True
+        return Recovery([_UNSOLVED], set())
 
-    def _iterate(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Take Gauss-Newton steps, halved until the error falls, until one would lower it negligibly."""
+    def _iterate(self, graph: gtsam.NonlinearFactorGraph) -> bool:
+        """Take Gauss-Newton steps, halved until the error falls, until one would lower it negligibly; say if one did.
+
+        With the past at first estimates one step is taken, as in GTSAM's window.
+        """
         ordering, error = self._order(), self._error(graph, self._at)
         for _ in range(1 if self._coordinates.is_fixed else _MOST_STEPS):
             linear = self._linear(graph)
@@ -250,16 +259,17 @@ class RelinearisedWindow:
             gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
             if self._coordinates.is_fixed or gain <= _NEGLIGIBLE:
                 self._move(self._at.retract(step))
-                return
+                return True
             for halvings in range(_MOST_HALVINGS + 1):
                 there = self._at.retract(step.scale(0.5**halvings))
                 now = self._error(graph, there)
                 if now < error:
                     break
             else:
-                return
+                return False
             self._move(there)
             error = now
+        return False
 
     def _move(self, there: gtsam.Values) -> None:
         """Take values, and linearise there from now on what may move."""

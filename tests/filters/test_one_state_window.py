@@ -73,3 +73,13 @@ def test_marginals_at_the_latest_estimates_gain_information_that_nothing_measure
     decoupled = flown(fixed_lag.build, cross_covariances=False).cov[-1]
     assert np.linalg.det(latest[:3, :3]) < 0.5 * np.linalg.det(sound[:3, :3])
     assert np.trace(decoupled[3:6, 3:6]) < 0.1 * np.trace(sound[3:6, 3:6])
+
+
+@pytest.mark.parametrize(("policy", "told"), [("robust", 1), ("none", 0)])
+def test_a_window_that_was_not_solved_to_its_minimum_is_told_once(policy: str, told: int) -> None:
+    """Huber's weights change with every step; without a loss the steps shorten quadratically."""
+    sequence = simulate(replace(DRIVE, duration_s=0.6), 0)
+    settings = Settings(outliers=POLICIES[policy], estimators={"fixed-lag": {"marginals": "invariant"}})
+    done = runner.run("fixed-lag", fixed_lag.build, sequence, sequence.prior, settings=settings)
+    assert done.status == "ok"
+    assert sum("not solved to its minimum" in line for line in done.log) == told
