@@ -99,16 +99,22 @@ def test_no_effect_is_named_whose_interval_contains_none(seed: int) -> None:
 def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
     lost = msgspec.structs.replace(effect(A, BETWEEN, 1.0), ok=2, error=None, shown=False)
     perhaps = msgspec.structs.replace(effect(A, BETWEEN, 1.2), shown=False)
+    wide = msgspec.structs.replace(effect(A, BETWEEN, 1.1, 3.0), shown=False)
     found = explanation(
-        part("salt", effect(A, BETWEEN, 1.0)), part("pepper", lost), part("tea", None), part("oil", perhaps)
+        part("salt", effect(A, BETWEEN, 1.0)),
+        part("pepper", lost),
+        part("tea", None),
+        part("oil", perhaps),
+        part("flour", wide),
     )
     words = in_words(found)
     assert (
         "Nothing that 8 seeds can show is brought by salt (0.952 to 1.05) and pepper (too few runs ended well)."
         in words
     )
+    assert "Too few data to tell of flour (0.367 to 3.30): a factor of two is not excluded." in words
     assert "What tea brings cannot be measured: no two estimators differ in that alone." in words
-    assert "Perhaps the error is smaller with oil (1.14 to 1.26); among 3 tests that may be chance" in words
+    assert "Perhaps the error is smaller with oil (1.14 to 1.26); among 4 tests that may be chance" in words
     assert "need not multiply to the whole" in words
     assert [row[:3] for row in explanation_table(found).rows if row[0] in ("pepper", "tea")] == [
         ("pepper", "added to a", "2 of 8 ok"),

@@ -269,7 +269,10 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
             if some := [part for part in likely if of(part)]:
                 chance = f"among {_tests(found)} tests that may be chance: more data would tell"
                 yield f"Perhaps the error is {size} with {_listed(some)}; {chance}."
-    if rest := [part for part in silent if part not in likely]:
+    rest = [part for part in silent if part not in likely]
+    if still_open := [part for part in rest if _may_be_twofold(part)]:
+        yield f"Too few data to tell of {_listed(still_open)}: a factor of two is not excluded."
+    if rest := [part for part in rest if part not in still_open]:
         yield f"Nothing that {over(found)} can show is brought by {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
         yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
@@ -288,6 +291,11 @@ def _beside(found: ExplanationRecord) -> Iterator[str]:
 def _helps(part: IngredientRecord) -> bool:
     """Say whether what looks like more than chance of an ingredient makes the error smaller with it."""
     return any(one.error is not None and one.error.low > 1.0 for one in part.effects)
+
+
+def _may_be_twofold(part: IngredientRecord) -> bool:
+    """Say whether an effect of a factor of two either way is not excluded."""
+    return any(one.error is not None and (one.error.low < 0.5 or one.error.high > 2.0) for one in part.effects)
 
 
 def _harms(part: IngredientRecord) -> bool:
