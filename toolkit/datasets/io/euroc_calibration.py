@@ -154,9 +154,7 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
 def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
     """Return the message for a folder without calibration: what was looked for, and what lies there instead."""
     missing = ", ".join(str(file.relative_to(mav0)) for file in lacking)
-    there = [
-        file for folder in (mav0.parent, mav0) for kind in ("*.yaml", "*.yml", "*.json") for file in folder.glob(kind)
-    ]
+    there = [file for folder in (mav0.parent, mav0) for kind in _KINDS for file in folder.glob(kind)]
     others = [f"{printable(file.name)}{_of_system(file)} is not read" for file in sorted(set(there))[:_NAMED]]
     return (
         f"{mav0}: missing {missing}, and there is no *camchain*.yaml of Kalibr's that states it{'; ' if others else ''}"
