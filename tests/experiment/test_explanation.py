@@ -7,7 +7,7 @@ import pytest
 
 from toolkit.audit import Audit
 from toolkit.experiment import Plan, recording
-from toolkit.experiment.explanation import Explanation, run_explanation
+from toolkit.experiment.explanation import ERROR, Explanation, run_explanation
 from toolkit.experiment.ingredients import GATE
 from toolkit.report.explanation import explanation_document
 from toolkit.settings.reading import settings_of
@@ -87,7 +87,7 @@ def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted: st
             assert effect.on_error is not None
             (_, low, high), direct = effect.on_error.interval, PLANTED[planted] if part.ingredient == planted else 0.0
             assert low <= direct <= high, part.ingredient
-            assert effect.shown == (part.ingredient == planted)
+            assert (ERROR in effect.shown) == (part.ingredient == planted)
 
 
 def test_a_second_run_finds_every_outcome_and_tells_the_same(folders: dict[str, Path]) -> None:

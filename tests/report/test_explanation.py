@@ -33,7 +33,7 @@ def effect(
 ) -> ContributionRecord:
     error = FactorRecord(factor=factor, low=factor / reach, high=factor * reach)
     made = ContributionRecord(
-        less=less, more=more, distance=0, runs=8, ok=8, shown=error.is_off, error=error, variance=None, nees=None
+        less=less, more=more, distance=0, runs=8, ok=8, shown=error.is_off, error=error, variance=error, nees=error
     )
     return msgspec.structs.replace(made, **given)
 
@@ -109,7 +109,7 @@ def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
     )
     words = in_words(found)
     assert (
-        "Nothing that 8 seeds can show is brought by salt (0.952 to 1.05) and pepper (too few runs ended well)."
+        "The error does not show with 8 seeds that anything is brought by salt (0.952 to 1.05) and pepper (too few runs"
         in words
     )
     assert "Too few data to tell of flour (0.367 to 3.30): a factor of two is not excluded." in words
@@ -120,6 +120,20 @@ def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
         ("pepper", "added to a", "2 of 8 ok"),
         ("tea", "no two differ in it alone", "-"),
     ]
+
+
+def test_other_measures_tell_of_what_the_error_does_not_show_and_only_of_that() -> None:
+    hidden = msgspec.structs.replace(effect(A, BETWEEN, 1.2), shown=False, also_shown=("variance",))
+    worse = msgspec.structs.replace(effect(A, BETWEEN, 0.5), shown=False, also_shown=("variance", "nees"))
+    clear = effect(A, BETWEEN, 2.3, also_shown=("variance", "nees"))
+    silent = msgspec.structs.replace(effect(A, BETWEEN, 1.1), shown=False)
+    found = explanation(part("salt", hidden), part("pepper", worse), part("tea", clear), part("oil", silent))
+    assert (
+        "More than chance, where the error shows nothing: the variance of the pose over its bound is 2.00 times larger "
+        "with pepper (1.90 to 2.10) and 1.20 times smaller with salt (1.14 to 1.26); the NEES is 2.00 times larger "
+        "with pepper (1.90 to 2.10)." in in_words(found)
+    )
+    assert "More than chance, where" not in in_words(explanation(part("tea", clear), part("oil", silent)))
 
 
 def test_two_estimators_that_do_not_differ_are_not_ranked() -> None:

@@ -5,11 +5,12 @@ the pair nearest to the second what is lost without it (*last in*). The two need
 ingredients need not add up to the whole: what one brings depends on what else is there.
 
 Effects are differences of logarithms, paired by seed, or of a single recording over its stretches, with Student's
-intervals. Several are tested at once, so an effect is called shown only where Holm's test over all of them finds it.
+intervals. Several are tested at once, so an effect on a measure is called shown only where Holm's test over all effects
+on that measure finds it.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -55,14 +56,14 @@ class Measure(NamedTuple):
 class Contribution:
     """What an ingredient brings between two variants, by measure: the logarithm of that without it over that with it.
 
-    Under ``ok`` of ``runs`` seeds both ended well. ``shown`` says that it changes the error by more than chance.
+    Under ``ok`` of ``runs`` seeds both ended well. ``shown`` has the measures that it changes by more than chance.
     """
 
     edge: Edge
     runs: int
     ok: int
     by: Mapping[str, Paired | None]
-    shown: bool = False
+    shown: frozenset[str] = frozenset()
 
     @property
     def on_error(self) -> Paired | None:
@@ -165,7 +166,7 @@ def explained(found: Pairings, grid: Grid) -> Explanation:
         return Contribution(edge, len(ok), sum(ok), {key: difference(key, edge) for key in measures})
 
     pairs = {name: pair for name, pair in found.edges.items() if pair is not None}
-    effects = _tested({edge: effect(edge) for pair in pairs.values() for edge in pair})
+    effects = _tested({edge: effect(edge) for pair in pairs.values() for edge in pair}, measures)
     orders = {name: difference(ERROR, *pair) for name, pair in pairs.items() if pair[0].less != pair[1].less}
     clear = _found_by_holm(orders)
     parts = [
@@ -176,11 +177,16 @@ def explained(found: Pairings, grid: Grid) -> Explanation:
     return Explanation(found.start, found.goal, grid, metric, gap, tuple(sorted(parts, key=_size, reverse=True)))
 
 
-def _tested(effects: Mapping[Edge, Contribution]) -> dict[Edge, Contribution]:
-    """Return effects with what the test over all of them shows; a pair that stands for first and last counts once."""
-    by_pair = {(edge.less, edge.more): effect.on_error for edge, effect in effects.items()}
-    shown = _found_by_holm(by_pair)
-    return {edge: replace(effect, shown=(edge.less, edge.more) in shown) for edge, effect in effects.items()}
+def _tested(effects: Mapping[Edge, Contribution], measures: Iterable[str]) -> dict[Edge, Contribution]:
+    """Return effects with what the tests over all of them show; a pair that stands for first and last counts once."""
+    shown = {
+        key: _found_by_holm({(edge.less, edge.more): effect.by[key] for edge, effect in effects.items()})
+        for key in measures
+    }
+    return {
+        edge: replace(effect, shown=frozenset(key for key, pairs in shown.items() if (edge.less, edge.more) in pairs))
+        for edge, effect in effects.items()
+    }
 
 
 def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:

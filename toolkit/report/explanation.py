@@ -34,10 +34,14 @@ from toolkit.report.text import (
 from toolkit.settings import changes_of
 
 Kind = Literal["added", "taken"]
+Other = Literal["variance", "nees"]
 EXPLANATION, TEXT = "explain.json", "explain.md"
 # Factors of more than this stand for any larger one, which a diverged run may have.
 _MOST = 1e6
 _DIGITS = 3
+_KEYS: dict[Other, str] = {"variance": VARIANCE, "nees": NEES}
+# So many ingredients a sentence names; the table has all.
+_MOST_NAMED = 3
 
 
 class VariantRecord(Struct, frozen=True, kw_only=True):
@@ -85,6 +89,9 @@ class ContributionRecord(Struct, frozen=True, kw_only=True):
     error: FactorRecord | None
     variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
     nees: FactorRecord | None
+    also_shown: Annotated[
+        tuple[Other, ...], Meta(description="which of the other two differ by more than chance, as ``shown``")
+    ] = ()
 
 
 class IngredientRecord(Struct, frozen=True, kw_only=True):
@@ -164,10 +171,11 @@ def _effect(effect: Contribution) -> ContributionRecord:
         distance=effect.edge.distance,
         runs=effect.runs,
         ok=effect.ok,
-        shown=effect.shown,
+        shown=ERROR in effect.shown,
         error=by[ERROR],
         variance=by.get(VARIANCE),
         nees=by.get(NEES),
+        also_shown=tuple(name for name, key in _KEYS.items() if key in effect.shown),
     )
 
 
@@ -183,7 +191,7 @@ def _factor_record(one: Paired) -> FactorRecord:
 
 def in_words(found: ExplanationRecord) -> str:
     """Return an explanation in plain sentences, which call only that an effect which is more than chance."""
-    return " ".join([_gap(found), *_shown(found), *_not_shown(found), *_beside(found)])
+    return " ".join([_gap(found), *_shown(found), *_by_other_measures(found), *_not_shown(found), *_beside(found)])
 
 
 def _gap(found: ExplanationRecord) -> str:
@@ -253,27 +261,48 @@ def _clause(effect: ContributionRecord, kind: Kind, tests: int) -> str:
         return f"{at}, it cannot be told ({effect.ok} of {effect.runs} pairs of runs ended well)"
     if not (effect.shown or effect.error.is_off):
         return f"{at}, nothing is shown ({effect.error.range()})"
-    change = effect.error.inverse() if kind == "added" else effect.error
-    size, by = ("larger", change) if change.factor > 1.0 else ("smaller", change.inverse())
-    change_told = f"{number(by.factor, _DIGITS)} times {size} ({by.range()})"
+    change_told = _size_told(effect.error if kind == "added" else effect.error.inverse())
     if effect.shown:
         return f"{at}, the error becomes {change_told}"
     return f"{at}, it seems to become {change_told}, which may be chance among {tests} tests"
+
+
+def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
+    """Yield what is more than chance of ingredients whose effect on the error is not, the largest effects first."""
+    names: dict[Other, str] = {"variance": "the variance of the pose over its bound", "nees": "the NEES"}
+    told = []
+    for measure, name in names.items():
+        effects: list[tuple[FactorRecord, str]] = []
+        for part in found.parts:
+            shown = [getattr(one, measure) for one in part.effects if measure in one.also_shown]
+            if shown and not _is_shown(part):
+                effects.append((shown[0], part.ingredient))
+        effects.sort(key=lambda pair: -abs(math.log(pair[0].factor)))
+        clauses = [_size_told(change, f"with {ingredient} ") for change, ingredient in effects[:_MOST_NAMED]]
+        if clauses:
+            told.append(f"{name} is {_joined(clauses)}")
+    if told:
+        yield f"More than chance, where the error shows nothing: {'; '.join(told)}."
+
+
+def _size_told(change: FactorRecord, where: str = "") -> str:
+    """Return how many times smaller or larger something is with an ingredient, whose effect is given."""
+    size, by = ("smaller", change) if change.factor > 1.0 else ("larger", change.inverse())
+    return f"{number(by.factor, _DIGITS)} times {size} {where}({by.range()})"
 
 
 def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     """Yield what may be chance, of which some look like more where they are tested alone, and what is not known."""
     silent = [part for part in found.parts if part.effects and not _is_shown(part)]
     if likely := [part for part in silent if any(one.error and one.error.is_off for one in part.effects)]:
-        for size, of in (("smaller", _helps), ("larger", _harms)):
-            if some := [part for part in likely if of(part)]:
-                chance = f"among {_tests(found)} tests that may be chance: more data would tell"
-                yield f"Perhaps the error is {size} with {_listed(some)}; {chance}."
+        by_size = {"smaller": list(filter(_helps, likely)), "larger": [part for part in likely if not _helps(part)]}
+        said = " and ".join(f"{size} with {_listed(some)}" for size, some in by_size.items() if some)
+        yield f"Perhaps the error is {said}; among {_tests(found)} tests that may be chance: more data would tell."
     rest = [part for part in silent if part not in likely]
     if still_open := [part for part in rest if _may_be_twofold(part)]:
         yield f"Too few data to tell of {_listed(still_open)}: a factor of two is not excluded."
     if rest := [part for part in rest if part not in still_open]:
-        yield f"Nothing that {over(found)} can show is brought by {_listed(rest)}."
+        yield f"The error does not show with {over(found)} that anything is brought by {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
         yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
 
@@ -298,12 +327,12 @@ def _may_be_twofold(part: IngredientRecord) -> bool:
     return any(one.error is not None and (one.error.low < 0.5 or one.error.high > 2.0) for one in part.effects)
 
 
-def _harms(part: IngredientRecord) -> bool:
-    return not _helps(part)
-
-
 def _listed(parts: Sequence[IngredientRecord]) -> str:
-    *most, last = map(_with_ranges, parts)
+    return _joined([*map(_with_ranges, parts)])
+
+
+def _joined(texts: Sequence[str]) -> str:
+    *most, last = texts
     return " and ".join(filter(None, (", ".join(most), last)))
 
 
@@ -328,8 +357,9 @@ def explanation_table(found: ExplanationRecord) -> Table:
     heads = (("ingredient", "", ""), ("where", "", ""), *((names[key], "", "") for key in keys))
     under = [
         f"how many times as large without it as with it, with 95 % intervals over {over(found)}, paired",
-        f"error: {error_of(found)}; * more than chance, by Holm's test over all effects on the error",
+        f"error: {error_of(found)}; * more than chance, by Holm's test over all effects of its column",
         *(["variance: of the pose, over the Cramér-Rao bound"] if "variance" in keys else []),
+        *(["NEES: squared error over its stated variance, 1 where that is right"] if "nees" in keys else []),
     ]
     return Table(heads, tuple(rows), labels=2, under=tuple(under))
 
@@ -342,7 +372,7 @@ def _cells(effect: ContributionRecord, keys: Sequence[str]) -> Iterator[str]:
             yield ok or MISSING
             continue
         factor, low, high = (number(value, _DIGITS) for value in (one.factor, one.low, one.high))
-        star = "*" if key == "error" and effect.shown else ""
+        star = "*" if key in effect.also_shown or (key == "error" and effect.shown) else ""
         yield f"{factor}{star} ({', '.join(filter(None, (f'{low}-{high}', ok if key == 'error' else '')))})"
 
 

@@ -7,14 +7,17 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
 
-from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, placed, where
+from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, over, placed, where
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
     SMALL_PT,
     TICK_PT,
+    Entry,
     NamedFigure,
+    legend,
     new_figure,
     style_axes,
 )
@@ -23,11 +26,13 @@ from toolkit.report.text import number
 _FIRST, _LAST, _WHOLE = "#0072B2", "#D55E00", "#5b6670"
 # Bars of effects that may be chance are pale.
 _PALE = 0.3
-_ROW_IN, _AROUND_IN, _BAR = 0.46, 0.9, 0.38
+_ROW_IN, _AROUND_IN, _BAR = 0.46, 1.9, 0.38
 # The axis has this room on either side of the bars, which it cuts where they reach further than the second.
 _ROOM, _MOST = math.log(1.25), math.log(30.0)
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-_FINE_TICKS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.6, 1.8, 2.0)
+_FINE_TICKS = (0.5, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
+# Where the columns beside the bars begin.
+_EFFECT_AT, _BASE_AT = 0.0, 0.36
 
 
 class _Bar(NamedTuple):
@@ -63,7 +68,7 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
         for k, (of_second, kind, effect) in enumerate(placed(found, part)):
             bars.append(_Bar(top + k * _BAR, *((_LAST, gap) if of_second else (_FIRST, 0.0)), effect, kind))
     figure = new_figure(_AROUND_IN + _ROW_IN * (1 + len(parts)))
-    axes, words = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.0))
+    axes, words = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.2))
     ends = [0.0, gap, *(bar.ends[0] for bar in bars if bar.effect.error is not None)]
     least, most = (min(max(end, min(0.0, gap) - _MOST), max(0.0, gap) + _MOST) for end in (min(ends), max(ends)))
     axes.set_xlim(least - _ROOM, most + _ROOM)
@@ -79,15 +84,33 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
         )  # fmt: skip
     words.axis("off")
     words.set_xlim(0.0, 1.0)
+    for at, head in ((_EFFECT_AT, "error without/with"), (_BASE_AT, "base")):
+        words.text(at, -0.62, head, fontsize=TICK_PT, color=MUTED_COLOUR)
     for bar in bars:
         _draw(axes, words, bar)
+    legend(figure, _key(found), columns=1, loc="outside lower left")
     yield NamedFigure(
         "waterfall",
-        f"What each ingredient brings {start} or the pair of estimators nearest to it (blue, to the right where it is "
-        f"added, to the left where it is taken away), and what {goal} loses without it, or the pair nearest to that "
-        "(orange), with 95 % intervals; pale: no more than chance. The bars need not add up.",
+        f"What each ingredient brings near {start} (blue) and near {goal} (orange), in the pair of estimators that "
+        "is named beside it: to the right where it is added, to the left where it is taken away. The bars need not "
+        "add up.",
         figure,
     )
+
+
+def _key(found: ExplanationRecord) -> list[Entry]:
+    """Return what colours and whiskers stand for."""
+    start, goal = found.gap.less, found.gap.more
+    drawn = "world and noise" if found.settings.get("vary") == "world" else "the noise of the sensors"
+    what = f"; each draws {drawn} anew, the same for all estimators" if found.intervals == "seeds" else ""
+    named = {
+        f"{goal} against {start}": (_WHOLE, 1.0),
+        f"an ingredient at the base nearest to {start}, drawn from the line of {start}": (_FIRST, 1.0),
+        f"an ingredient at the base nearest to {goal}, drawn from the line of {goal}": (_LAST, 1.0),
+        "pale: no more than chance": (_FIRST, _PALE),
+    }
+    bars = [Entry(label, (Patch(color=colour, alpha=alpha),)) for label, (colour, alpha) in named.items()]
+    return [*bars, Entry.of_line(f"95 % interval over {over(found)}{what}", "black", width=1.0)]
 
 
 def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
@@ -101,10 +124,10 @@ def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
         axes.plot(interval, [bar.row, bar.row], color="black", linewidth=1.0, marker="|", markersize=5.0)
         told = f"{number(one.factor)} ({number(one.low)}-{number(one.high)})"
     colour = bar.colour if is_sure else MUTED_COLOUR
-    words.text(0.0, bar.row, told, fontsize=SMALL_PT, color=colour, va="center")
+    words.text(_EFFECT_AT, bar.row, told, fontsize=SMALL_PT, color=colour, va="center")
     if bar.kind is not None:
         at = where(bar.kind, effect)
-        words.text(0.43, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
+        words.text(_BASE_AT, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
 
 
 def _log_ticks(axes: Axes) -> None:
