@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES
@@ -89,9 +89,17 @@ class ContributionRecord(Struct, frozen=True, kw_only=True):
     error: FactorRecord | None
     variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
     nees: FactorRecord | None
-    also_shown: Annotated[
-        tuple[Other, ...], Meta(description="which of the other two differ by more than chance, as ``shown``")
-    ] = ()
+    also_shown: (
+        Annotated[
+            tuple[Other, ...],
+            Meta(description="which of the others differ by more than chance too; absent before it was added"),
+        ]
+        | UnsetType
+    ) = UNSET
+
+    def shows(self, measure: str) -> bool:
+        """Say whether a measure differs by more than chance."""
+        return self.shown if measure == "error" else measure in (self.also_shown or ())
 
 
 class IngredientRecord(Struct, frozen=True, kw_only=True):
@@ -274,7 +282,7 @@ def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
     for measure, name in names.items():
         effects: list[tuple[FactorRecord, str]] = []
         for part in found.parts:
-            shown = [getattr(one, measure) for one in part.effects if measure in one.also_shown]
+            shown = [getattr(one, measure) for one in part.effects if one.shows(measure)]
             if shown and not _is_shown(part):
                 effects.append((shown[0], part.ingredient))
         effects.sort(key=lambda pair: -abs(math.log(pair[0].factor)))
@@ -372,7 +380,7 @@ def _cells(effect: ContributionRecord, keys: Sequence[str]) -> Iterator[str]:
             yield ok or MISSING
             continue
         factor, low, high = (number(value, _DIGITS) for value in (one.factor, one.low, one.high))
-        star = "*" if key in effect.also_shown or (key == "error" and effect.shown) else ""
+        star = "*" if effect.shows(key) else ""
         yield f"{factor}{star} ({', '.join(filter(None, (f'{low}-{high}', ok if key == 'error' else '')))})"
 
 
