@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from toolkit.errors import VislamError
 from toolkit.experiment.code_version import code_digest, numeric_versions
-from toolkit.experiment.workers import LostUnit, Needs, Work, nothing_kept
+from toolkit.experiment.workers import LostUnit, Needs, Work
 from toolkit.progress import SILENT, Progress
 
 T = TypeVar("T")
@@ -53,7 +53,7 @@ class Cluster:
         self._client.close()
 
     def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress, _needs: Needs[T] = nothing_kept
+        self, units: Sequence[T], work: Work[T, R], progress: Progress, _needs: Needs[T] | None = None
     ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there; the scheduler chooses the workers.
 

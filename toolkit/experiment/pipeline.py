@@ -23,13 +23,16 @@ from toolkit.experiment.references import (
     reference_runs,
 )
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
-from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
+from toolkit.experiment.workers import LostUnit, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.registry import LADDER, EstimatorEntry, check_options, find_all
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings, SettingsError
 from toolkit.simulation.faults import Doses
 from toolkit.threads import MOST_WORKERS
+
+# What does units of work side by side: processes here, or those of a cluster.
+Pool = Workers | Cluster
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,17 +15,17 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
-from loky import ProcessPoolExecutor
+from loky import ProcessPoolExecutor, cpu_count
 from loky.process_executor import BrokenProcessPool
 
 from toolkit.errors import SystemLimitError
@@ -36,12 +36,14 @@ from toolkit.threads import THREAD_VARIABLES
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T, Progress], R]
-# Key of the data that a process keeps from one unit for the next; equal keys share it. None where nothing is kept.
+# Key of the data that a process keeps from one unit for the next; equal keys share it.
 Needs = Callable[[T], Hashable]
 
 # Loky takes growth by 300 MB for a leak and restarts the process; a recording and a smoother's graph are no leak.
 _ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
 _PARENT_POLL_S, _POLL_S = 1.0, 0.1
+# How many processors this process may use: by its affinity, and by the limits of its container.
+usable_cpus: Callable[[], int] = cpu_count
 # Signals that a terminal sends to every process of its group, and that the parent alone handles.
 _OF_A_TERMINAL = (signal.SIGINT, signal.SIGHUP)
 # Progress of a unit, written by its process and read by the parent.
@@ -57,10 +59,10 @@ class WorkerProcess:
         self._executor: ProcessPoolExecutor | None = None
 
     def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
-        """Queue work for the process; BrokenProcessPool is raised where the process dies.
+        """Queue work for the process, whose result is BrokenProcessPool where the process dies.
 
-        Signals are held back until the process is started; otherwise resources of a half-started process would be left
-        behind. Raises SystemLimitError where the system lets no process be started.
+        Signals are held back until it is started, lest a half-started one leave what it shares behind. Raises
+        SystemLimitError where the system lets no process be started.
         """
         with uninterrupted(), _refusals_shown():
             # Up to Python 3.11 its resource tracker leaves interrupts unblocked when it has started, so they are held
@@ -149,43 +151,16 @@ class LostUnit:
     why: str
 
 
-def usable_cpus() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def nothing_kept(_unit: object) -> Hashable:
-    """Return None: units share no data."""
-    return None
-
-
 def results_of(
-    units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
+    units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] | None = None
 ) -> Generator[tuple[int, R | LostUnit], None, None]:
     """Yield the place and the result of every unit as each is there, from several processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress, needs)
 
 
-class Pool(Protocol):
-    """Does units of work somewhere, ``count`` at a time; a context that ends what it started."""
-
-    count: int
-
-    def __enter__(self) -> Self:
-        """Begin."""
-
-    def __exit__(self, *_: object) -> None:
-        """End what was started."""
-
-    def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | LostUnit], None, None]:
-        """Yield the place and the result of every unit as each is there; an error of the work is raised."""
-
-
 class Workers:
-    """So many processes, started once for several pieces of work; when the context ends none is left.
+    """Processes, started once for several pieces of work; when the context ends none is left.
 
     With one worker the work is done in this process.
     """
@@ -198,10 +173,6 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end()
-
-    def end(self) -> None:
-        """End the processes, whatever they are doing."""
         if self._processes:
             with ThreadPoolExecutor(len(self._processes)) as threads:
                 list(threads.map(WorkerProcess.end, self._processes))
@@ -212,7 +183,7 @@ class Workers:
             process.submit(import_module, module)
 
     def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
+        self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] | None = None
     ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there.
 
@@ -228,7 +199,9 @@ class Workers:
             path = Path(folder) / "progress"
             board = _Board(len(units), path)
             tasks = [(_do, work, unit, path, place) for place, unit in enumerate(units)]
-            handing_out: _HandingOut[R] = _HandingOut(self._processes, tasks, [needs(unit) for unit in units])
+            handing_out: _HandingOut[R] = _HandingOut(
+                self._processes, tasks, [None if needs is None else needs(unit) for unit in units]
+            )
             progress.advance(*board.progress())
             try:
                 for place, result in handing_out.results(lambda: progress.advance(*board.progress())):
@@ -240,7 +213,7 @@ class Workers:
 
 
 class _HandingOut(Generic[R]):
-    """A thread that gives each process its next task as soon as it is free, independent of the reader of the results.
+    """A thread for each process gives it its next task as soon as it is free, whenever the results are read.
 
     ``tasks`` are functions with their arguments, ``needs`` the keys of the data that processes keep for them.
     """
@@ -248,24 +221,31 @@ class _HandingOut(Generic[R]):
     def __init__(
         self, processes: list[WorkerProcess], tasks: Sequence[tuple[Any, ...]], needs: Sequence[Hashable]
     ) -> None:
-        self._processes, self._tasks, self._needs = processes, tasks, needs
-        self._waiting = list(range(len(tasks)))
+        self._tasks, self._needs, self._waiting = tasks, needs, list(range(len(tasks)))
         self._ready: dict[WorkerProcess, Hashable] = {}
         self._answers: SimpleQueue[tuple[int, Future[R]] | Exception] = SimpleQueue()
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._give, name="vislam-workers", daemon=True)
-        self._thread.start()
+        self._lock = threading.Lock()
+        for process in processes:
+            threading.Thread(target=self._serve, args=(process,), name="vislam-workers", daemon=True).start()
 
     def stop(self) -> None:
         """Hand out nothing more."""
-        self._stopped.set()
-        self._thread.join()
+        with self._lock:
+            self._waiting.clear()
 
     def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of each task as it is there, and call ``meanwhile`` while there is none."""
         died = []
         for _ in self._tasks:
-            place, future = self._next_answer(meanwhile)
+            while True:
+                try:
+                    answer = self._answers.get(timeout=_POLL_S)
+                    break
+                except Empty:
+                    meanwhile()
+            if isinstance(answer, Exception):
+                raise answer
+            place, future = answer
             try:
                 result = future.result()
             except BrokenProcessPool:
@@ -274,17 +254,6 @@ class _HandingOut(Generic[R]):
                 yield place, result
         for place in died:
             yield place, self._retry_alone(place, meanwhile)
-
-    def _next_answer(self, meanwhile: Callable[[], None]) -> tuple[int, "Future[R]"]:
-        while True:
-            try:
-                answer = self._answers.get(timeout=_POLL_S)
-            except Empty:
-                meanwhile()
-                continue
-            if isinstance(answer, Exception):
-                raise answer
-            return answer
 
     def _retry_alone(self, place: int, meanwhile: Callable[[], None]) -> R | LostUnit:
         """Try a task once more, in a process of its own."""
@@ -299,34 +268,28 @@ class _HandingOut(Generic[R]):
         finally:
             process.end()
 
-    def _give(self) -> None:
-        """Hand out the tasks and pass their answers on, until all are there or this is stopped."""
-        busy: dict[Future[R], tuple[int, WorkerProcess]] = {}
-        free = list(self._processes)
+    def _serve(self, process: WorkerProcess) -> None:
+        """Hand a process one task after the other and pass the answers on, until none is waiting."""
         try:
-            while (self._waiting or busy) and not self._stopped.is_set():
-                while free and self._waiting:
-                    process = free.pop()
-                    place = self._next_for(process)
-                    busy[process.submit(*self._tasks[place])] = (place, process)
-                done, _ = wait(busy, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                for future in done:
-                    place, process = busy.pop(future)
-                    free.append(process)
-                    self._answers.put((place, future))
+            while (handed := self._next_for(process)) is not None:
+                wait([handed[1]])
+                self._answers.put(handed)
         except Exception as error:  # any error is raised where the results are read
             self._answers.put(error)
 
-    def _next_for(self, process: WorkerProcess) -> int:
-        """Take the next task for a process: one it is ready for, else one that no process is, else any."""
-        mine, elsewhere = self._ready.get(process), set(self._ready.values())
-        place = next(
-            (one for one in self._waiting if mine is not None and self._needs[one] == mine),
-            next((one for one in self._waiting if self._needs[one] not in elsewhere - {None}), self._waiting[0]),
-        )
-        self._waiting.remove(place)
-        self._ready[process] = self._needs[place]
-        return place
+    def _next_for(self, process: WorkerProcess) -> "tuple[int, Future[R]] | None":
+        """Submit the next task for a process: one it is ready for, else one that no process is, else any."""
+        with self._lock:  # so that no process is started once this is stopped
+            if not self._waiting:
+                return None
+            mine, elsewhere = self._ready.get(process), set(self._ready.values())
+            place = next(
+                (one for one in self._waiting if mine is not None and self._needs[one] == mine),
+                next((one for one in self._waiting if self._needs[one] not in elsewhere - {None}), self._waiting[0]),
+            )
+            self._waiting.remove(place)
+            self._ready[process] = self._needs[place]
+            return place, process.submit(*self._tasks[place])
 
 
 class _Board:
