@@ -19,9 +19,10 @@ from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Message, Top
 from toolkit.datasets.io.fields import check_frame_count, joined_imu
 from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
 from toolkit.datasets.io.ros_values import Mounted, Recorded, mounted, recorded
-from toolkit.datasets.io.truth import truth_near, with_truth
-from toolkit.datasets.trajectories.formats import checked_poses, known_poses, states_turns
-from toolkit.errors import DataError
+from toolkit.datasets.io.truth import OF_POSITIONS, truth_near, with_truth
+from toolkit.datasets.trajectories.covariances import ROS, CovConvention, StatedCovariances
+from toolkit.datasets.trajectories.formats import PosesFile, checked_poses, known_poses, states_turns
+from toolkit.errors import DataError, no_such
 from toolkit.frontend import ImageRecording, StampedPair, matched_corners
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray
@@ -71,8 +72,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
         seen = seen_in(path, filmed, read.mounted.T_imu_left, frontend, progress)
     finally:
         spool.close()
-    remarks = (*bag_reader.parts_beside(path), *read.remarks)
-    facts = (*seen.facts, *remarks, *read.chosen.facts, *read.mounted.facts)
+    facts = (*seen.facts, *read.remarks, *read.chosen.facts, *read.mounted.facts)
     sequence = Recording(
         name=path.resolve().stem,
         rig=seen.rig,
@@ -153,27 +153,25 @@ def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     topic, messages = source.chosen.truth, source.of(source.chosen.truth)
     if topic is None or not messages:
         return None, ()
-    t_ns, first = np.unique(_stamps_ns(messages), return_index=True)
-    values = ros_values.poses_of([message.value for message in messages], topic.type)[first]
+    t_ns, rows, values = ros_values.poses_of(messages, topic.type)
     kept = known_poses(values)
     if not kept.any():
         return None, (f"no pose of {topic.name} is finite: it is left out, and there is no truth",)
-    what = Path(f"{source.path}: {topic.name}")
-    T_world_child = checked_poses(what, first[kept].tolist(), t_ns[kept], values[kept], "message")
-    lost = int((~kept).sum())
-    remarks = (f"{lost} of {kept.size} poses of {topic.name} are not finite and left out of the truth",) if lost else ()
-    if not states_turns(values).any():
-        alone = f"{topic.name} states no orientation (its quaternions are 0 or NaN): the truth is of positions alone"
-        return Truth(t_ns[kept], T_world_child), (*remarks, alone)
+    what, lost = Path(f"{source.path}: {topic.name}"), int((~kept).sum())
+    T_world_child = checked_poses(what, rows[kept].tolist(), t_ns[kept], values[kept], "message")
+    remarks = [f"{lost} of {kept.size} poses of {topic.name} are not finite and left out of the truth"] if lost else []
     body, child = source.body, ros_values.frame_name(getattr(messages[0].value, "child_frame_id", ""))
     T_child_body = source.tree.between(child, body)
-    if T_child_body is not None:
-        return Truth(t_ns[kept], T_world_child @ T_child_body), remarks
-    whose = (
-        f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
-        "body's"
-    )
-    return Truth(t_ns[kept], T_world_child), (*remarks, whose) if child and child != body else remarks
+    if not states_turns(values).any():
+        remarks.append(f"{topic.name} states no orientation (quaternions of 0 or NaN): {OF_POSITIONS}")
+    elif T_child_body is not None:
+        T_world_child = T_world_child @ T_child_body
+    elif child and child != body:
+        remarks.append(
+            f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
+            "body's"
+        )
+    return Truth(t_ns[kept], T_world_child), tuple(remarks)
 
 
 def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progress) -> tuple[str, ...]:
@@ -181,30 +179,20 @@ def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progres
     sides = {chosen.left.name: "cam0", chosen.right.name: "cam1"}
     for topic, camera in sides.items():
         spool.call(f"{camera}/data", f"{bag.path}: {topic}")
-    total = chosen.left.count + chosen.right.count
-    unstamped = 0
+    types = {topic.name: topic.type for topic in (chosen.left, chosen.right)}
+    total, unstamped = chosen.left.count + chosen.right.count, 0
     for done, message in enumerate(bag.messages(sides.keys())):
         what = f"{bag.path}: {message.topic}: message {done}"
         t_ns = ros_values.stamp_ns(message.value.header, message.t_ns)
-        unstamped += t_ns == message.t_ns and not ros_values.is_stamped(message.value.header)
+        unstamped += not ros_values.is_stamped(message.value.header)
         name = f"{sides[message.topic]}/data/{t_ns}"
-        if _type_of(chosen, message.topic) == COMPRESSED:
+        if types[message.topic] == COMPRESSED:
             ending, content = ros_values.image_file(message.value, what)
             spool.add(name + ending, content)
         else:
             spool.add_grey(name, ros_values.grey(message.value, what))
         progress.advance(done + 1, max(total, done + 1), "unpacking images")
     return (f"{unstamped} images have no stamp, and the time of recording is used",) if unstamped else ()
-
-
-def _type_of(chosen: Chosen, name: str) -> str:
-    return chosen.left.type if chosen.left.name == name else chosen.right.type
-
-
-def _stamps_ns(messages: Sequence[Message]) -> IntArray:
-    """Return the stamps (N,) of messages, which are their headers' or, where these are zero, the recording's."""
-    stamps = [ros_values.stamp_ns(message.value.header, message.t_ns) for message in messages]
-    return np.array(stamps, dtype=np.int64)
 
 
 def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
@@ -239,7 +227,7 @@ def _twists(source: Recorded) -> TwistSamples:
     linear, angular = (ros_values.columns(values, part) for part in ros_values.VECTORS[topic.type])
     if not (linear.any() or angular.any()):
         raise DataError(f"{path}: {topic.name} states no twist (all are 0); name {_NAME_ANOTHER}")
-    return TwistSamples(_stamps_ns(messages), linear, angular)
+    return TwistSamples(ros_values.stamps_ns(messages), linear, angular)
 
 
 def _joined(source: Recorded, gyro: tuple[Topic, IntArray, Array], accel: Topic) -> tuple[ImuSamples, tuple[str, ...]]:
@@ -277,4 +265,49 @@ def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Arra
             f"{source.path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}"
             f"{_NAME_ANOTHER}"
         )
-    return _stamps_ns(messages), values
+    return ros_values.stamps_ns(messages), values
+
+
+# Trajectories --------------------------------------------------------------------------------------------------------
+
+_WITH_COVARIANCES = (bag_reader.ODOMETRY, bag_reader.POSE_COV)
+_OF_POSES = (*_WITH_COVARIANCES, bag_reader.POSE, bag_reader.TRANSFORM)
+
+
+def read_topic(path: Path, name: str | None, cov_convention: CovConvention | None = None) -> PosesFile:
+    """Read the poses of a topic of a bag, of the only one where none is named, with the covariances it has.
+
+    The convention of covariances is ROS's (position first, turns about the fixed axes) unless another is given, for
+    programs that write theirs into ROS's messages. Raises DataError where the bag is damaged, rosbags is not installed,
+    or it has no such topic.
+    """
+    with bag_reader.opened(path) as bag:
+        topic = _topic_of_poses(path, bag.topics, name)
+        messages = list(bag.messages({topic.name}))
+    t_ns, rows, values = ros_values.poses_of(messages, topic.type)
+    T_world_body = checked_poses(Path(f"{path}: {topic.name}"), rows.tolist(), t_ns, values)
+    stated = None
+    if topic.type in _WITH_COVARIANCES:
+        cov = np.array([messages[row].value.pose.covariance for row in rows.tolist()], dtype=float).reshape(-1, 6, 6)
+        cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
+        # A covariance of zeros, or of -1, says that there is none.
+        unknown = (np.einsum("nii->ni", cov) <= 0.0).all(axis=1)
+        cov[unknown] = np.nan
+        stated = None if unknown.all() else StatedCovariances(cov, None)
+    file = PosesFile(path, f"{topic.type.replace('/msg/', '/')} of a bag", t_ns, T_world_body, None, stated)
+    return file.with_convention(cov_convention or ROS)
+
+
+def _topic_of_poses(path: Path, topics: Sequence[Topic], name: str | None) -> Topic:
+    """Return the topic that is named, or the only one, of those with covariances first."""
+    usable = [topic for topic in topics if topic.type in _OF_POSES and topic.count and not topic.unreadable]
+    by_name = {topic.name: topic for topic in usable}
+    if name in by_name:
+        return by_name[name]
+    if name is not None:
+        raise DataError(f"{path}: {no_such('topic of poses', name, by_name)}")
+    for of_kind in ([topic for topic in usable if topic.type in _WITH_COVARIANCES], usable):
+        if len(of_kind) == 1:
+            return of_kind[0]
+    there = ", ".join(map(str, usable)) or "none"
+    raise DataError(f"{path}: name the topic of the poses, as in {path.name}:/odom; there are {there}")

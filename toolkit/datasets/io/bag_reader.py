@@ -6,19 +6,20 @@ http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and 
 Topics get their roles as given with ``--topics``, else guessed from types and names.
 """
 
+import heapq
 import importlib.util
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from toolkit.errors import DataError, VislamError, no_such, printable
 from toolkit.files.reading import is_regular, open_input
-from toolkit.measurements import NS_PER_S
 
 Kind = Literal["ros1", "mcap", "sqlite", "folder"]
 _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}
@@ -36,13 +37,7 @@ _ENDINGS = (".mcap", ".db3", ".bag")
 _PART = re.compile(r"_(\d+)$")
 # The library's messages about a storage, a compression or a version of bags that it does not know.
 _NOT_SUPPORTED = "not supported"
-# What writes the missing index, by kind of bag.
-_REMEDIES = {
-    "ros1": "copy it again, or run rosbag reindex on it",
-    "mcap": "copy it again, or run mcap recover on it",
-    "sqlite": "copy it again, or run ros2 bag reindex on its folder",
-    "folder": "copy it again, or run ros2 bag reindex on it",
-}
+_REMEDY = "copy it again, or write its index anew: rosbag reindex, ros2 bag reindex on its folder, mcap recover"
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, IMU, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", (_TF, _OLD_TF)
@@ -66,9 +61,6 @@ ROLES: dict[str, tuple[str, ...]] = {
     # A point is taken for a truth only where it is said: it may be a goal.
     "truth": (*_POSES, POINT),
 }
-# What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
-_SIDES = (("0", "1"), ("1", "2"), ("l", "r"))
-_SIDES_ANYWHERE = (("left", "right"), ("Left", "Right"))
 # Of a sensor that publishes both by themselves, as RealSense's cameras do.
 _GYRO, _ACCEL = "gyro", "accel"
 # In the name of a topic whose poses are a truth, and not another system's estimate.
@@ -168,59 +160,41 @@ def _of_calibration(path: Path) -> bool:
 
 
 class Bag:
-    """An open bag, of which each reader reads a part; one where it is whole."""
+    """An open bag; of one that ROS 1 has split each reader reads a part."""
 
-    def __init__(self, path: Path, kind: Kind, readers: Sequence[Any]) -> None:
+    def __init__(self, path: Path, readers: Sequence[Any], *, of_ros1: bool) -> None:
         self.path = path
-        self._readers = readers
-        self._kind = kind
-        self._of_ros1 = kind == "ros1"
-        with _guarded(path, kind):
-            self._connections = [connection for reader in readers for connection in reader.connections]
-            self.topics = tuple(self._topic(name) for name in sorted({c.topic for c in self._connections}))
+        self._readers, self._of_ros1 = readers, of_ros1
+        connections = sorted((one for reader in readers for one in reader.connections), key=lambda one: one.topic)
+        self.topics = tuple(self._topic(name, list(of_it)) for name, of_it in groupby(connections, lambda c: c.topic))
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics in the order of recording; raises DataError where one is damaged."""
-        for reader in self._readers:
-            with _guarded(self.path, self._kind):
-                connections = [connection for connection in reader.connections if connection.topic in topics]
-            yield from self._messages(reader, connections) if connections else ()
+        with _guarded(self.path):
+            wanted = [(reader, [c for c in reader.connections if c.topic in topics]) for reader in self._readers]
+            parts = (reader.messages(connections) for reader, connections in wanted if connections)
+            for connection, t_ns, raw in heapq.merge(*parts, key=itemgetter(1)):
+                of_ros1 = self._encoding(connection) == "ros1"
+                store = _store(of_ros1)
+                value = (store.deserialize_ros1 if of_ros1 else store.deserialize_cdr)(raw, connection.msgtype)
+                yield Message(connection.topic, t_ns, value)
 
-    def _messages(self, reader: Any, connections: Sequence[Any]) -> Iterator[Message]:
-        coming = iter(reader.messages(connections))
-        while True:
-            with _guarded(self.path, self._kind):
-                found = next(coming, None)
-                if found is None:
-                    return
-                connection, t_ns, raw = found
-                message = Message(connection.topic, t_ns, self._decoder(connection)(raw, connection.msgtype))
-            yield message
-
-    def _topic(self, name: str) -> Topic:
-        connections = [connection for connection in self._connections if connection.topic == name]
+    def _topic(self, name: str, connections: Sequence[Any]) -> Topic:
         types = sorted({connection.msgtype for connection in connections})
         count = sum(connection.msgcount or 0 for connection in connections)
-        unreadable = "" if types[0] not in KNOWN_TYPES else self._why_not(connections)
-        fields = "" if types[0] in KNOWN_TYPES else str(connections[0].msgdef.data)
-        return Topic(name, types[0] if len(types) == 1 else " and ".join(types), count, unreadable, fields)
+        if types[0] not in KNOWN_TYPES:
+            return Topic(name, " and ".join(types), count, fields=str(connections[0].msgdef.data))
+        return Topic(name, " and ".join(types), count, next(filter(None, map(self._why_not, connections)), ""))
 
-    def _why_not(self, connections: list[Any]) -> str:
+    def _why_not(self, connection: Any) -> str:
         """Return why messages of a known type cannot be read, nothing where they can."""
-        for connection in connections:
-            encoding = self._encoding(connection)
-            if encoding not in ("cdr", "ros1"):
-                return f"encoded as {printable(encoding)}"
-            digest, store = connection.digest, _store(encoding == "ros1")
-            if digest and digest != _digest(store, connection.msgtype, of_ros1=self._of_ros1):
-                return "of another definition than ROS's"
-        return ""
-
-    def _decoder(self, connection: Any) -> Callable[[bytes, str], Any]:
-        of_ros1 = self._encoding(connection) == "ros1"
-        store = _store(of_ros1)
-        decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if of_ros1 else store.deserialize_cdr
-        return decode
+        encoding = self._encoding(connection)
+        if encoding not in ("cdr", "ros1"):
+            return f"encoded as {printable(encoding)}"
+        other = connection.digest and connection.digest != _digest(
+            _store(encoding == "ros1"), connection.msgtype, of_ros1=self._of_ros1
+        )
+        return "of another definition than ROS's" if other else ""
 
     def _encoding(self, connection: Any) -> str:
         return "ros1" if self._of_ros1 else str(getattr(connection.ext, "serialization_format", "cdr"))
@@ -234,81 +208,49 @@ def opened(path: Path) -> Iterator[Bag]:
         raise DataError(f"{path}: is no bag of ROS 1 or 2 and no MCAP")
     if importlib.util.find_spec("rosbags") is None:
         raise DataError(f'{path}: bags are read with the package rosbags; pip install "vislam-toolkit[bags]"')
-    paths = [path]
-    if kind == "folder" and not _of_rosbag2(path / _METADATA):
-        paths = _parts(path)
-        path = paths[0] if len(paths) == 1 else path
-        kind = kind_of(paths[0])
-        assert kind is not None
+    parts = [path] if kind != "folder" or _of_rosbag2(path / _METADATA) else _parts(path)
+    kinds = {part: kind_of(part) for part in parts}
+    path = parts[0] if len(parts) == 1 else path
     with ExitStack() as closing:
         readers = []
-        for part in paths:
-            with _guarded(part, kind):
-                readers.append(_reader(kind)(part))
+        for part, of_part in kinds.items():
+            with _guarded(part):
+                readers.append(_reader(of_part)(part))
                 readers[-1].open()
                 closing.callback(readers[-1].close)
-        _check_order(paths, readers)
-        yield Bag(path, kind, readers)
+        with _guarded(path):
+            bag = Bag(path, readers, of_ros1="ros1" in kinds.values())
+        yield bag
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Return the one bag in a folder without metadata.yaml, or the parts of one that ROS 1 has split, in their order.
+    """Return the one bag in a folder without metadata.yaml, or the parts of one that ROS 1 has split.
 
     Raises DataError where there are several that are no such parts.
     """
     bags = _files_alone(folder)
-    if len(bags) == 1:
+    of_ros1 = {kind_of(bag) for bag in bags} == {"ros1"}
+    numbers = sorted(int(found[1]) for bag in bags if (found := _PART.search(bag.stem)))
+    if len(bags) == 1 or (of_ros1 and numbers == list(range(len(bags)))):
         return bags
-    names, kinds = printable(", ".join(bag.name for bag in bags))[:200], {kind_of(bag) for bag in bags}
-    if kinds != {"ros1"}:
-        raise DataError(
-            f"{folder}: holds {len(bags)} bags and no {_METADATA} that joins them: {names}; name one of them, or run "
-            "ros2 bag reindex on the folder"
-        )
-    places = {int(found[1]): bag for bag in bags if (found := _PART.search(bag.stem))}
-    if sorted(places) != list(range(len(bags))):
-        raise DataError(
-            f"{folder}: holds {len(bags)} bags: {names}; name one of them, or, if they are parts of one recording, let "
-            "their names end in _0, _1 and so on, as rosbag record --split does"
-        )
-    return [places[place] for place in range(len(bags))]
+    remedy = (
+        "if they are parts of one recording, let their names end in _0, _1 and so on, as rosbag record --split does"
+        if of_ros1
+        else "run ros2 bag reindex on the folder"
+    )
+    names = printable(", ".join(bag.name for bag in bags))[:200]
+    raise DataError(
+        f"{folder}: holds {len(bags)} bags and no {_METADATA} that joins them: {names}; name one of them, or {remedy}"
+    )
 
 
-def parts_beside(path: Path) -> tuple[str, ...]:
-    """Return a remark on what lies beside one part of a bag that ROS 1 has split; none where nothing does."""
-    if path.is_dir() or path.suffix != ".bag" or _PART.search(path.stem) is None:
-        return ()
-    others = [one.name for one in path.parent.glob("*.bag") if one.name != path.name and _PART.search(one.stem)]
-    if not others:
-        return ()
-    return (f"read alone; {printable(', '.join(sorted(others)))[:200]} beside it may go on: name the folder for all",)
-
-
-def _check_order(parts: Sequence[Path], readers: Sequence[Any]) -> None:
-    """Raise DataError where a part of a bag begins before the one ahead of it ends."""
-    for (before, earlier), (part, later) in pairwise(zip(parts, readers, strict=True)):
-        if later.message_count and later.start_time < earlier.end_time:
-            overlap_s = (earlier.end_time - later.start_time) / NS_PER_S
-            raise DataError(
-                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so they are not parts of one recording; "
-                "name one of them"
-            )
-
-
-def _reader(kind: Kind) -> Any:
+def _reader(kind: Kind | None) -> Any:
     """Return the class that reads a kind of bag, whatever the file is called."""
-    if kind == "ros1":
-        from rosbags.rosbag1 import Reader as Reader1
-
-        return Reader1
-    if kind == "folder":
-        from rosbags.rosbag2 import Reader as Reader2
-
-        return Reader2
+    from rosbags import rosbag1, rosbag2
     from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    return McapReader if kind == "mcap" else Sqlite3Reader
+    return {"ros1": rosbag1.Reader, "folder": rosbag2.Reader, "mcap": McapReader, "sqlite": Sqlite3Reader}[str(kind)]
 
 
 @cache
@@ -330,7 +272,7 @@ def _digest(store: Any, message_type: str, *, of_ros1: bool) -> str:
 
 
 @contextmanager
-def _guarded(path: Path, kind: Kind) -> Iterator[None]:
+def _guarded(path: Path) -> Iterator[None]:
     """Raise as DataError whatever the library raises: of a damaged bag that can be anything."""
     try:
         yield
@@ -343,8 +285,8 @@ def _guarded(path: Path, kind: Kind) -> Iterator[None]:
                 f"{path}: rosbags does not read such a bag ({why.removesuffix('; please report issue.')}); convert it "
                 "with ros2 bag convert or rosbag decompress, or install a newer rosbags"
             ) from error
-        of_folder = kind in ("mcap", "sqlite") and _of_rosbag2(path.parent / _METADATA)
-        remedy = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _REMEDIES[kind]
+        of_folder = path.is_file() and _of_rosbag2(path.parent / _METADATA)
+        remedy = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _REMEDY
         raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {remedy}") from error
 
 
@@ -468,17 +410,24 @@ def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> st
     return f"{path}: {why}; there are {there}"[:_LONGEST]
 
 
+def _alone(word: str) -> str:
+    """Return the pattern of a word as a word of its own, letters and digits apart."""
+    same_kind = r"\d" if word.isdigit() else r"[^\W\d_]"
+    return rf"(?<!{same_kind}){word}(?!{same_kind})"
+
+
+# What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
+_SIDES = ((_alone("0"), "1"), (_alone("1"), "2"), (_alone("l"), "r"), ("left", "right"), ("Left", "Right"))
+
+
+def _differ_by(one: str, two: str, pattern: str, other: str) -> bool:
+    """Say whether a name becomes another where one place that a pattern fits is exchanged."""
+    return two in (one[: at.start()] + other + one[at.end() :] for at in re.finditer(pattern, one))
+
+
 def _are_sides(one: str, two: str) -> bool:
     """Say whether two names differ in nothing but the side of a pair, the left one first."""
-    return any(_differ_by(one, two, left, right) for left, right in _SIDES) or any(
-        two in (one[: at.start()] + right + one[at.end() :] for at in re.finditer(left, one))
-        for left, right in _SIDES_ANYWHERE
-    )
-
-
-def _differ_by(one: str, two: str, word: str, other: str) -> bool:
-    """Say whether a name becomes another where a word in it is exchanged."""
-    return two in (one[:at] + other + one[at + len(word) :] for at in _places(one, word))
+    return any(_differ_by(one, two, left, right) for left, right in _SIDES)
 
 
 def _imu(imus: Sequence[Topic]) -> Topic | None:
@@ -490,20 +439,8 @@ def _imu(imus: Sequence[Topic]) -> Topic | None:
 
 def _partner(gyro: Topic | None, imus: Sequence[Topic]) -> Topic | None:
     """Return the accelerometer that has the name of a gyro but for that word."""
-    if gyro is None:
-        return None
-    return next((topic for topic in imus if _differ_by(gyro.name.lower(), topic.name.lower(), _GYRO, _ACCEL)), None)
-
-
-def _places(text: str, part: str) -> Iterable[int]:
-    """Yield where a part stands in a text as a word of its own, letters and digits apart."""
-    at = text.find(part)
-    while at >= 0:
-        before, after = text[at - 1 : at], text[at + len(part) : at + len(part) + 1]
-        same_kind = str.isdigit if part.isdigit() else str.isalpha
-        if not (same_kind(before) or same_kind(after)):
-            yield at
-        at = text.find(part, at + 1)
+    name = "" if gyro is None else gyro.name.lower()
+    return next((topic for topic in imus if _differ_by(name, topic.name.lower(), _alone(_GYRO), _ACCEL)), None)
 
 
 def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
@@ -520,12 +457,8 @@ def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
 
 
 def _truth(usable: Sequence[Topic]) -> Topic | None:
-    named = [topic for topic in _of_types(usable, _POSES) if any(_has_word(topic.name, word) for word in _OF_TRUTH)]
-    return _most(named)
-
-
-def _has_word(name: str, word: str) -> bool:
-    return any(True for _ in _places(name.lower(), word))
+    words = re.compile("|".join(map(_alone, _OF_TRUTH)), re.IGNORECASE)
+    return _most(topic for topic in _of_types(usable, _POSES) if words.search(topic.name))
 
 
 def _of_types(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:

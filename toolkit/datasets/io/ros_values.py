@@ -6,7 +6,7 @@ baseline; REP 103 (camera axes), REP 104 (rectified images), REP 105 (frames).
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from operator import attrgetter
@@ -35,39 +35,30 @@ from toolkit.datasets.io.fields import camera_matrix
 from toolkit.datasets.io.image_pairs import pinhole_of
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
-from toolkit.frontend import Camera, Pinhole, RectifiedPair, already_rectified, rectified
-from toolkit.geometry import Array, rotation_from_quaternion, se3, se3_inverse
+from toolkit.frontend import Camera, RectifiedPair, already_rectified, rectified
+from toolkit.geometry import Array, IntArray, rotation_from_quaternion, se3, se3_inverse
 from toolkit.measurements import NS_PER_S, MotionNoise
 from toolkit.models.noise import mems_imu, twist_noise
 from toolkit.motion_samples import MotionSamples, TwistSamples
 
 # Of the planar encodings the first plane is the brightness.
 _GREY = {
-    "mono8": np.uint8,
-    "8UC1": np.uint8,
-    "mono16": np.uint16,
-    "16UC1": np.uint16,
-    "nv12": np.uint8,
-    "nv21": np.uint8,
-    "nv24": np.uint8,
-    "i420": np.uint8,
+    **dict.fromkeys(("mono8", "8UC1", "nv12", "nv21", "nv24", "i420"), np.uint8),
+    **dict.fromkeys(("mono16", "16UC1"), np.uint16),
 }
-# Channels, and OpenCV's conversion. Names that end in 16 are of 16 bits.
+# Channels, and OpenCV's conversion; it names a pattern of Bayer by its second row, ROS by its first. Names that end in
+# 16 are of 16 bits.
 _COLOURS = {
     "rgb8": (3, "COLOR_RGB2GRAY"),
-    "bgr8": (3, "COLOR_BGR2GRAY"),
-    "8UC3": (3, "COLOR_BGR2GRAY"),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, "COLOR_BGR2GRAY")),
     "rgba8": (4, "COLOR_RGBA2GRAY"),
     "bgra8": (4, "COLOR_BGRA2GRAY"),
-    # OpenCV names a pattern by its second row, ROS by its first.
     "bayer_rggb8": (1, "COLOR_BayerBG2GRAY"),
     "bayer_bggr8": (1, "COLOR_BayerRG2GRAY"),
     "bayer_gbrg8": (1, "COLOR_BayerGR2GRAY"),
     "bayer_grbg8": (1, "COLOR_BayerGB2GRAY"),
-    "yuv422": (2, "COLOR_YUV2GRAY_UYVY"),
-    "yuv422_yuy2": (2, "COLOR_YUV2GRAY_YUY2"),
-    "uyvy": (2, "COLOR_YUV2GRAY_UYVY"),
-    "yuyv": (2, "COLOR_YUV2GRAY_YUY2"),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, "COLOR_YUV2GRAY_UYVY")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "COLOR_YUV2GRAY_YUY2")),
 }
 _COLOURS |= {
     f"{name.removesuffix('8')}16": what for name, what in _COLOURS.items() if name.startswith(("rgb", "bgr", "bayer"))
@@ -86,6 +77,11 @@ def stamp_ns(header: Any, recorded_ns: int) -> int:
 def is_stamped(header: Any) -> bool:
     """Say whether a header has a stamp."""
     return bool(header.stamp.sec or header.stamp.nanosec)
+
+
+def stamps_ns(messages: Sequence[Message]) -> IntArray:
+    """Return the stamps (N,) of messages as :func:`stamp_ns`."""
+    return np.array([stamp_ns(message.value.header, message.t_ns) for message in messages], dtype=np.int64)
 
 
 def grey(message: Any, what: str) -> Grey:
@@ -134,47 +130,21 @@ def image_file(message: Any, what: str) -> tuple[str, bytes]:
 
 def camera(info: Any, what: str) -> Camera:
     """Return the camera of a CameraInfo; raises DataError where it is not calibrated or its lens is not known."""
-    K = camera_matrix_of(info, what)
-    coefficients = np.asarray(_field(info, "D"), dtype=np.float64)
+    K, coefficients = _field(info, "K").reshape(3, 3), _field(info, "D")
+    if not (K.any() and np.isfinite(K).all() and info.width and info.height):
+        raise DataError(f"{what}: is not calibrated (K is zero or the size is missing); {_PUT_BESIDE}")
     name = str(info.distortion_model) if coefficients.any() else "none"
     model, coefficients = lens_of(what, name or "none", coefficients)
-    size_px = (int(info.width), int(info.height))
-    return Camera(pinhole_of(K), model, coefficients, size_px)
+    return Camera(pinhole_of(camera_matrix(Path(what), "K", K)), model, coefficients, _size(info))
 
 
-def camera_matrix_of(info: Any, what: str) -> Array:
-    """Return K (3, 3) of a CameraInfo."""
-    K = np.asarray(_field(info, "K"), dtype=np.float64).reshape(3, 3)
-    if not (K.any() and np.isfinite(K).all() and info.width and info.height):
-        raise DataError(
-            f"{what}: is not calibrated (K is zero or the size is missing); put a calibration beside the bag"
-        )
-    return camera_matrix(Path(what), "K", K)
-
-
-@dataclass(frozen=True, eq=False)
-class Rectification:
-    """What a CameraInfo says of rectified images: R_rect_cam (3, 3), fx, fy, cx, cy, and how far right the camera is.
-
-    That is from the origin of the rectified axes: 0 for most left cameras, and where nothing is stated.
-    """
-
-    R_rect_cam: Array
-    pinhole_px: Pinhole
-    right_m: float
-
-
-def rectification(info: Any) -> Rectification:
-    """Return how the images of a CameraInfo are rectified."""
-    P = np.asarray(_field(info, "P"), dtype=np.float64).reshape(3, 4)
-    right_m = -float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0
-    R_rect_cam = np.asarray(_field(info, "R"), dtype=np.float64).reshape(3, 3)
-    return Rectification(R_rect_cam if R_rect_cam.any() else np.eye(3), pinhole_of(P), right_m)
-
-
-def _field(info: Any, name: str) -> Any:
+def _field(info: Any, name: str) -> Array:
     """Return a field of a CameraInfo, which ROS 1 writes large and ROS 2 small."""
-    return getattr(info, name) if hasattr(info, name) else getattr(info, name.lower())
+    return np.asarray(getattr(info, name if hasattr(info, name) else name.lower()), dtype=np.float64)
+
+
+def _size(info: Any) -> tuple[int, int]:
+    return int(info.width), int(info.height)
 
 
 # Where messages have their vectors, by type: of an IMU rates and specific force, of others linear and angular velocity.
@@ -198,12 +168,17 @@ def columns(values: Sequence[Any], part: str, axes: str = "xyz") -> Array:
     return np.array([get(value) for value in values], dtype=np.float64).reshape(-1, len(axes))
 
 
-def poses_of(values: Sequence[Any], message_type: str) -> Array:
-    """Return x y z qx qy qz qw (N, 7) of messages of a type that has poses; a point's quaternion is NaN."""
+def poses_of(messages: Sequence[Message], message_type: str) -> tuple[IntArray, IntArray, Array]:
+    """Return stamps (N,) ns, each once and in order, of which message each is, and x y z qx qy qz qw (N, 7).
+
+    A point's quaternion is NaN.
+    """
+    t_ns, rows = np.unique(stamps_ns(messages), return_index=True)
+    values = [messages[row].value for row in rows.tolist()]
     if message_type == POINT:
-        return np.hstack([columns(values, "point"), np.full((len(values), 4), np.nan)])
+        return t_ns, rows, np.hstack([columns(values, "point"), np.full((len(values), 4), np.nan)])
     at, turn = _POSES[message_type]
-    return np.hstack([columns(values, at), columns(values, turn, "xyzw")])
+    return t_ns, rows, np.hstack([columns(values, at), columns(values, turn, "xyzw")])
 
 
 def frame_name(name: Any) -> str:
@@ -357,18 +332,8 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
     stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
     noise = () if twist else (NO_NOISE if stated is None else _STATED,)
     tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
-    notes = (f"calibration from {how} and {tf}", *noise, *_unused(*_infos(source)))
+    notes = (f"calibration from {how} and {tf}", *noise)
     return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)
-
-
-def _unused(topics: Sequence[Topic], infos: Sequence[Any]) -> Iterator[str]:
-    """Yield what calibrations state of a part of the image or of larger pixels, which is not used."""
-    for topic, info in zip(topics, infos, strict=True):
-        region, binned = info.roi, (int(info.binning_x), int(info.binning_y))
-        part = (int(region.width), int(region.height))
-        if max(binned) > 1 or (any(part) and part != _size(info)):
-            stated = f"binning {binned[0]} x {binned[1]}, region of interest {part[0]} x {part[1]} px"
-            yield f"not used of {topic.name}: {stated}; its camera matrix is taken for that of the images as they are"
 
 
 def _not_joined(source: Recorded) -> str:
@@ -401,30 +366,30 @@ def _folders_beside(path: Path) -> tuple[Path, ...]:
 def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     """Return the pair of cameras of the CameraInfo messages, that of images which come rectified, and the topics."""
     topics, infos = _infos(source)
-    what = [f"{source.path}: {topic.name}" for topic in topics]
-    left_rect, right_rect = (rectification(info) for info in infos)
+    what, size_px = [f"{source.path}: {topic.name}" for topic in topics], _size(infos[0])
     how = " and ".join(topic.name for topic in topics)
-    baseline_m = right_rect.right_m - left_rect.right_m
+    turns, projections = ([_field(info, name).reshape(3, -1) for info in infos] for name in "RP")
+    R_rect_left, R_rect_right = (R if R.any() else np.eye(3) for R in turns)
+    # How far right each camera is of the origin of the rectified axes; 0 where nothing is stated.
+    left_m, right_m = (-float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0 for P in projections)
+    pinhole_px, baseline_m = pinhole_of(projections[0]), right_m - left_m
     T_right_left = source.tree.between(*(source.frame_of(one) for one in (source.chosen.right, source.chosen.left)))
-    R_rect_left, R_rect_right = left_rect.R_rect_cam, right_rect.R_rect_cam
     if source.chosen.rectified:
         if not baseline_m > 0.0 and T_right_left is not None:
             baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
-        if not (baseline_m > 0.0 and left_rect.pinhole_px[0] > 0.0):
+        if not (baseline_m > 0.0 and pinhole_px[0] > 0.0):
             raise DataError(
                 f"{what[1]}: the images are rectified, P has no baseline (Tx is 0), and no /tf_static joins the two "
                 f"cameras; correct P, or {_PUT_BESIDE} and name the raw images"
             )
-        given = already_rectified(left_rect.pinhole_px, baseline_m, _size(infos[0]))
         # The frame of an image is the camera's own; R turns it into the rectified one's.
-        return replace(given, R_rect_cam=R_rect_left), None, how
+        return replace(already_rectified(pinhole_px, baseline_m, size_px), R_rect_cam=R_rect_left), None, how
     left, right = (camera(info, text) for info, text in zip(infos, what, strict=True))
     as_they_are = None
     if baseline_m > 0.0:
         # In rectified axes the right camera stands on x; R turns each camera's own axes into them.
-        shift_m = R_rect_right.T @ np.array([-baseline_m, 0.0, 0.0])
-        T_right_left = se3(R_rect_right.T @ R_rect_left, shift_m)
-        as_they_are = already_rectified(left_rect.pinhole_px, baseline_m, _size(infos[0]))
+        T_right_left = se3(R_rect_right.T @ R_rect_left, R_rect_right.T @ np.array([-baseline_m, 0.0, 0.0]))
+        as_they_are = already_rectified(pinhole_px, baseline_m, size_px)
     if T_right_left is None:
         raise DataError(f"{what[1]}: P has no baseline, and /tf_static does not join the two cameras; {_PUT_BESIDE}")
     return rectified(left, right, T_right_left, f"{source.path}: {how}"), as_they_are, how
@@ -443,7 +408,3 @@ def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
         infos.append(messages[0].value)
         topics.append(topic)
     return topics, infos
-
-
-def _size(info: Any) -> tuple[int, int]:
-    return int(info.width), int(info.height)

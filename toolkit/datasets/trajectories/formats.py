@@ -481,7 +481,7 @@ def read_poses(path: Path, cov_convention: CovConvention | None = None) -> Poses
     if place is None:
         return read_finite_poses(path, cov_convention).whole()
     # Here, because what reads messages imports what makes tracks of images.
-    from toolkit.datasets.trajectories.bags import read_topic
+    from toolkit.datasets.bags import read_topic
 
     return read_topic(*place, cov_convention)
 
