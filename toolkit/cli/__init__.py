@@ -74,6 +74,8 @@ def parser() -> Parser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
+    if "_ARGCOMPLETE" in os.environ:
+        completion.complete(parser())
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
     with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as end_requests:

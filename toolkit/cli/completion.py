@@ -1,31 +1,21 @@
-"""``vislam completion``: what a shell needs to complete commands, options, their choices and the names they take."""
-
-from __future__ import annotations
+"""``vislam completion``: the script with which a shell asks this program to complete a command line (argcomplete)."""
 
 import argparse
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
 
 from toolkit.cli.arguments import choice, command
+from toolkit.cli.parts import entries
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-
-class _Option(NamedTuple):
-    """The words of an option, what it is for, which words may follow it, and whether a value does."""
-
-    words: tuple[str, ...]
-    help: str
-    choices: tuple[str, ...]
-    takes_value: bool
-
-
-class _Command(NamedTuple):
-    """A subcommand, what it is for, and its options."""
-
-    name: str
-    help: str
-    options: tuple[_Option, ...]
+# Which names of vislam list an argument takes, by its destination.
+_KINDS = {
+    "estimators": "estimators",
+    "sequence": "sequences",
+    "sequences": "sequences",
+    "columns": "metrics",
+    "metric": "metrics",
+    "keep": "faults",
+    "set": "settings",
+}
 
 
 @command(
@@ -36,107 +26,28 @@ class _Command(NamedTuple):
 )
 def completion(options: argparse.Namespace) -> int:
     """Print a script that completes commands, options, their choices, and the names of estimators, built-in
-    sequences, metrics, faults and settings that are installed now. bash and zsh: put eval "$(vislam completion
+    sequences, metrics, faults and settings that are installed. bash and zsh: put eval "$(vislam completion
     bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as ~/.config/fish/completions/vislam.fish.
     """
-    from toolkit.cli import parser
+    from argcomplete.shell_integration import shellcode
 
-    commands = list(_commands(parser(), _known_names()))
-    print({"bash": _bash, "zsh": _zsh, "fish": _fish}[options.shell](commands), end="")
+    print(shellcode(["vislam"], shell=options.shell))
     return 0
 
 
-def _known_names() -> dict[str, tuple[str, ...]]:
-    """Return the names that arguments take without having them as choices, by the argument's destination."""
-    from toolkit import datasets, metrics
-    from toolkit.audit import faults
-    from toolkit.registry import discover
-    from toolkit.settings.reading import describe
+def complete(root: argparse.ArgumentParser) -> None:
+    """Answer a shell that asks for completions, and leave; return where none does."""
+    import argcomplete
 
-    return {
-        "estimators": tuple(discover()),
-        "sequence": datasets.built_in_names(),
-        "sequences": datasets.built_in_names(),
-        "columns": ("all", *metrics.describe()),
-        "metric": tuple(metrics.describe()),
-        "keep": tuple(faults()),
-        "set": tuple(f"{one.key}=" for one in describe()),
-    }
+    (commands,) = (one for one in root._actions if isinstance(one, argparse._SubParsersAction))
+    for parser in commands.choices.values():
+        for action in parser._actions:
+            if action.dest in _KINDS:
+                action.completer = partial(_known_names, _KINDS[action.dest])
+    argcomplete.autocomplete(root)
 
 
-def _commands(root: argparse.ArgumentParser, known: Mapping[str, tuple[str, ...]]) -> Iterator[_Command]:
-    (subcommands,) = (one for one in root._actions if isinstance(one, argparse._SubParsersAction))
-    helps = {one.dest: one.help or "" for one in subcommands._choices_actions}
-    for name, parser in subcommands.choices.items():
-        options = (
-            # Positional choices are offered where no option is under way.
-            _Option(
-                tuple(one.option_strings),
-                one.help or "",
-                tuple(map(str, one.choices or known.get(one.dest, ()))),
-                one.nargs != 0,
-            )
-            for one in parser._actions
-        )
-        yield _Command(name, helps[name], tuple(options))
-
-
-def _bash(commands: list[_Command]) -> str:
-    cases = "".join(f"    {one.name}) {_case(one)} ;;\n" for one in commands)
-    names = " ".join(one.name for one in commands)
-    return f"""# Completion of vislam for bash. Load it with: eval "$(vislam completion bash)"
-_vislam() {{
-  local word="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}" words="" chosen="" listed=""
-  if [ "$COMP_CWORD" -eq 1 ]; then
-    COMPREPLY=($(compgen -W "{names} --help --version" -- "$word"))
-    return
-  fi
-  case "${{COMP_WORDS[1]}}" in
-{cases}  esac
-  if [ -n "$chosen" ]; then
-    [[ "$word" == *,* ]] && listed="${{word%,*}},"
-    COMPREPLY=($(compgen -P "$listed" -W "$chosen" -- "${{word##*,}}"))
-    [[ "${{COMPREPLY[0]-}}" == *= ]] && compopt -o nospace 2>/dev/null
-  else
-    COMPREPLY=($(compgen -W "$words" -- "$word"))
-  fi
-}}
-complete -o default -F _vislam vislam
-"""
-
-
-def _case(one: _Command) -> str:
-    words = " ".join(word for option in one.options for word in (option.words or option.choices))
-    chosen = " ".join(
-        f'{"|".join(option.words)}) chosen="{" ".join(option.choices)}" ;;'
-        for option in one.options
-        if option.words and option.choices
-    )
-    return f'words="{words}"' + (f'; case "$before" in {chosen} esac' if chosen else "")
-
-
-def _zsh(commands: list[_Command]) -> str:
-    script = _bash(commands).split("\n", 1)[1]
-    head = '# Completion of vislam for zsh. Load it with: eval "$(vislam completion zsh)"\n'
-    return f"{head}autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n{script}"
-
-
-def _fish(commands: list[_Command]) -> str:
-    lines = ["# Completion of vislam for fish: save as ~/.config/fish/completions/vislam.fish"]
-    lines.append("complete -c vislam -n __fish_use_subcommand -l help -l version")
-    for one in commands:
-        lines.append(f"complete -c vislam -n __fish_use_subcommand -a {one.name} -d {_quoted(one.help)}")
-        under = f"complete -c vislam -n '__fish_seen_subcommand_from {one.name}'"
-        for option in one.options:
-            if not option.words:
-                lines += [f"{under} -a {_quoted(' '.join(option.choices))}"] if option.choices else []
-                continue
-            words = " ".join(f"-l {w[2:]}" if w.startswith("--") else f"-s {w[1:]}" for w in option.words)
-            values = f" -x -a {_quoted(' '.join(option.choices))}" if option.choices else " -r" * option.takes_value
-            lines.append(f"{under} {words}{values} -d {_quoted(option.help)}")
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("%%", "%").replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{escaped}'"
+def _known_names(kind: str, prefix: str, **_: object) -> list[str]:
+    """Return the names of a kind behind what stands of a list already."""
+    before, comma, _last = prefix.rpartition(",")
+    return [f"{before}{comma}{name}{'=' if kind == 'settings' else ''}" for name in entries(kind)]

@@ -30,14 +30,14 @@ def list_parts(options: argparse.Namespace) -> int:
     kind, how many there are of each.
     """
     if options.kind is None:
-        print("\n".join(_summary(kind, list(_entries(kind))) for kind in KINDS))
+        print("\n".join(_summary(kind, list(entries(kind))) for kind in KINDS))
         print(f"\nvislam list KIND prints one of them: {', '.join(KINDS)}")
     else:
-        print(_listing(_entries(options.kind)))
+        print(_listing(entries(options.kind)))
     return 0
 
 
-def _entries(kind: str) -> Mapping[str, str]:
+def entries(kind: str) -> Mapping[str, str]:
     """Return the names of a kind with their one-line summaries."""
     from toolkit import datasets, metrics
     from toolkit.audit import faults

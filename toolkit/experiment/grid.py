@@ -4,7 +4,7 @@ Whoever asks what a change costs or brings lists the trials; what is not kept fr
 """
 
 from collections.abc import Hashable, Iterable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ import msgspec
 from toolkit.answers import Output, Status
 from toolkit.errors import no_such
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.outcome_store import NOWHERE, settings_of_a_run
+from toolkit.experiment.outcome_store import settings_of_a_run
 from toolkit.experiment.pipeline import Job, Plan, located, outcomes_of, prepared_cases, store_of, workers_of
 from toolkit.experiment.recording import WHOLE, Prepared
 from toolkit.experiment.units import Outcome, Unit
@@ -126,7 +126,7 @@ def run_grid(
         case = case or prepared_case(plan, progress_for)
         for faults in dict.fromkeys(trial.faults for trial in plans):
             planted(case.sequence, faults, plan.seeds[0])
-        with closing(NOWHERE if directory is None else store_of(plan, case, directory)) as store:
+        with nullcontext() if directory is None else closing(store_of(plan, case, directory)) as store:
             jobs: dict[Hashable, Job] = {}
             of_trial: dict[Trial, list[Hashable]] = {trial: [] for trial in plans}
             for trial, unit in _units(plans, case):

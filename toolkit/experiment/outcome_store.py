@@ -7,10 +7,11 @@ one outcome, exactly, and all that it depends on (docs/scaling.md).
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -20,21 +21,24 @@ from toolkit.answers import Output, Status
 from toolkit.errors import DataError, OutputError
 from toolkit.experiment.code_version import code_digest, numeric_versions
 from toolkit.experiment.units import Outcome, Scored, Unit
+from toolkit.files.documents import of_attributes
 from toolkit.files.reading import read_input
 from toolkit.files.writing import LineFile, plain_name, whole_lines
 from toolkit.geometry import Array
 from toolkit.metrics import Scores, repeated, without_requests
 from toolkit.settings import Settings, as_values
 
-# JSON has no such numbers; null stands for NaN.
-Infinite = Literal["inf", "-inf"]
-Number = float | Infinite | None
+# JSON has neither NaN, which is null, nor infinities, which are the texts inf and -inf.
+Number = float | str | None
 Series = Annotated[tuple[Number, ...], Meta(description="one a frame; null where unknown")]
 OUTCOMES, _TRAJECTORIES = "outcomes.jsonl", "trajectories"
-# Every line of such a file begins so.
-_OUR_START = b'{"schema":"vislam.outcome'
-_NO_CHECKSUM = b'"sha256":""}'
+# Every line of such a file begins so. Those of the first version had no checksum, and are of other code.
+_OUR_START, _OF_VERSION_1 = b'{"schema":"vislam.outcome', b'{"schema":"vislam.outcome/1"'
 _FILES_START = b'{"schema":"vislam.outcome-files/1"'
+# Series of an output.
+_SERIES = ("nees_pose", "position_m", "drift_m", "heldout_px")
+# A line ends with its checksum.
+_CHECKSUM = slice(-66, -2)
 
 
 class UnitKey(Struct, frozen=True, kw_only=True):
@@ -66,11 +70,8 @@ class ScoredRecord(Struct, frozen=True, kw_only=True):
     heldout_px: Annotated[tuple[Number, ...], Meta(description="over equal stretches of time")] = ()
 
 
-class UncheckedRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/1"):
-    """An outcome without a checksum, as earlier versions wrote it: of other code, and so never found.
-
-    A final output that only repeats the causal one is not there.
-    """
+class OutcomeRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/2"):
+    """An outcome as its line holds it; a final output that only repeats the causal one is not there."""
 
     unit: UnitKey
     requested: Annotated[tuple[str, ...], Meta(description="metrics on request that were computed")]
@@ -80,12 +81,7 @@ class UncheckedRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag
     outputs: dict[Output, ScoredRecord]
     files: Annotated[dict[str, str], Meta(description="SHA-256 of its trajectories by their relative paths")]
     log: tuple[str, ...]
-
-
-class OutcomeRecord(UncheckedRecord, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/2"):
-    """An outcome as its line holds it."""
-
-    sha256: Annotated[str, Meta(description="of the line with this empty: a line that was edited is refused")]
+    sha256: Annotated[str, Meta(description="of the line with this empty: a line that was edited is refused")] = ""
 
 
 class FilesRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome-files/1"):
@@ -94,128 +90,52 @@ class FilesRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vi
     files: tuple[str, ...]
 
 
-def record_of(outcome: Outcome, unit: UnitKey, requested: tuple[str, ...], files: dict[str, str]) -> OutcomeRecord:
-    """Return an outcome as a line holds it, with its trajectory files; the run itself is left out."""
-    repeats = outcome.final_is_causal
-    return OutcomeRecord(
-        unit=unit,
-        requested=requested,
-        status=outcome.status,
-        sequence_hash=outcome.sequence_hash,
-        final_is_causal=repeats,
-        outputs={k: _scored_record(v) for k, v in outcome.outputs.items() if not (repeats and k == "final")},
-        files=files,
-        log=outcome.log,
-        sha256="",
-    )
-
-
-def line_of(record: OutcomeRecord) -> bytes:
-    """Return the line of an outcome, with its checksum, which stands last."""
+def _line_of(record: OutcomeRecord) -> bytes:
+    """Return the line of an outcome with its checksum."""
     line = msgspec.json.encode(record)
-    assert line.endswith(_NO_CHECKSUM)
-    return _with_checksum(line, hashlib.sha256(line).hexdigest())
+    return line[:-2] + hashlib.sha256(line).hexdigest().encode() + line[-2:]
 
 
-def _with_checksum(line: bytes, digest: str) -> bytes:
-    return line.removesuffix(_NO_CHECKSUM) + _NO_CHECKSUM[:-2] + digest.encode() + _NO_CHECKSUM[-2:]
+def _is_as_written(line: bytes) -> bool:
+    bare = line[: _CHECKSUM.start] + line[_CHECKSUM.stop :]
+    return hashlib.sha256(bare).hexdigest().encode() == line[_CHECKSUM]
 
 
-def _is_as_written(line: bytes, record: OutcomeRecord) -> bool:
-    """Say whether the checksum of a line is that of the line."""
-    end = _with_checksum(_NO_CHECKSUM, record.sha256)
-    bare = line.removesuffix(end) + _NO_CHECKSUM
-    return line.endswith(end) and hashlib.sha256(bare).hexdigest() == record.sha256
-
-
-def outcome_of_record(record: OutcomeRecord, requested: tuple[str, ...]) -> Outcome:
+def _outcome_of(record: OutcomeRecord, requested: tuple[str, ...]) -> Outcome:
     """Return the outcome of a line to the bit, without metrics on request that are not ``requested``."""
     outputs = {output: _scored(one, requested) for output, one in record.outputs.items()}
     if record.final_is_causal:
-        causal = outputs["causal"]
-        final = replace(causal, scores=repeated(causal.scores))
-        outputs = {"causal": causal, "final": final}
+        outputs["final"] = replace(outputs["causal"], scores=repeated(outputs["causal"].scores))
     return Outcome(
-        seed=record.unit.seed,
-        estimator=record.unit.estimator,
-        status=record.status,
-        outputs=outputs,
-        log=record.log,
-        sequence_hash=record.sequence_hash,
-        final_is_causal=record.final_is_causal,
-        files=record.files,
-    )
+        record.unit.seed, record.unit.estimator, record.status, outputs, record.log, record.sequence_hash,
+        record.final_is_causal, files=record.files,
+    )  # fmt: skip
 
 
 def _scored_record(scored: Scored) -> ScoredRecord:
     return ScoredRecord(
-        values={key: _plain(value) for key, value in scored.scores.values.items()},
+        values={k: v.item() if isinstance(v, np.generic) else v for k, v in scored.scores.values.items()},
         notes=dict(scored.scores.notes),
-        nees_pose=_numbers(scored.nees_pose),
-        position_m=_numbers(scored.position_m),
         nis_dof=None if scored.nis_dof is None else _number(float(scored.nis_dof)),
-        drift_m=_numbers(scored.drift_m),
-        heldout_px=_numbers(scored.heldout_px),
+        **{name: tuple(map(_number, getattr(scored, name).tolist())) for name in _SERIES},
     )
-
-
-def _plain(value: float | None) -> float | None:
-    """Return a number of NumPy's as Python's, whole ones whole."""
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _scored(record: ScoredRecord, requested: tuple[str, ...]) -> Scored:
     scores = without_requests(Scores(dict(record.values), dict(record.notes)), requested)
     nis_dof = None if record.nis_dof is None else float(record.nis_dof)
-    stretches = _series(record.drift_m), _series(record.heldout_px)
-    return Scored(scores, _series(record.nees_pose), _series(record.position_m), nis_dof, *stretches)
-
-
-def _numbers(values: Array) -> tuple[Number, ...]:
-    return tuple(_number(value) for value in values.tolist())
+    return Scored(scores, nis_dof=nis_dof, **{name: _array(getattr(record, name)) for name in _SERIES})
 
 
 def _number(value: float) -> Number:
-    if math.isfinite(value):
-        return value
-    return None if math.isnan(value) else "inf" if value > 0.0 else "-inf"
+    return value if math.isfinite(value) else None if math.isnan(value) else str(value)
 
 
-def _series(numbers: tuple[Number, ...]) -> Array:
-    return np.array([math.nan if number is None else float(number) for number in numbers], dtype=float)
+def _array(numbers: tuple[Number, ...]) -> Array:
+    return np.array([math.nan if number is None else number for number in numbers], dtype=float)
 
 
-_DECODER = msgspec.json.Decoder(OutcomeRecord | UncheckedRecord | FilesRecord)
-
-
-class Store(Protocol):
-    """Where outcomes are looked for before a unit is run, and kept when it has ended."""
-
-    def find(self, unit: Unit) -> Outcome | None:
-        """Return the outcome of a unit, or None where it has to be run."""
-
-    def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
-        """Keep an outcome; return it as it will be found again."""
-
-    def close(self) -> None:
-        """Let others add to what is kept."""
-
-
-class Nowhere:
-    """Keeps nothing: every unit is run, and its outcome is in memory alone."""
-
-    def find(self, _unit: Unit) -> None:
-        """Find nothing."""
-
-    def keep(self, _unit: Unit, outcome: Outcome) -> Outcome:
-        """Return the outcome."""
-        return outcome
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-NOWHERE = Nowhere()
+_DECODER = msgspec.json.Decoder(OutcomeRecord | FilesRecord)
 
 
 @dataclass(frozen=True)
@@ -275,21 +195,37 @@ class OutcomeStore:
         self._path = directory / OUTCOMES
         self._lines = LineFile(self._path) if self._path.exists() else None
         self._records: dict[bytes, list[OutcomeRecord]] = {}
-        self._unchecked = 0
+        self._of_version_1 = 0
         try:
-            for record in _records_in(self._path):
-                if isinstance(record, OutcomeRecord):
-                    self._records.setdefault(record.unit.text(), []).append(record)
-                self._unchecked += type(record) is UncheckedRecord
+            for number, line in enumerate(whole_lines(read_input(self._path)) if self._lines else (), start=1):
+                self._read(line, number)
         except BaseException:
             self.close()
             raise
+
+    def _read(self, line: bytes, number: int) -> None:
+        """Take in a line; a last one without its end, cut off by a kill, is none."""
+        if line.startswith(_OF_VERSION_1):
+            self._of_version_1 += 1
+            return
+        try:
+            record = _DECODER.decode(line)
+        except msgspec.DecodeError as error:
+            why = f"is no outcome ({' '.join(str(error).split())}); delete the line, and repeat"
+            raise DataError(f"{self._path}, line {number}: {why}") from error
+        if isinstance(record, OutcomeRecord) and not _is_as_written(line):
+            raise DataError(
+                f"{self._path}, line {number}: was changed since it was written, for its checksum is another; delete "
+                "the line, and repeat: its run is made anew"
+            )
+        if isinstance(record, OutcomeRecord):
+            self._records.setdefault(record.unit.text(), []).append(record)
 
     @property
     def unusable(self) -> int:
         """Return how many outcomes are of other data, code or repairs, so that no unit of the case can use them."""
         of_others = (not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
-        return self._unchecked + sum(of_others)
+        return self._of_version_1 + sum(of_others)
 
     @property
     def is_there(self) -> bool:
@@ -303,10 +239,12 @@ class OutcomeStore:
         metric_keys = unit.settings.metrics.requested()
         for record in self._records.get(self._conditions.key(unit).text(), []):
             if set(metric_keys) <= set(record.requested):
-                files = self._unchanged(record.files)
-                if not unit.keep_trajectories or files.keys() == _names(unit, record.final_is_causal, record.outputs):
+                outcome = _outcome_of(record, metric_keys)
+                unchanged = {k: v for k, v in record.files.items() if _digest(self._directory / k) == v}
+                wanted = {trajectory_file(unit, output) for output in outcome.outputs}
+                if not unit.keep_trajectories or unchanged.keys() == wanted:
                     self.found += 1
-                    return replace(outcome_of_record(record, metric_keys), files=files)
+                    return replace(outcome, files=unchanged)
         return None
 
     def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
@@ -320,12 +258,14 @@ class OutcomeStore:
             self._lines.append(msgspec.json.encode(FilesRecord(files=tuple(texts))))
             self._write(texts)
         digests = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
-        metric_keys = unit.settings.metrics.requested()
-        line = line_of(record_of(outcome, self._conditions.key(unit), metric_keys, digests))
-        self._lines.append(line)
-        kept = _DECODER.decode(line)
-        assert isinstance(kept, OutcomeRecord)
-        return outcome_of_record(kept, metric_keys)
+        metric_keys, repeats = unit.settings.metrics.requested(), outcome.final_is_causal
+        outputs = {k: _scored_record(v) for k, v in outcome.outputs.items() if not (repeats and k == "final")}
+        record = of_attributes(
+            OutcomeRecord, outcome, unit=self._conditions.key(unit), requested=metric_keys, outputs=outputs,
+            files=digests, sha256="",
+        )  # fmt: skip
+        self._lines.append(_line_of(record))
+        return _outcome_of(record, metric_keys)
 
     def close(self) -> None:
         """Let other processes add to the file."""
@@ -343,19 +283,10 @@ class OutcomeStore:
             why = error.strerror or error
             raise OutputError(f"{self._directory / name} cannot be written ({why}); make room, and repeat") from error
 
-    def _unchanged(self, files: Mapping[str, str]) -> dict[str, str]:
-        """Return those of some files that are there as they were written."""
-        return {name: digest for name, digest in files.items() if _digest(self._directory / name) == digest}
-
 
 def trajectory_file(unit: Unit, output: Output) -> str:
     """Return where in a run directory the trajectory of a unit's output is kept."""
     return f"{_TRAJECTORIES}/seed-{unit.seed}/{plain_name(unit.estimator)}_{output}.tum"
-
-
-def _names(unit: Unit, final_is_causal: bool, outputs: Iterable[Output]) -> set[str]:
-    both: tuple[Output, ...] = ("causal", "final")
-    return {trajectory_file(unit, output) for output in (both if final_is_causal else outputs)}
 
 
 def files_of_ours(directory: Path) -> frozenset[str]:
@@ -370,31 +301,11 @@ def files_of_ours(directory: Path) -> frozenset[str]:
     return frozenset({OUTCOMES, *(name for line in named for name in _files_named(line))})
 
 
-def _files_named(line: bytes) -> tuple[str, ...]:
-    try:
-        record = _DECODER.decode(line)
-    except msgspec.DecodeError:
-        return ()
-    named = record.files if isinstance(record, FilesRecord) else ()
-    return tuple(name for name in named if PurePosixPath(name).parts[:1] == (_TRAJECTORIES,) and ".." not in name)
-
-
-def _records_in(path: Path) -> Iterable[UncheckedRecord | FilesRecord]:
-    """Yield what the lines of a file hold; a last line without its end was cut off by a kill and is not read."""
-    if not path.exists():
-        return
-    for number, line in enumerate(whole_lines(read_input(path)), start=1):
-        try:
-            record = _DECODER.decode(line)
-        except msgspec.DecodeError as error:
-            what = " ".join(str(error).split())
-            raise DataError(f"{path}, line {number}: is no outcome ({what}); delete the line, and repeat") from error
-        if isinstance(record, OutcomeRecord) and not _is_as_written(line, record):
-            raise DataError(
-                f"{path}, line {number}: was changed since it was written, for its checksum is another; delete the "
-                "line, and repeat: its run is made anew"
-            )
-        yield record
+def _files_named(line: bytes) -> Iterator[str]:
+    with suppress(msgspec.DecodeError):
+        for name in msgspec.json.decode(line, type=FilesRecord).files:
+            if PurePosixPath(name).parts[:1] == (_TRAJECTORIES,) and ".." not in name:
+                yield name
 
 
 def _digest(path: Path) -> str | None:

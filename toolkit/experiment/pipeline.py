@@ -12,7 +12,7 @@ from toolkit.errors import DataError
 from toolkit.estimator import Build
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
-from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
+from toolkit.experiment.outcome_store import Conditions, OutcomeStore
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
 from toolkit.experiment.references import (
     ExternalFile,
@@ -190,7 +190,7 @@ def comparisons(
     cases: Sequence[Prepared],
     workers: Pool,
     progress_for: ProgressFor = silent,
-    stores: Sequence[Store] = (),
+    stores: Sequence[OutcomeStore] = (),
 ) -> Iterator[Comparison]:
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
@@ -198,11 +198,8 @@ def comparisons(
     so. Raises DataError where a recording cannot be used under a seed.
     """
     entries = find_all(plan.estimators)
-    jobs = [
-        Job(unit, store)
-        for case, store in zip(cases, stores or [NOWHERE] * len(cases), strict=True)
-        for unit in _units(plan, case, entries)
-    ]
+    kept: Sequence[OutcomeStore | None] = stores or [None] * len(cases)
+    jobs = [Job(unit, store) for case, store in zip(cases, kept, strict=True) for unit in _units(plan, case, entries)]
     outcomes: list[list[Outcome]] = [[] for _ in cases]
     names, shown = ", ".join(dict.fromkeys(case.name for case in cases)), 0
     for place, outcome in outcomes_of(jobs, workers, names, progress_for):
@@ -215,10 +212,10 @@ def comparisons(
 
 
 class Job(NamedTuple):
-    """A unit of work, and where its outcome is looked for first and kept afterwards."""
+    """A unit of work, and where its outcome is looked for first and kept afterwards, if anywhere."""
 
     unit: Unit
-    store: Store = NOWHERE
+    store: OutcomeStore | None = None
 
 
 def outcomes_of(
@@ -228,7 +225,7 @@ def outcomes_of(
 
     A job whose process died is a run that failed. Raises DataError where a recording cannot be used.
     """
-    found = [job.store.find(job.unit) for job in jobs]
+    found = [None if job.store is None else job.store.find(job.unit) for job in jobs]
     yield from ((place, one) for place, one in enumerate(found) if one is not None)
     missing = [place for place, one in enumerate(found) if one is None]
     there = f" ({len(jobs) - len(missing)} are there)" if len(missing) < len(jobs) else ""
@@ -263,9 +260,9 @@ def located(source: str | Recorded) -> str | Recorded:
     return str(Path(source).expanduser().absolute())
 
 
-def _outcome(result: Outcome | LostUnit, unit: Unit, store: Store) -> Outcome:
+def _outcome(result: Outcome | LostUnit, unit: Unit, store: OutcomeStore | None) -> Outcome:
     if isinstance(result, Outcome):
-        return store.keep(unit, result)
+        return result if store is None else store.keep(unit, result)
     return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
 
 
