@@ -24,12 +24,12 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.sequence import Sequence
 
 __all__ = [
+    "CONTRACT_KEYS",
     "ENTRY_POINT_GROUP",
     "Evaluation",
     "Metric",
     "Scores",
     "Unavailable",
-    "contract_keys",
     "describe",
     "evaluate",
     "is_on_request",
@@ -44,6 +44,14 @@ __all__ = [
 ]
 
 ENTRY_POINT_GROUP = "toolkit.metrics"
+# The keys that every ``vislam.metrics/1`` document has, whatever metrics were added since.
+_CONTRACT = """
+ate_none_m ate_se3_m ate_yaw_m ate_sim3_m ate_se3_deg rpe_1s_m rpe_1s_deg rpe_100m_percent kitti_t_percent
+kitti_r_deg_per_m end_drift_percent reproj_median_px reproj_rmse_px heldout_reproj_median_px heldout_reproj_rmse_px
+nis_mean nees_pose_mean nees_ori_mean nees_pos_mean nees_pose_in_band_percent coverage_percent pairs
+frame_ms_mean frame_ms_p95 frame_ms_max total_s cpu_s peak_rss_mb
+"""
+CONTRACT_KEYS = tuple(_CONTRACT.split())
 _ON_REQUEST = "computed on request"
 
 
@@ -105,7 +113,8 @@ def _found() -> tuple[tuple[_MetricFile, ...], dict[str, str]]:
     """
     files: list[_MetricFile] = []
     missing: dict[str, str] = {}
-    for module in (*_own_modules(), *announced(ENTRY_POINT_GROUP)):
+    own = sorted(modules_in(__name__, __path__), key=lambda module: module.module)
+    for module in (*own, *announced(ENTRY_POINT_GROUP)):
         try:
             files.append(_MetricFile.loaded(module))
         except MissingDependency as dependency:
@@ -116,10 +125,6 @@ def _found() -> tuple[tuple[_MetricFile, ...], dict[str, str]]:
         here = [file.path for file in files if set(twice) & set(file.keys)]
         raise ExtensionError(f"{' and '.join(here)}: both declare {', '.join(twice)}; rename it in one of them")
     return tuple(sorted(files, key=lambda file: file.order)), missing
-
-
-def _own_modules() -> list[FoundModule]:
-    return sorted(modules_in(__name__, __path__), key=lambda module: module.module)
 
 
 def _files() -> tuple[_MetricFile, ...]:
@@ -139,12 +144,6 @@ def describe() -> dict[str, str]:
 def unavailable() -> dict[str, str]:
     """Return the metric files that cannot be imported here, by name, with the missing dependency."""
     return dict(_found()[1])
-
-
-def contract_keys() -> tuple[str, ...]:
-    """Return the keys that every ``vislam.metrics/1`` document has, in its order."""
-    files = sorted(map(_MetricFile.loaded, _own_modules()), key=lambda file: file.order)
-    return tuple(metric.key for file in files for metric in file.metrics if metric.in_contract)
 
 
 def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:

@@ -24,7 +24,6 @@ METRICS = (
         "m",
         ("ATE", "none"),
         over_seeds=True,
-        in_contract=True,
     ),
     Metric(
         "ate_se3_m",
@@ -32,8 +31,6 @@ METRICS = (
         "m",
         ("ATE", "SE(3)"),
         table="always",
-        gate_name="position error (ATE, SE(3))",
-        in_contract=True,
     ),
     Metric(
         "ate_yaw_m",
@@ -42,25 +39,9 @@ METRICS = (
         ("ATE", "yaw"),
         table="always",
         over_seeds=True,
-        gate_name="position error (ATE, yaw)",
-        in_contract=True,
     ),
-    Metric(
-        "ate_sim3_m",
-        "RMSE of position after fitting rotation, translation and scale (m)",
-        "m",
-        ("ATE", "Sim(3)"),
-        gate_name="position error (ATE, Sim(3))",
-        in_contract=True,
-    ),
-    Metric(
-        "ate_se3_deg",
-        "RMSE of the rotation angle after the fit of ate_se3_m (deg)",
-        "deg",
-        ("ATE rot", "SE(3)"),
-        gate_name="rotation error (ATE, SE(3))",
-        in_contract=True,
-    ),
+    Metric("ate_sim3_m", "RMSE of position after fitting rotation, translation and scale (m)", "m", ("ATE", "Sim(3)")),
+    Metric("ate_se3_deg", "RMSE of the rotation angle after the fit of ate_se3_m (deg)", "deg", ("ATE rot", "SE(3)")),
 )
 # A remark is made where the estimate's world is tilted by this angle (deg) and the tilt explains more than half of the
 # squared error of the fit that keeps the vertical. A smaller tilt is the estimator's own error, or that of a given

@@ -145,10 +145,7 @@ def _rms_error_m(evaluation: Evaluation) -> float:
 
 
 def _sizes(bound: Array) -> dict[str, float | None]:
-    return {
-        "bound_position_m": _rms(bound, POSITION),
-        "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION))),
-    }
+    return {"bound_position_m": _rms(bound, POSITION), "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION)))}
 
 
 def _claims(stated: Array, bound: Array, blocks: dict[str, slice | None]) -> dict[str, float | None]:

@@ -9,31 +9,12 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 90
 METRICS = (
-    Metric(
-        "frame_ms_mean",
-        "mean wall-clock time of a step, the first included (ms)",
-        "ms",
-        ("wall", "frame"),
-        in_contract=True,
-    ),
-    Metric("frame_ms_p95", "95th percentile of the same (ms)", "ms", ("frame", "p95"), in_contract=True),
-    Metric("frame_ms_max", "longest step (ms)", "ms", ("frame", "max"), in_contract=True),
-    Metric(
-        "total_s",
-        "wall-clock time of all steps and the finish (s)",
-        "s",
-        ("total", ""),
-        table="always",
-        in_contract=True,
-    ),
-    Metric("cpu_s", "processor time of all threads (s)", "s", ("CPU", ""), in_contract=True),
-    Metric(
-        "peak_rss_mb",
-        "peak resident memory of the process during the run (MB)",
-        "MB",
-        ("peak", "memory"),
-        in_contract=True,
-    ),
+    Metric("frame_ms_mean", "mean wall-clock time of a step, the first included (ms)", "ms", ("wall", "frame")),
+    Metric("frame_ms_p95", "95th percentile of the same (ms)", "ms", ("frame", "p95")),
+    Metric("frame_ms_max", "longest step (ms)", "ms", ("frame", "max")),
+    Metric("total_s", "wall-clock time of all steps and the finish (s)", "s", ("total", ""), table="always"),
+    Metric("cpu_s", "processor time of all threads (s)", "s", ("CPU", "")),
+    Metric("peak_rss_mb", "peak resident memory of the process during the run (MB)", "MB", ("peak", "memory")),
     Metric(
         "frame_cpu_ms_mean",
         "processor time of all threads, the finish included, over the number of steps (ms)",

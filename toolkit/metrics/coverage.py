@@ -15,8 +15,6 @@ METRICS = (
         name="coverage",
         best="most",
         table="where rows differ",
-        gate_name="coverage",
-        in_contract=True,
     ),
     Metric(
         "pairs",
@@ -26,7 +24,6 @@ METRICS = (
         best="",
         table="where rows differ",
         count=True,
-        in_contract=True,
     ),
 )
 

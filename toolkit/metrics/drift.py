@@ -12,7 +12,6 @@ METRICS = (
         "position error at the end with only the first pose placed, over the true path (percent)",
         "%",
         ("end", "drift"),
-        in_contract=True,
     ),
 )
 

@@ -29,8 +29,6 @@ METRICS = (
         ("NIS", "mean"),
         best="one",
         over_seeds=True,
-        gate_name="consistency (NIS)",
-        in_contract=True,
     ),
     Metric(
         ACCEPTED,

@@ -14,18 +14,10 @@ from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 ORDER = 30
 METRICS = (
     Metric(
-        "kitti_t_percent",
-        "mean translation error over segments of 100 ... 800 m (percent)",
-        "%",
-        ("KITTI", "trans"),
-        in_contract=True,
+        "kitti_t_percent", "mean translation error over segments of 100 ... 800 m (percent)", "%", ("KITTI", "trans")
     ),
     Metric(
-        "kitti_r_deg_per_m",
-        "mean rotation error over segments of 100 ... 800 m (deg/m)",
-        "deg/m",
-        ("KITTI", "rot"),
-        in_contract=True,
+        "kitti_r_deg_per_m", "mean rotation error over segments of 100 ... 800 m (deg/m)", "deg/m", ("KITTI", "rot")
     ),
 )
 SEGMENT_LENGTHS_M = np.arange(100.0, 801.0, 100.0)

@@ -32,8 +32,6 @@ _OF_POSE = (
         best="one",
         table="always",
         over_seeds=True,
-        gate_name="consistency (NEES)",
-        in_contract=True,
     ),
     Metric(
         "nees_ori_mean",
@@ -42,7 +40,6 @@ _OF_POSE = (
         ("NEES", "rot"),
         best="one",
         over_seeds=True,
-        in_contract=True,
     ),
     Metric(
         "nees_pos_mean",
@@ -51,7 +48,6 @@ _OF_POSE = (
         ("NEES", "pos"),
         best="one",
         over_seeds=True,
-        in_contract=True,
     ),
     Metric(
         "nees_pose_in_band_percent",
@@ -59,7 +55,6 @@ _OF_POSE = (
         "%",
         ("NEES", "in band"),
         best="most",
-        in_contract=True,
     ),
 )
 _OF_STATE = tuple(

@@ -21,7 +21,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import CAP_PX, FEWEST_VIEWS, errors_left_out, reprojection_errors_px
-from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models import stereo
 from toolkit.models.corrections import belief_at
 from toolkit.models.motion import motion_model
@@ -41,50 +41,27 @@ MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
 _OF_CAUSAL = ": look for wrong tracks, or corrections it takes back later"
 _OF_FINAL = ": look for wrong tracks or a wrong calibration"
-
-
-def _pixel_metrics(
-    prefix: str,
-    error: str,
-    whose: str,
-    heading: tuple[str, str],
-    *,
-    table: InTable = "on request",
-    over_seeds: bool = False,
-    gate_name: str = "",
-) -> tuple[Metric, Metric]:
-    """Declare PREFIX_median_px and PREFIX_rmse_px of an error (N,) px, which :func:`_pixel_scores` scores.
-
-    ``whose`` is a word that distinguishes it from other reprojection errors; the other arguments say how the median is
-    shown (:class:`Metric`).
-    """
-    median = Metric(
-        f"{prefix}_median_px",
-        f"median {error} (px)",
+_CAPPED = f"RMSE of the same, each observation's error capped at {CAP_PX:g} px (px)"
+_IN_SAMPLE = (
+    Metric(
+        "reproj_median_px",
+        "median reprojection error of the estimator's own landmarks, in-sample (px)",
         "px",
-        heading,
-        name=f"reproj {whose}",
-        table=table,
-        over_seeds=over_seeds,
-        in_contract=True,
-        gate_name=gate_name,
-    )
-    capped = f"RMSE of the same, each observation's error capped at {CAP_PX:g} px (px)"
-    name = f"reproj {whose} RMSE"
-    return median, Metric(f"{prefix}_rmse_px", capped, "px", (whose, "RMSE"), name=name, in_contract=True)
-
-
-_IN_SAMPLE = _pixel_metrics(
-    "reproj", "reprojection error of the estimator's own landmarks, in-sample", "own", ("reproj", "own")
+        ("reproj", "own"),
+    ),
+    Metric("reproj_rmse_px", _CAPPED, "px", ("own", "RMSE"), name="reproj own RMSE"),
 )
-_HELD_OUT = _pixel_metrics(
-    "heldout_reproj",
-    "leave-one-view-out reprojection error of the one track in ten no estimator is given",
-    "held-out",
-    ("held-", "out"),
-    table="always",
-    over_seeds=True,
-    gate_name="held-out reprojection",
+_HELD_OUT = (
+    Metric(
+        "heldout_reproj_median_px",
+        "median leave-one-view-out reprojection error of the one track in ten no estimator is given (px)",
+        "px",
+        ("held-", "out"),
+        name="reproj held-out",
+        table="always",
+        over_seeds=True,
+    ),
+    Metric("heldout_reproj_rmse_px", _CAPPED, "px", ("held-out", "RMSE"), name="reproj held-out RMSE"),
 )
 _OVER_MOTION = (
     Metric(

@@ -11,14 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.consistency import (
-    UNCOUPLED,
-    Nees,
-    StatedErrors,
-    chi2_quantile,
-    nees_of,
-    stated_errors,
-)
+from toolkit.metrics.parts.consistency import UNCOUPLED, Nees, StatedErrors, chi2_quantile, nees_of, stated_errors
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores
 

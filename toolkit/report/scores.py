@@ -16,16 +16,13 @@ from toolkit.answers import STATUS_MEANING, Output, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.files.documents import Count, Value, of_attributes, read
-from toolkit.metrics import Metric, contract_keys, describe, known_metrics
+from toolkit.metrics import CONTRACT_KEYS, Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
 from toolkit.sequence import Sequence
 
 # What to do about a document of a run directory that cannot be read.
 REPEAT = "repeat the comparison"
-# The keys every document of the contracts has, whatever metrics were added since: those of their first version, as the
-# metric files say.
-PROMISED_KEYS = contract_keys()
-ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
+ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(CONTRACT_KEYS)})
 
 MotionKind = Literal["twist", "imu", "none"]
 Motion = Annotated[MotionKind, Meta(description="body velocities, raw IMU or nothing between the frames")]
@@ -34,7 +31,7 @@ Notes = Annotated[dict[str, str], Meta(description="by metric key, why there is 
 
 def check_promised(metrics: dict[str, object]) -> None:
     """Raise ValueError where one of the keys is missing that every document has."""
-    missing = next((key for key in PROMISED_KEYS if key not in metrics), None)
+    missing = next((key for key in CONTRACT_KEYS if key not in metrics), None)
     if missing is not None:
         raise ValueError(f"metrics.{missing} is missing")
 

@@ -18,9 +18,7 @@ class Metric:
     ``meaning`` is one line with the unit; ``unit`` is the unit as written in a table, "1" for a ratio and "" for a
     count. ``heading`` are the two lines above its column, ``name`` the same in one line where it is not given. ``best``
     says which value is best: the least, the most, the one nearest 1, or "" for none. ``table`` is when the table of a
-    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one. ``in_contract``
-    marks the keys that every ``vislam.metrics/1`` document has; it counts for the toolkit's own metrics only.
-    ``gate_name`` is what the accuracy gate calls it, "" where the gate does not test it.
+    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one.
     """
 
     key: str
@@ -32,8 +30,6 @@ class Metric:
     table: InTable = "on request"
     over_seeds: bool = False
     count: bool = False
-    in_contract: bool = False
-    gate_name: str = ""
 
     def __post_init__(self) -> None:
         for what, value, known in (("best", self.best, Best), ("table", self.table, InTable)):
