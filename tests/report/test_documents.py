@@ -22,9 +22,8 @@ from toolkit.experiment.configuration import configuration, read_configuration
 from toolkit.files.documents import parse, read, to_line, to_text
 from toolkit.gate import baseline
 from toolkit.metrics import Evaluation, Scores, describe
-from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.consistency import body_errors
-from toolkit.report.curves import components, error_curves
+from toolkit.report.curves import components
 from toolkit.report.messages import note_lines
 from toolkit.report.records import RECORDS, read_card, read_check, read_manifest, schema_files
 from toolkit.report.report_json import report_document
@@ -305,13 +304,6 @@ def test_nees_and_nis_series_average_to_their_metrics(scored: Comparison) -> Non
     info = scored.runs[0].info
     dof = info["nis_dof"][np.isfinite(info["nis"]) & (info["nis_dof"] > 0)]
     assert np.average(run["nis"]["per_dof"], weights=dof) == pytest.approx(scores["nis_mean"], rel=1e-5)
-
-
-def test_errors_after_a_fit_are_those_of_the_metric(comparison: Comparison) -> None:
-    curves = error_curves(comparison, fitted=True)
-    assert curves is not None
-    for row, errors in curves.of_rows:
-        assert rmse(errors.position_m) == pytest.approx(row.scores.values["ate_se3_m"], rel=1e-9)
 
 
 def test_errors_are_those_from_the_start_that_the_nees_takes(comparison: Comparison) -> None:

@@ -8,9 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.inset import InsetIndicator
 
 from tests.report.conftest import compared
 from toolkit.estimate import Landmarks, Trajectory
@@ -28,7 +26,7 @@ from toolkit.report.curves import (
     truth_during,
 )
 from toolkit.report.figures import FigureChoice, FigureFormat, bands, from_above, over_time, reprojection, save
-from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
+from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
@@ -192,44 +190,10 @@ def test_a_panel_whose_values_leave_the_figure_says_how_large_they_become() -> N
     assert [axes.get_title(loc="right") for axes in figure.axes] == ["67 % in band", "67 % in band, up to 7e+05"]
 
 
-def straight(offset_m: float, widening_m: float = 0.0) -> PathFromAbove:
-    t_ns = np.arange(101)
-    return PathFromAbove(t_ns, np.stack([t_ns.astype(float), offset_m + widening_m * t_ns / 100.0], axis=1))
-
-
-def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None:
-    view = View(np.array([0.0, -50.0]), np.array([100.0, 50.0]))
-    tracks = [straight(0.0), straight(0.01, widening_m=0.5), straight(30.0)]
-    closer = where_tracks_coincide(tracks, view, np.arange(101))
-    assert closer is not None
-    # At the end of the two; the third is far from both and not in it.
-    assert closer.low[0] < 100.0 < closer.high[0]
-    assert closer.low[1] < 0.0
-    assert 0.51 < closer.high[1] < 2.0
-
-
-@pytest.mark.parametrize("turn_rad", [-0.5, 1.0])
-def test_lines_to_the_closer_look_end_at_the_corners_that_face_the_map(
-    sequence: Sequence, comparison: Comparison, turn_rad: float
-) -> None:
-    truth = sequence.truth
-    assert truth is not None
-    turned = replace(truth, T_world_imu=se3(about_z(turn_rad), np.zeros(3)) @ truth.T_world_imu)
-    (one,) = from_above.draw_all(compared(replace(sequence, truth=turned), comparison.runs))
-    FigureCanvasAgg(one.figure).draw()
-    _, the_map, panel = one.figure.axes
-    (square,) = (artist for artist in the_map.get_children() if isinstance(artist, InsetIndicator))
-    lines = [line for line in square.connectors or () if line.get_visible()]
-    ends = np.array([line.get_path().vertices[0] for line in lines])
-    box = panel.get_window_extent()
-    np.testing.assert_allclose(ends, [(box.x0, box.y0), (box.x0, box.y1)], atol=0.5)
-    # A panel takes the place that its equal scale leaves it when it is drawn: before the lines to it.
-    assert panel.get_zorder() < the_map.get_zorder()
-
-
 def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
     nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
-    (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight(0.0), nowhere], [straight(0.0)]))
+    straight = PathFromAbove(np.arange(2), np.array([[0.0, 0.0], [100.0, 0.0]]))
+    (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight, nowhere], [straight]))
     np.testing.assert_array_equal(both, one)
     assert np.isfinite(view_of([nowhere], NOWHERE)).all()
 

@@ -119,19 +119,6 @@ def in_sample_errors(evaluation: Evaluation) -> Array:
 
     Tracks seen only once are left out: a landmark started from one sighting reprojects onto it exactly.
     """
-    return _errors_of_sightings(evaluation)[1]
-
-
-def errors_of_landmarks(evaluation: Evaluation) -> tuple[IntArray, Array]:
-    """Return the track ids (M,) of the landmarks that have such observations, and the RMS (M,) px over each one's."""
-    rows, errors_px = _errors_of_sightings(evaluation)
-    seen, of_landmark, counts = np.unique(rows, return_inverse=True, return_counts=True)
-    sums = np.bincount(of_landmark, weights=errors_px**2, minlength=seen.size)
-    return evaluation.run.landmarks.track_ids[seen], np.sqrt(sums / counts)
-
-
-def _errors_of_sightings(evaluation: Evaluation) -> tuple[IntArray, Array]:
-    """Return the row (N,) of each observation's landmark, and the observation's error (N,) px."""
     landmarks, rig = evaluation.run.landmarks, evaluation.sequence.rig
     if not len(landmarks):
         raise Unavailable("the estimator has no landmarks")
@@ -141,7 +128,7 @@ def _errors_of_sightings(evaluation: Evaluation) -> tuple[IntArray, Array]:
     T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)
-    return row[known], reprojection_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)
+    return reprojection_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)
 
 
 def _seen_again(track_ids: IntArray) -> BoolArray:

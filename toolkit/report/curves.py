@@ -1,7 +1,7 @@
 """What figures, report.json and the page draw alike: errors over time, whole and by component, and colours.
 
-Errors over time are drawn from the common start, which shows drift, or after a fit to the truth. Pairs and fits are
-those of the metrics. With an IMU the vertical is measured and only heading and position are fitted (the fit of
+Errors over time are drawn from the common start, which shows drift. Maps are drawn after a fit to the truth. Pairs and
+fits are those of the metrics. With an IMU the vertical is measured and only heading and position are fitted (the fit of
 ate_yaw_m); from twists alone an estimator does not know the vertical, and a whole rigid motion is fitted (that of
 ate_se3_m).
 """
@@ -165,19 +165,12 @@ class ErrorCurves(NamedTuple):
     caption: str
 
 
-def error_curves(comparison: Comparison, *, fitted: bool = False) -> ErrorCurves | None:
-    """Return every row's errors (with truth) or differences (without), or None where no row has any.
-
-    Errors are those from the common start, or ``fitted`` after a fit to the truth.
-    """
+def error_curves(comparison: Comparison) -> ErrorCurves | None:
+    """Return every row's errors from the common start (with truth) or differences (without), or None without any."""
     sequence, reference = comparison.sequence, truth_during(comparison.sequence)
     estimate = reference_estimate(comparison) if reference is None else None
-    align: Callable[[Run, Output, Sequence], Alignment] = _not_aligned
     if reference is not None:
-        align, placing, fit = from_start, "from the common start", _FROM_START
-        if fitted:
-            align, placing, fit = onto_truth, f"aligned by {fit_name(sequence)}", alignment_text(sequence)
-        what, caption = "error", f"{fit} {_LINES}"
+        placing, what, caption = "from the common start", "error", f"{_FROM_START} {_LINES}"
     elif estimate is not None:
         reference = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
         placing, what = "not aligned", f"difference from {estimate.name}"
@@ -193,14 +186,11 @@ def error_curves(comparison: Comparison, *, fitted: bool = False) -> ErrorCurves
         repeated = row.output == "causal" and row.run.final_is_causal
         if trajectory is None or repeated or (estimate is not None and trajectory is estimate.trajectory):
             continue
-        errors = errors_to(reference, trajectory, align(row.run, row.output, sequence), sequence)
+        placed = NOT_ALIGNED if estimate is not None else from_start(row.run, row.output, sequence)
+        errors = errors_to(reference, trajectory, placed, sequence)
         if errors is not None:
             curves.append((row, errors))
     return ErrorCurves(curves, what, placing, caption) if curves else None
-
-
-def _not_aligned(_run: Run, _output: Output, _sequence: Sequence) -> Alignment:
-    return NOT_ALIGNED
 
 
 class Components(NamedTuple):

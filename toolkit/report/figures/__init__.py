@@ -46,8 +46,6 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
         bands.draw_nis,
         over_time.draw_frame_times,
         from_above.draw_trajectories,
-        from_above.draw_maps,
-        over_time.draw_fitted_errors,
         over_time.draw_other_components,
         from_above.draw_each,
     )

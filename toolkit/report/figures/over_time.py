@@ -49,8 +49,6 @@ from toolkit.report.figures.style import (
 )
 from toolkit.report.text import number
 
-# What leaves a panel is drawn up to this many times the largest error of what does not.
-_ROOM_BEYOND = 1.5
 # A heading larger than this many times that of the middle row leaves its panel, which has no logarithmic axis.
 _FAR_FROM_MIDDLE = 10.0
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
@@ -69,17 +67,10 @@ def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors from the common start, or without truth of differences between two trajectories."""
     curves = error_curves(comparison)
     if curves is not None:
-        yield _figure(comparison, curves, "errors_over_time")
+        yield _figure(comparison, curves)
 
 
-def draw_fitted_errors(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure of errors after a fit to the truth, where there is one."""
-    curves = error_curves(comparison, fitted=True)
-    if curves is not None and comparison.sequence.truth is not None:
-        yield _figure(comparison, curves, "errors_over_time_fitted")
-
-
-def _figure(comparison: Comparison, curves: ErrorCurves, name: str) -> NamedFigure:
+def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     figure = new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
     for row, errors in curves.of_rows:
@@ -98,7 +89,7 @@ def _figure(comparison: Comparison, curves: ErrorCurves, name: str) -> NamedFigu
     caption = (
         f"Position and heading {curves.what} over time, in the legend the RMS of the position, of the final output"
     )
-    return NamedFigure(name, f"{caption} where there is one. {curves.caption}", figure)
+    return NamedFigure("errors_over_time", f"{caption} where there is one. {curves.caption}", figure)
 
 
 def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
@@ -106,38 +97,35 @@ def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
 
     Where these differ by more than an order of magnitude it is logarithmic: else the best would be a line at zero.
     """
-    good = [errors.position_m for row, errors in curves if row.status == "ok"]
-    sizes = [size for position_m in good if (size := rmse(position_m)) > 0.0]
-    _, high = axes.get_ylim()
-    if good and len(good) < len(curves):
-        largest = max(float(position_m.max()) for position_m in good)
-        high = min(high, largest * _ROOM_BEYOND) if largest > 0.0 else high
-    high = max(high, _LEAST_POSITION_M)
-    if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and high > _LEAST_POSITION_M:
-        scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), high)
+    largest = {row: float(np.nanmax(errors.position_m)) for row, errors in curves}
+    reach = 1.05 * max(_reach(largest), _LEAST_POSITION_M)
+    sizes = [size for row, errors in curves if row.status == "ok" and (size := rmse(errors.position_m)) > 0.0]
+    if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and reach > 2.0 * _LEAST_POSITION_M:
+        scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), reach)
     else:
-        axes.set_ylim(0.0, high)
-    _say_who_leaves(axes, [(row, float(np.nanmax(errors.position_m))) for row, errors in curves], high, "m")
+        axes.set_ylim(0.0, reach)
+    _say_who_leaves(axes, largest, reach, "m")
 
 
 def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     """Keep the heading axis to what most runs that are ok need, and say which leave it."""
-    largest = [(row, float(np.nanmax(np.abs(errors.heading_deg)))) for row, errors in curves]
-    sizes = sorted(size for row, size in largest if row.status == "ok") or sorted(size for _, size in largest)
+    largest = {row: float(np.nanmax(np.abs(errors.heading_deg))) for row, errors in curves}
+    sizes = sorted(size for row, size in largest.items() if row.status == "ok") or sorted(largest.values())
     middle = max(sizes[(len(sizes) - 1) // 2], _LEAST_HEADING_DEG)
-    reach = max(size for size in (*sizes, middle) if size <= _FAR_FROM_MIDDLE * middle)
-    if reach < max(size for _, size in largest):
-        reach *= _ROOM_BEYOND
-        axes.set_ylim(-reach, reach)
-    else:
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
+    reach = 1.05 * max(size for size in (*sizes, middle) if size <= _FAR_FROM_MIDDLE * middle)
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(min(low, -_LEAST_HEADING_DEG), -reach), min(max(high, _LEAST_HEADING_DEG), reach))
     _say_who_leaves(axes, largest, reach, "deg")
 
 
-def _say_who_leaves(axes: Axes, largest: list[tuple[Row, float]], reach: float, unit: str) -> None:
+def _reach(largest: dict[Row, float]) -> float:
+    """Return the largest error of the runs that are ok, or of all where none is."""
+    return max([size for row, size in largest.items() if row.status == "ok"] or largest.values())
+
+
+def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: str) -> None:
     """Name above a panel, to the right, the rows whose largest errors are beyond its axis."""
-    beyond = {row.estimator: size for row, size in largest if size > 1.01 * reach}
+    beyond = {row.estimator: size for row, size in largest.items() if size > 1.01 * reach}
     if beyond:
         listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
         axes.set_title(f"beyond it: {listed}", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)

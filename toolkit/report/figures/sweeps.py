@@ -1,4 +1,4 @@
-"""A sweep: errors, NEES and withheld tracks over the values of an axis, a grid of two, and error against time."""
+"""A sweep: errors, NEES and withheld tracks over the values of an axis, and error against time."""
 
 import math
 from collections.abc import Iterator
@@ -6,7 +6,6 @@ from typing import TypeGuard
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
@@ -19,7 +18,6 @@ from toolkit.report.figures.style import (
     ZERO_COLOUR,
     Entry,
     NamedFigure,
-    columns_for,
     legend_below,
     new_figure,
     scale_by_decades,
@@ -27,23 +25,18 @@ from toolkit.report.figures.style import (
     style_axes,
 )
 from toolkit.report.sweep import metric_of, shown_value
-from toolkit.report.text import number
 
 # Doses that span more than this factor are laid out by their logarithm.
 _WIDE = 8.0
 # Beyond this a ratio or NEES is drawn at the limit.
 _MOST = 1e6
-# Ratios of the darkest shades of a grid.
-_SHADES = (0.5, 50.0)
-_HEIGHT_IN, _PANEL_IN = 2.9, 2.4
+_HEIGHT_IN = 2.9
 
 
 def draw_sweep(sweep: Sweep) -> Iterator[NamedFigure]:
-    """Yield the figures of a sweep: one an axis, that of a grid, and that of error against time where settings vary."""
+    """Yield the figures of a sweep: one an axis, and that of error against time where settings vary."""
     for axis in sweep.axes:
         yield _curves(sweep, axis)
-    if any(len(point) > 1 for point in sweep.points):
-        yield _crossed(sweep)
     for axis in sweep.axes:
         if not axis.is_fault:
             yield _against_time(sweep, axis)
@@ -117,31 +110,6 @@ def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> N
         bad = [place for place, one in line if math.isinf(one.value)]
         axes.scatter(bad, [high] * len(bad), color=stroke["color"], marker="x", clip_on=False)
     scale_by_decades(axes, low, high)
-
-
-def _crossed(sweep: Sweep) -> NamedFigure:
-    down, across = sweep.axes
-    columns = columns_for(len(sweep.estimators))
-    rows = -(-len(sweep.estimators) // columns)
-    figure = new_figure(0.6 + _PANEL_IN * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels[len(sweep.estimators) :]:
-        axes.set_axis_off()
-    for axes, name in zip(panels, sweep.estimators, strict=False):
-        effects = [[sweep.effects[name, one + other].over_clean for other in _steps(across)] for one in _steps(down)]
-        ratios = np.array([[np.nan if effect is None else effect.value for effect in line] for line in effects])
-        axes.imshow(np.clip(ratios, *_SHADES), norm=LogNorm(*_SHADES), cmap="RdYlBu_r", aspect="auto")
-        style_axes(axes, name, across.name, down.name)
-        axes.grid(False)
-        for (i, k), ratio in np.ndenumerate(ratios):
-            text = number(float(ratio), 2) if math.isfinite(ratio) else f"{ratio:g}"
-            axes.text(k, i, text, ha="center", va="center", fontsize=SMALL_PT)
-        axes.set_yticks(range(len(down.values) + 1), [_word(down), *map(shown_value, down.values)])
-        axes.set_xticks(range(len(across.values) + 1), [_word(across), *map(shown_value, across.values)])
-    figure.suptitle(f"{sweep.grid.case.name}: error over clean", fontsize=TITLE_PT, x=0.01, ha="left")
-    names = f"{down.name} and {across.name}"
-    caption = f"Error over that of the clean recording on {sweep.grid.case.name}, under {names} together."
-    return NamedFigure("sweep_grid", caption, figure)
 
 
 def _steps(axis: Axis) -> tuple[Point, ...]:
