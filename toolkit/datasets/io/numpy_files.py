@@ -1,17 +1,15 @@
 """NumPy's files, read without running anything in them: the arrays of an npz, and the plain data of an object npy.
 
-A pickle is a program. Of its instructions those that make plain data are carried out, and every name that it refers to
-is answered with a description of an array or a number, never with an object of a module. Sizes are checked before
-memory is taken, long arrays of a pickle are views of the mapped file, and an array that is mostly filler is streamed
-and kept sparse: the dense features of a long drive take more than a gigabyte, their sightings a few megabytes.
-Formats: numpy.lib.format, versions 1 to 3; the standard library's pickletools documents the instructions.
+A pickle is a program: every name that it refers to is answered with a description of an array or a number, never with
+an object of a module. Sizes are checked before memory is taken, long arrays of a pickle are views of the mapped file,
+and an array that is mostly filler is streamed and kept sparse: the dense features of a long drive take more than a
+gigabyte, their sightings a few megabytes. Formats: numpy.lib.format, versions 1 to 3, and pickletools.
 """
 
 import io
 import math
 import mmap
 import pickle
-import pickletools
 import struct
 import zipfile
 import zlib
@@ -34,10 +32,6 @@ from toolkit.geometry import Array, IntArray
 MAGIC = b"\x93NUMPY"
 # Small enough for the processor's cache, large enough that the Python around it does not show.
 _CHUNK_BYTES = 1 << 18
-# A dense array of a recording is far smaller: an hour of IMU samples at 1 kHz has 200 MB.
-_MOST_BYTES = 2 << 30
-# A recording of an hour at 30 Hz, both its images as arrays of their own, takes six million.
-_MOST_OPCODES = 10_000_000
 # Longer byte strings of a pickle stay in the file.
 _LONG_BYTES = 1 << 16
 _ZIP_MAGIC, _ZIP_HEADER = b"PK\x03\x04", struct.Struct("<26xHH")
@@ -184,8 +178,6 @@ class NpzArchive:
             raise DataError(f"{what} holds objects, which are never unpickled; save it as plain numbers")
         if size > stored:
             raise DataError(f"{what} ends after {stored} of {size} bytes; save it again")
-        if size > _MOST_BYTES:
-            raise DataError(f"{what} takes {size / 1e9:.1f} GB, more than is read at once; cut the recording")
         with self.archive.open(name) as stream:
             try:
                 array: npt.NDArray[np.generic] = np.lib.format.read_array(stream, allow_pickle=False)
@@ -291,8 +283,6 @@ class _Mapped:
 class _Begun:
     """A dtype or an array between the instruction that begins it and the one that brings its state."""
 
-    __slots__ = ("finish", "value")
-
     def __init__(self, finish: Callable[[Any], Any]) -> None:
         self.finish = finish
         self.value: Any = None
@@ -306,17 +296,20 @@ class _Memo(dict[int, Any]):
         return kept.value if isinstance(kept, _Begun) else kept
 
 
-# The library's reader in C takes memory for bytes before it has met them, and tells nothing of single instructions.
+# The library's reader in C copies bytes, and takes memory for them before it has met them.
 _InPython: Any = pickle._Unpickler
 
 
 class _PlainUnpickler(_InPython):  # type: ignore[misc]
-    """The standard library's reader in Python, with the instructions and names of plain data alone."""
+    """The standard library's reader in Python, to which no name is known but those of arrays and numbers.
+
+    Nothing else can be called: what a name gives is a function of this module, and no value of plain data is one.
+    """
 
     def __init__(self, path: Path, source: _Mapped) -> None:
         super().__init__(source)
         self.memo = _Memo()
-        self.dispatch = _Instructions(path)
+        self.dispatch = {**_InPython.dispatch, pickle.BUILD[0]: _PlainUnpickler.load_build}
         self._path = path
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
@@ -337,36 +330,6 @@ class _PlainUnpickler(_InPython):  # type: ignore[misc]
         self.stack[-1] = begun.value = begun.finish(state)
 
 
-class _Instructions(dict[int, Callable[[_PlainUnpickler], None]]):
-    """What is carried out for each instruction that plain data need; the others are refused, as are too many."""
-
-    def __init__(self, path: Path) -> None:
-        known = _InPython.dispatch
-        super().__init__({code: known[code] for code in _PLAIN} | {pickle.BUILD[0]: _PlainUnpickler.load_build})
-        self._path, self._left = path, _MOST_OPCODES
-
-    def __getitem__(self, code: int) -> Callable[[_PlainUnpickler], None]:
-        self._left -= 1
-        if self._left < 0:
-            raise DataError(f"{self._path}: more than {_MOST_OPCODES} pickled values; it is no recording")
-        return super().__getitem__(code)
-
-    def __missing__(self, code: int) -> NoReturn:
-        name = next((one.name for one in pickletools.opcodes if ord(one.code) == code), f"byte {code}")
-        raise DataError(f"{self._path}: its pickle uses {name}, which plain data do not need; it is not executed")
-
-
-_PLAIN = b"".join((
-    *(pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.GLOBAL, pickle.STACK_GLOBAL, pickle.REDUCE),
-    *(pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.INT, pickle.BININT, pickle.BININT1, pickle.BININT2),
-    *(pickle.LONG, pickle.LONG1, pickle.LONG4, pickle.FLOAT, pickle.BINFLOAT),
-    *(pickle.SHORT_BINUNICODE, pickle.BINUNICODE, pickle.BINUNICODE8),
-    *(pickle.SHORT_BINBYTES, pickle.BINBYTES, pickle.BINBYTES8),
-    *(pickle.EMPTY_LIST, pickle.LIST, pickle.APPEND, pickle.APPENDS),
-    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS),
-    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
-    *(pickle.MEMOIZE, pickle.PUT, pickle.BINPUT, pickle.LONG_BINPUT, pickle.GET, pickle.BINGET, pickle.LONG_BINGET),
-))  # fmt: skip
 _OBJECTS = "objects"
 
 
@@ -378,10 +341,6 @@ def _dtype(text: Any, *_: Any) -> _Begun:
     if dtype.kind not in "fiub":
         raise ValueError(f"an array holds {dtype}, expected numbers")
     return _Begun(lambda state: dtype.newbyteorder(state[1]) if state[1] in "<>" else dtype)
-
-
-def _array(*_: Any) -> _Begun:
-    return _Begun(_array_of)
 
 
 def _array_of(state: Any) -> Plain:
@@ -396,18 +355,13 @@ def _array_of(state: Any) -> Plain:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
-def _scalar(dtype: Any, data: Any) -> bool | int | float:
-    value: bool | int | float = np.frombuffer(data, dtype)[0].item()
-    return value
-
-
 def _class(*_: Any) -> NoReturn:
     raise ValueError("a value is called")
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "numpy._core.multiarray._reconstruct": _array,
-    "numpy._core.multiarray.scalar": _scalar,
+    "numpy._core.multiarray._reconstruct": lambda *_: _Begun(_array_of),
+    "numpy._core.multiarray.scalar": lambda dtype, data: np.frombuffer(data, dtype)[0].item(),
     "numpy.ndarray": _class,
     "numpy.dtype": _dtype,
 }
