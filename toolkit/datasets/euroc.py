@@ -35,7 +35,7 @@ from toolkit.datasets.io.image_pairs import (
     pairs_of_asl,
     seen_in,
 )
-from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
+from toolkit.datasets.io.tables import columns_of_file, headings_of, read_stamps
 from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, printable
@@ -203,9 +203,9 @@ def _imu(layout: _Layout) -> ImuSamples:
             f"{layout.imu}: cannot be read, and there is no imu0.csv of Kalibr's: name the folder that has mav0, or "
             "rectify images without an IMU and lay them out as KITTI's image_0, image_1 and calib.txt"
         )
-    columns = imu_columns(columns_of(layout.imu)) or _ACCEL + _GYRO
-    table = read_table(layout.imu, columns)
-    return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
+    table = columns_of_file(layout.imu)
+    values = table.numbers(*(imu_columns(table.names) or _ACCEL + _GYRO))
+    return ImuSamples(table.whole(table.names[0]), values[:, :3], values[:, 3:])
 
 
 def _few_images(layout: _Layout) -> Iterator[str]:
@@ -287,7 +287,7 @@ def _layout(path: Path) -> _Layout | None:
     mav0 = next((p for p in (path / "mav0", path) if (p / "imu0").is_dir() or (p / "cam0").is_dir()), None)
     if mav0 is not None:
         return _Layout(mav0.parent if mav0.name == "mav0" else mav0, mav0)
-    lean = (path / _STAMPS).is_file() or columns_of(path / _LEAN_IMU).keys() >= set(_GYRO)
+    lean = (path / _STAMPS).is_file() or headings_of(path / _LEAN_IMU) >= set(_GYRO)
     return _Layout(path, None) if lean else None
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, flattened, rectified_observations, stamps_ns
-from toolkit.datasets.io.tables import find_table, first_line, read_columns
+from toolkit.datasets.io.tables import columns_of_file, find_table, headings_of
 from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
@@ -51,7 +51,7 @@ _RECTIFIED_TOLERANCE = 1e-6
 def recognises(path: Path) -> bool:
     """Say whether the path is a folder whose calibration or feature table is of this kind."""
     features = find_table(path, _FEATURES)
-    if features is not None and b"feature_id" in first_line(features):
+    if features is not None and "feature_id" in headings_of(features):
         return True
     try:
         return b'"cam0"' in read_input(path / _CALIBRATION)
@@ -66,7 +66,7 @@ def load(path: Path) -> Sequence:
     """
     imu_path, features_path = _tables(path)
     calibration = _calibration(path / _CALIBRATION)
-    imu = read_columns(imu_path, _IMU_COLUMNS)
+    imu = columns_of_file(imu_path).numbers(*_IMU_COLUMNS)
     motion = ImuSamples(stamps_ns(imu_path, "timestamp", imu[:, 0]), imu[:, 1:4], imu[:, 4:7])
     frames_t_ns, sightings = _frames(features_path, motion.t_ns)
     check_frame_count(path, frames_t_ns.size)
@@ -141,13 +141,12 @@ def _rig(calibration: Fields) -> StereoRig:
 
 def _frames(path: Path, imu_t_ns: IntArray) -> tuple[IntArray, Observations]:
     """Return the stamps (K,) of the frames within the IMU's time, and their sightings in both cameras."""
-    table = read_columns(path, _FEATURE_COLUMNS)
+    columns = columns_of_file(path)
+    table = columns.numbers(*_FEATURE_COLUMNS)
     row_t_ns = stamps_ns(path, "timestamp", table[:, 0])
     unnamed = np.flatnonzero(~np.isfinite(table[:, 1:3]).all(axis=1))
     if unnamed.size:
-        raise DataError(f"{path}: row {unnamed[0] + 1} has no frame or feature_id; remove the row")
-    if imu_t_ns.size == 0:
-        raise DataError(f"{path.parent}: the IMU table has no samples; export it again")
+        raise DataError(f"{path}: {columns.at(unnamed[0])} has no frame or feature_id; remove the row")
     inside = (row_t_ns >= imu_t_ns.min()) & (row_t_ns <= imu_t_ns.max())
     stereo = (table[:, 7:9] == 1.0).all(axis=1)
     number, first_row = np.unique(table[inside, 1], return_index=True)
@@ -161,9 +160,7 @@ def _truth(folder: Path) -> Truth | None:
     path = find_table(folder, _TRUTH)
     if path is None:
         return None
-    table = read_columns(path, _TRUTH_COLUMNS)
-    if not len(table):
-        raise DataError(f"{path}: holds no poses; export it again, or remove it to run without truth")
+    table = columns_of_file(path).numbers(*_TRUTH_COLUMNS)
     t_ns = stamps_ns(path, "timestamp", table[:, 0])
     T_world_imu = checked_poses(path, list(range(2, len(table) + 2)), t_ns, table[:, 1:8])
     return Truth(t_ns, T_world_imu, table[:, 8:11], table[:, 11:17])

@@ -7,9 +7,8 @@ whole nanoseconds and are read at once: Burri et al., "The EuRoC micro aerial ve
 import codecs
 import csv
 import gzip
-import io
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -37,70 +36,16 @@ def find_table(folder: Path, name: str) -> Path | None:
     return next((path for path in candidates if is_regular(path)), None)
 
 
-def first_line(path: Path) -> bytes:
-    """Return the first line of a table, or nothing where it cannot be read."""
+def headings_of(path: Path) -> set[str]:
+    """Return the names in the first line of a table, without ``#`` and units; none where it cannot be read."""
     try:
         with open_input(path) as raw:
             zipped = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
         with gzip.open(path) if zipped else path.open("rb") as stream:
-            return stream.readline(_LONGEST_LINE)
+            line = stream.readline(_LONGEST_LINE).decode(errors="replace")
     except (DataError, OSError, EOFError, zlib.error):
-        return b""
-
-
-def read_columns(path: Path, names: tuple[str, ...]) -> Array:
-    """Return the named columns (N, C) of a table, in that order; N may be 0.
-
-    Raises DataError where the file is damaged, a column is missing (all are listed), or a row is not numeric.
-    """
-    header, _, body = _read_whole(path).partition(b"\n")
-    columns = [name.strip() for name in header.decode(errors="replace").split(",")]
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise DataError(f"{path}: missing column {', '.join(missing)}; its first line is {', '.join(columns)[:200]}")
-    if not body.strip():
-        return np.empty((0, len(names)))
-    try:
-        wanted = [columns.index(name) for name in names]
-        table: Array = np.loadtxt(io.BytesIO(body), delimiter=",", usecols=wanted, ndmin=2)
-    except ValueError as error:
-        raise DataError(f"{path}: after the header, {_first_sentence(error)}; the file may be truncated") from error
-    return table
-
-
-def _read_whole(path: Path) -> bytes:
-    """Return the content of a table, plain or gzipped; raises DataError where it cannot be read or is damaged."""
-    return read_unzipped(path).removeprefix(codecs.BOM_UTF8)
-
-
-def _first_sentence(error: ValueError) -> str:
-    return str(error).partition("\n")[0].partition(";")[0].rstrip(".")
-
-
-@dataclass(frozen=True, eq=False)
-class AslTable:
-    """Rows of one table: stamps (N,) ns in the file's order, and the requested columns (N, C)."""
-
-    t_ns: IntArray
-    values: Array
-
-
-def columns_of(path: Path) -> dict[str, str]:
-    """Return the headings of a table by their names without ``#`` and units; none where it cannot be read."""
-    headings = [heading.strip() for heading in first_line(path).decode(errors="replace").split(",")]
-    return {heading.lstrip("#").partition("[")[0].strip(): heading for heading in headings}
-
-
-def read_table(path: Path, names: tuple[str, ...]) -> AslTable:
-    """Read the stamps, the first column, and the named columns of a table; N > 0.
-
-    Raises DataError where the file cannot be read, a column is missing, there are no rows, a stamp is no whole
-    number or a value no number.
-    """
-    headings = columns_of(path)
-    values = read_columns(path, tuple(headings.get(name, name) for name in names))
-    t_ns = read_stamps(path, header_lines=1)
-    return AslTable(t_ns, values)
+        return set()
+    return set(map(_plain, line.split(",")))
 
 
 def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
@@ -120,8 +65,9 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """A table: what it is called in a complaint, its columns (N,), texts or numbers, by name, and what rows are called.
+    """A table: what it is called in a complaint, its columns (N,) by name, and what rows are called.
 
+    The columns of a file are tuples of texts, those of a program arrays.
     ``numbers_of_rows`` are those of a file's lines, as an editor counts them; None counts from 0.
     """
 
@@ -151,16 +97,18 @@ class Columns:
         return f" (rename {printable(close)}?)" if close else ""
 
     def numbers(self, *names: str) -> Array:
-        """Return columns side by side (N, C) as float64, NaN included; raises DataError naming the row of a text."""
+        """Return columns side by side (N, C) as float64, NaN included.
+
+        Raises DataError naming the columns that are missing, or the row of a text.
+        """
+        self.require(*names)
         return np.stack([self._numbers(name) for name in names], axis=1)
 
     def numbers_or_none(self, *names: str) -> Array:
         """Return columns as :meth:`numbers` does, with NaN where a CSV has nothing."""
-        filled = {name: [cell or "nan" for cell in self.values[name]] for name in names if self._is_text(name)}
+        texts = {name: values for name in names if isinstance(values := self.values[name], tuple)}
+        filled = {name: tuple(cell.strip() or "nan" for cell in cells) for name, cells in texts.items()}
         return replace(self, values={**self.values, **filled}).numbers(*names)
-
-    def _is_text(self, name: str) -> bool:
-        return all(isinstance(cell, str) for cell in self.values[name])
 
     def whole(self, name: str) -> IntArray:
         """Return a column of whole numbers (N,); raises DataError naming the row of anything else."""
@@ -201,18 +149,21 @@ class Columns:
         return tuple(name for name in self.names if name not in known)
 
     def _numbers(self, name: str) -> Array:
-        values = np.asarray(self.values[name])
+        given = self.values[name]
+        values: npt.NDArray[Any] = np.empty(0) if isinstance(given, tuple) else np.asarray(given)
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
         if values.dtype.kind == "c":
             raise DataError(f"{self.what}: column {name} holds complex numbers; give their real parts")
         try:
-            if values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any():
-                raise ValueError  # Python takes 1_0 for ten
+            if isinstance(given, tuple) and "_" not in "".join(given):  # Python takes 1_0 for ten
+                return np.fromiter(map(float, given), dtype=np.float64, count=len(given))
+            if isinstance(given, tuple) or (values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any()):
+                raise ValueError
             return values.astype(np.float64)
         except (TypeError, ValueError):
-            bad = next(i for i, value in enumerate(values.tolist()) if not _is_number(value))
-            shown = printable(str(values[bad]))[:50] or "empty"
+            bad, value = next((i, value) for i, value in enumerate(given) if not _is_number(value))
+            shown = printable(str(value).strip())[:50] or "empty"
             point = " with a decimal point" if "," in shown else ""
             raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}") from None
 
@@ -224,7 +175,7 @@ class Columns:
         except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
             exact, number, too_large = value, None, False
         if number is None or number != exact:
-            shown = printable(str(value))[:50] or "empty"
+            shown = printable(str(value).strip())[:50] or "empty"
             most = f" of at most {_LARGEST}" if too_large else ""
             raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number{most}")
         return number
@@ -244,10 +195,9 @@ def columns_of_file(path: Path) -> Columns:
     Cells stand between commas, semicolons or tabs, in quotes or not. Raises DataError where the file cannot be read,
     has no names or no rows, a column twice, or a row of another length.
     """
-    try:
-        text = _read_whole(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file; write a CSV, one row a line, with names in the first") from error
+    text = read_unzipped(path).removeprefix(codecs.BOM_UTF8).decode(errors="replace")
+    if "\0" in text:
+        raise DataError(f"{path}: not a text file; write a CSV, one row a line, with names in the first")
     heading, lines = _heading(path, text)
     separator = max(_SEPARATORS, key=heading.count)
     if separator not in heading and len(heading.split()) > 1:
@@ -256,19 +206,29 @@ def columns_of_file(path: Path) -> Columns:
     kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
     if len(set(kept)) < len(kept):
         raise DataError(f"{path}: a column name is there twice in {printable(heading)[:200]}; rename or remove one")
-    rows = [_cells(line, separator) for _, line in lines]
-    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
-    if wrong is not None:
-        raise DataError(f"{path}: line {lines[wrong][0]} has {len(rows[wrong])} columns, expected {len(names)}")
-    if not rows:
+    if not lines:
         raise DataError(f"{path}: holds no rows; its first line names the columns, the others hold them")
-    values = dict(zip(kept, zip(*rows, strict=True), strict=False))
+    values = dict(zip(kept, _split(path, lines, separator, len(names)), strict=False))
     return Columns(path, values, "line", tuple(number for number, _ in lines))
+
+
+def _split(path: Path, lines: Sequence[tuple[int, str]], separator: str, width: int) -> Iterator[tuple[str, ...]]:
+    """Return the columns of lines; raises DataError, naming the line, where one has another number of cells."""
+    whole = separator.join(line for _, line in lines)
+    if '"' not in whole and {line.count(separator) for _, line in lines} == {width - 1}:
+        cells = whole.split(separator)
+        return (tuple(cells[column::width]) for column in range(width))
+    rows = [_cells(line, separator) for _, line in lines]
+    rows = [row[:-1] if len(row) == width + 1 and not row[-1].strip() else row for row in rows]
+    for (number, _), row in zip(lines, rows, strict=True):
+        if len(row) != width:
+            raise DataError(f"{path}: line {number} has {len(row)} columns, expected {width}")
+    return zip(*rows, strict=True)
 
 
 def _canonical(heading: Sequence[str]) -> list[str]:
     """Return the names of columns without comments and units; that of stamps is t or t_ns where it says the unit."""
-    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in heading]
+    names = list(map(_plain, heading))
     if SECONDS in names or NANOSECONDS in names:
         return names
     units = {NS_PER_S: SECONDS, 1: NANOSECONDS}
@@ -276,6 +236,10 @@ def _canonical(heading: Sequence[str]) -> list[str]:
     if at is not None:
         names[at] = units[stamp_unit_ns(heading[at]) or 1]
     return names
+
+
+def _plain(heading: str) -> str:
+    return heading.strip().lstrip("#").partition("[")[0].strip()
 
 
 def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
@@ -300,8 +264,8 @@ def _begins_with_number(line: str) -> bool:
 
 def _cells(line: str, separator: str) -> list[str]:
     if '"' in line:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-    return [cell.strip() for cell in line.split(separator)]
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return line.split(separator)
 
 
 def _unmasked(column: Any) -> npt.NDArray[Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.fields import read_fields
-from toolkit.datasets.io.tables import columns_of, read_table
+from toolkit.datasets.io.tables import columns_of_file, headings_of
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order, turned
 from toolkit.datasets.trajectories.formats import (
@@ -189,13 +189,10 @@ def _tables(root: Path, mav0: Path | None) -> list[Path]:
     # TUM-VI's motion capture, already moved to the IMU and its clock.
     folders = () if mav0 is None else ("state_groundtruth_estimate0", "mocap0")
     inside = [] if mav0 is None else [mav0 / folder / "data.csv" for folder in folders]
-    beside = [path for path in sorted(root.glob("*.csv")) if _heading(path) is not None]
+    beside = [
+        path for path in sorted(root.glob("*.csv")) if any(headings_of(path) >= set(pose) for pose, _ in _HEADINGS)
+    ]
     return [*(path for path in inside if path.is_file()), *beside, *sorted(root.glob("*.tum"))]
-
-
-def _heading(path: Path) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    columns = columns_of(path)
-    return next((heading for heading in _HEADINGS if columns.keys() >= set(heading[0])), None)
 
 
 def _read(path: Path, mav0: Path | None) -> TruthRead:
@@ -215,11 +212,13 @@ def _read(path: Path, mav0: Path | None) -> TruthRead:
 
 def _read_csv(path: Path) -> TruthRead:
     """Read finite poses and, where all are there, velocities and biases; stamps stay whole numbers."""
-    pose, rest = _heading(path) or _HEADINGS[0]
-    complete = columns_of(path).keys() >= set(rest)
-    table = read_table(path, pose + rest if complete else pose)
-    kept = known_poses(table.values[:, :7])
-    t_ns, values = table.t_ns[kept], table.values[kept]
+    table = columns_of_file(path)
+    names = set(table.names)
+    pose, rest = next((heading for heading in _HEADINGS if names >= set(heading[0])), _HEADINGS[0])
+    complete = names >= set(rest)
+    values, t_ns = table.numbers(*pose, *(rest if complete else ())), table.whole(table.names[0])
+    kept = known_poses(values[:, :7])
+    t_ns, values = t_ns[kept], values[kept]
     T_world_imu = checked_poses(path, (2 + np.flatnonzero(kept)).tolist(), t_ns, values[:, :7])
     lost = int((~kept).sum())
     facts = (f"{lost} of its {kept.size} poses are not finite and left out",) if lost else ()
