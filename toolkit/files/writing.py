@@ -9,9 +9,9 @@ import os
 import re
 import shutil
 import signal
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from toolkit.errors import OutputError
 
@@ -36,6 +36,13 @@ def check_replaceable(target: Path, owner: Owner) -> None:
         _probe(target)
     except OSError as error:
         raise _unwritable(target, error) from error
+
+
+def with_folders(files: Iterable[str]) -> frozenset[str]:
+    """Return relative paths of files with the folders they are in, which have a slash behind, as an owner does."""
+    paths = list(files)
+    folders = {f"{part.as_posix()}/" for path in paths for part in PurePosixPath(path).parents}
+    return frozenset({*paths, *folders} - {"./"})
 
 
 def check_parent(directory: Path) -> None:

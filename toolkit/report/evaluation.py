@@ -5,49 +5,44 @@ figures, and the leaderboard in Markdown and as a page, one HTML file that opens
 page.
 """
 
-import base64
 import csv
 import io
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from msgspec import UNSET
 from msgspec.structs import replace
 
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE
-from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedRecord, Quartiles, RunRecord, StandingRecord
+from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedRecord, Quartiles, StandingRecord
 from toolkit.experiment.statistics import mean_interval
 from toolkit.files.documents import to_text
-from toolkit.files.writing import check_replaceable, replaced_directory
+from toolkit.files.writing import check_replaceable, replaced_directory, with_folders
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
 from toolkit.metrics.parts.consistency import nees_band
 from toolkit.metrics.uncertainty import REGIONS_PERCENT
-from toolkit.report.html import filled_page, source
+from toolkit.report.html import card, filled_page, source
 from toolkit.report.text import (
     MISSING,
     WIDTH,
+    Part,
     ShownUnit,
     Table,
     Width,
-    as_html,
     as_latex,
-    as_markdown,
-    as_text,
     cell,
     filled,
     heading,
     in_html,
     in_markdown,
     listed,
-    markdown_section,
     number,
-    section,
+    parts_as_markdown,
+    parts_as_text,
     unit_of,
     unrivalled,
 )
@@ -66,7 +61,7 @@ _BLOCKS = {
     "ori": ("orientation", 3, "energy_ori_deg"),
     "pos": ("position", 3, "energy_pos_m"),
 }
-_UNCERTAINTY = "stated uncertainty: means over the runs (95 % interval over the runs)"
+_UNCERTAINTY = "Stated uncertainty: means over the runs (95 % interval over the runs)"
 _OF_ORIENTATION = (
     *("ate_none_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent"),
     *("kitti_r_deg_per_m", "end_drift_percent"),
@@ -76,8 +71,6 @@ _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
 EVALUATION = "evaluation.json"
 _FILES = (EVALUATION, "leaderboard.html", "leaderboard.md", "runs.csv")
-# Of the figure, in its own units: room for names, for dots, between rows; and how many lines of colour there are.
-_NAMES, _DOTS, _MARGIN, _ROW, _COLOURS = 190.0, 660.0, 60.0, 15.0, 7
 
 
 def shown_metrics(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> tuple[Metric, ...]:
@@ -283,43 +276,37 @@ class _RemarkScope(NamedTuple):
     whose: dict[str, None]
 
 
-def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
-    """Return an evaluation as plain text: the leaderboard, the sequences, the tests, what failed and what to know."""
-    lines = [filled(line, width) for line in header_lines(evaluation)]
-    lines += ["", as_text(leaderboard_table(evaluation, columns)), ""]
+def _parts(
+    evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), most: int | None = _MOST_FAILURES
+) -> Iterator[Part]:
+    """Yield what is told of an evaluation: tables, then what is more than chance, what failed and what to know."""
+    yield Part("Leaderboard", leaderboard_table(evaluation, columns))
     if len(evaluation.sequences) > 1:
-        lines += [f"{evaluation.ranked_by.name}, median over the runs", "", as_text(sequences_table(evaluation)), ""]
+        yield Part(f"{evaluation.ranked_by.name}, median over the runs", sequences_table(evaluation))
     if (stated := uncertainty_table(evaluation)) is not None:
-        lines += [_UNCERTAINTY, "", as_text(stated), ""]
-    lines += section("pairs", paired_lines(evaluation), width)
-    lines += section("fails", failure_lines(evaluation), width)
-    lines += section("notes", note_lines(evaluation), width)
-    return "\n".join(lines).rstrip()
+        yield Part(_UNCERTAINTY, stated)
+    yield Part("Pairs", tuple(paired_lines(evaluation)))
+    yield Part("Fails", tuple(failure_lines(evaluation, most)))
+    yield Part("Notes", tuple(note_lines(evaluation)))
+
+
+def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
+    """Return an evaluation as plain text."""
+    lines = [filled(line, width) for line in header_lines(evaluation)]
+    return "\n".join([*lines, "", *parts_as_text(_parts(evaluation, columns), width)]).rstrip()
 
 
 def evaluation_markdown(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
     """Return the same as Markdown, the best of each column in bold."""
-    parts = ["## Leaderboard", *(f"{in_markdown(line)}." for line in header_lines(evaluation))]
-    parts.append(as_markdown(leaderboard_table(evaluation, columns)))
-    if len(evaluation.sequences) > 1:
-        parts += [f"## {evaluation.ranked_by.name} by sequence", as_markdown(sequences_table(evaluation))]
-    if (stated := uncertainty_table(evaluation)) is not None:
-        parts += [f"## {_UNCERTAINTY.capitalize()}", as_markdown(stated)]
-    parts += markdown_section("Pairs", paired_lines(evaluation))
-    parts += markdown_section("Failed", failure_lines(evaluation))
-    parts += markdown_section("Notes", note_lines(evaluation))
-    return "\n\n".join(parts) + "\n"
+    heads = (f"{in_markdown(line)}." for line in header_lines(evaluation))
+    return "\n\n".join([*heads, *parts_as_markdown(_parts(evaluation, columns))]) + "\n"
 
 
 def evaluation_latex(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
     """Return the tables for a paper, after a comment that says on which terms; the package booktabs is needed."""
     parts = ["\n".join(f"% {line}" for line in (*header_lines(evaluation), *paired_lines(evaluation)))]
-    parts.append(as_latex(leaderboard_table(evaluation, columns)))
-    if len(evaluation.sequences) > 1:
-        parts.append(as_latex(sequences_table(evaluation)))
-    if (stated := uncertainty_table(evaluation)) is not None:
-        parts += [f"% {_UNCERTAINTY}\n{as_latex(stated)}"]
-    return "\n\n".join(parts) + "\n"
+    tables = ((title, body) for title, body in _parts(evaluation, columns) if isinstance(body, Table))
+    return "\n\n".join([*parts, *(f"% {title}\n{as_latex(table)}" for title, table in tables)]) + "\n"
 
 
 def evaluation_csv(evaluation: EvaluatedSystems) -> str:
@@ -337,7 +324,7 @@ def evaluation_csv(evaluation: EvaluatedSystems) -> str:
 
 def check_evaluation_directory(target: Path) -> None:
     """Raise OutputError unless an evaluation can be written at ``target`` without the loss of anybody's files."""
-    check_replaceable(target, _written_by_us)
+    check_replaceable(target, _ours)
 
 
 def write_evaluation(
@@ -347,12 +334,13 @@ def write_evaluation(
 
     Raises OutputError where that cannot be.
     """
-    with replaced_directory(target, _written_by_us) as directory:
+    with replaced_directory(target, _ours) as directory:
         captions = _written_figures(evaluation, directory / "figures", choice, kind)
+        figures = {directory / "figures" / name: caption for name, caption in captions.items()}
         document = replace(evaluation_document(evaluation), figures=tuple(captions))
         texts = (
             to_text(document),
-            leaderboard_page(evaluation, _in_page(directory / "figures", captions)),
+            leaderboard_page(evaluation, figures),
             evaluation_markdown(evaluation),
             evaluation_csv(evaluation),
         )
@@ -374,112 +362,25 @@ def _written_figures(
     return save(map(literal, draw(evaluation, all_sequences=choice == "all")), folder, kind)
 
 
-def _in_page(folder: Path, captions: Mapping[str, str]) -> str:
-    """Return figures with their captions as elements of HTML, the images inside; a PDF is not shown in a page."""
-    kinds = {".png": "image/png", ".svg": "image/svg+xml"}
-    elements = []
-    for name, caption in captions.items():
-        image, words = folder / name, in_html(caption)
-        if image.suffix in kinds:
-            data = base64.b64encode(image.read_bytes()).decode()
-            source_of = f"data:{kinds[image.suffix]};base64,{data}"
-            elements.append(
-                f'<figure><img alt="{words}" src="{source_of}"><figcaption class="fine">{words}</figcaption></figure>'
-            )
-    return "".join(elements)
-
-
-def _written_by_us(directory: Path) -> frozenset[str]:
-    """Return what in a directory an earlier evaluation wrote; nothing where its document is none of ours."""
+def _ours(directory: Path) -> frozenset[str]:
     try:
-        document = read_evaluation(directory / EVALUATION)
+        figures = read_evaluation(directory / EVALUATION).figures or ()
     except DataError:
         return frozenset()
-    figures = () if document.figures is UNSET else document.figures
-    return frozenset({*_FILES, *(f"figures/{name}" for name in figures), *(["figures/"] if figures else [])})
+    return with_folders((*_FILES, *(f"figures/{name}" for name in figures)))
 
 
-def leaderboard_page(evaluation: EvaluatedSystems, figures: str = "") -> str:
-    """Return the page: leaderboard, a table by sequence, every run as a dot, figures, tests, failures and notes."""
+def leaderboard_page(evaluation: EvaluatedSystems, figures: Mapping[Path, str]) -> str:
+    """Return the page: tables, figures (file -> caption), tests, failures and notes."""
     title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
     if len(evaluation.sequences) > 3:
         title += f" and {len(evaluation.sequences) - 3} more"
-    cards = [_card("Leaderboard", _paragraphs(header_lines(evaluation)) + _html_table(leaderboard_table(evaluation)))]
-    if len(evaluation.sequences) > 1:
-        name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
-        cards.append(_card(name, _html_table(sequences_table(evaluation))))
-    cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
-    if (stated := uncertainty_table(evaluation)) is not None:
-        cards.append(_card(_UNCERTAINTY.capitalize(), _html_table(stated)))
-    cards += [_card("Figures", figures)] if figures else []
-    for name, lines in (
-        ("Is it more than chance?", paired_lines(evaluation)),
-        ("Runs that failed", failure_lines(evaluation, None)),
-        ("Notes", note_lines(evaluation)),
-    ):
-        entries = "".join(f"<li>{in_html(line)}</li>" for line in lines)
-        cards += [_card(name, f"<ul>{entries}</ul>")] if entries else []
+    cards = [card("On which terms", header_lines(evaluation))]
+    for name, body in _parts(evaluation, most=None):
+        if body:
+            cards.append(
+                card(name.capitalize(), table=body) if isinstance(body, Table) else card(name.capitalize(), body)
+            )
+    cards += [card("Figures", figures=figures)] if figures else []
     parts = {"title": in_html(title), "style": source("style.css"), "cards": "\n".join(cards)}
     return filled_page("leaderboard.html", parts)
-
-
-def _html_table(table: Table) -> str:
-    return f'<div class="scroll">{as_html(table)}</div>'
-
-
-def _card(title: str, body: str) -> str:
-    return f'<section class="card"><h2>{in_html(title)}</h2>{body}</section>'
-
-
-def _paragraphs(lines: Iterable[str]) -> str:
-    return "".join(f'<p class="fine">{in_html(line)}</p>' for line in lines)
-
-
-def _figure(evaluation: EvaluatedSystems) -> str:
-    """Return every run as a dot, a row a sequence and system, on a logarithmic scale; a cross is one that failed."""
-    rows = [(sequence, system) for sequence in evaluation.sequences for system in evaluation.systems]
-    values = [v for run in evaluation.runs if run.status == "ok" and (v := _value(run, evaluation)) is not None]
-    if not values:
-        return '<p class="fine">No run has a value.</p>'
-    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
-    scale = _DOTS / max(high - low, 1)
-    height = _ROW * len(rows) + 34.0
-    marks = []
-    for decade in range(low, max(high, low + 1) + 1):
-        x = _NAMES + scale * (decade - low)
-        marks.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="4" y2="{height - 22:.1f}"/>')
-        marks.append(f'<text x="{x:.1f}" y="{height - 6:.1f}" text-anchor="middle">{10.0**decade:g}</text>')
-    for i, (sequence, system) in enumerate(rows):
-        y, colour = 10.0 + _ROW * (i + 0.5), evaluation.systems.index(system) % _COLOURS
-        if i % len(evaluation.systems) == 0:
-            marks.append(f'<text x="0" y="{y + 4:.1f}">{in_html(sequence[:30])}</text>')
-        for run in evaluation.cells[system, sequence].runs:
-            value = _value(run, evaluation)
-            title = f"<title>{in_html(_named(run, value))}</title>"
-            if run.status == "ok" and value is not None:
-                x = _NAMES + scale * (math.log10(value) - low)
-                style = f'style="fill:var(--line-{colour});fill-opacity:.75"'
-                marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" {style}>{title}</circle>')
-            elif run.status != "ok":
-                x = _NAMES + _DOTS + 0.5 * _MARGIN
-                cross = f"M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"
-                marks.append(f'<path class="failed" d="{cross}">{title}</path>')
-    keys = "".join(
-        f'<span class="key"><i style="background:var(--line-{i % _COLOURS})"></i>{in_html(system)}</span>'
-        for i, system in enumerate(evaluation.systems)
-    )
-    unit = f" [{evaluation.ranked_by.unit}]" if evaluation.ranked_by.unit else ""
-    label = f"{evaluation.ranked_by.name}{unit} of every run, logarithmic; a cross is a run that failed"
-    box = f"0 0 {_NAMES + _DOTS + _MARGIN:.0f} {height:.0f}"
-    drawing = f'<svg viewBox="{box}" role="img" aria-label="{in_html(label)}">{"".join(marks)}</svg>'
-    return f'<figure>{keys}{drawing}<figcaption class="fine">{in_html(label)}</figcaption></figure>'
-
-
-def _value(run: RunRecord, evaluation: EvaluatedSystems) -> float | None:
-    value = run.metrics.get(evaluation.ranked_by.key)
-    return value if value is not None and value > 0.0 else None
-
-
-def _named(run: RunRecord, value: float | None) -> str:
-    entry = run.log[0] if run.status != "ok" else f"{value:.4g}" if value is not None else "no value"
-    return f"{run.estimator}, {run.sequence}, {run.run}: {entry}"

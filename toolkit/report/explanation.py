@@ -18,8 +18,9 @@ from toolkit.experiment.statistics import Paired
 from toolkit.files.documents import Count, read, rounded, to_text
 from toolkit.files.writing import check_replaceable
 from toolkit.metrics import metrics_called
+from toolkit.report.html import card
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import own_files, results_section, write_results
+from toolkit.report.results_folder import PAGE, own_files, write_results
 from toolkit.report.text import (
     MISSING,
     Table,
@@ -415,7 +416,8 @@ def explanation_section(found: ExplanationRecord, directory: Path) -> str:
 
     Raises DataError where the figure is missing.
     """
-    return results_section(title_of(found), found.words, explanation_table(found), found.figures, directory)
+    figures = {directory / name: caption for name, caption in found.figures.items()}
+    return card(title_of(found), [found.words], explanation_table(found), figures)
 
 
 def check_explanation_directory(target: Path) -> None:
@@ -424,7 +426,7 @@ def check_explanation_directory(target: Path) -> None:
 
 
 def _ours(directory: Path) -> frozenset[str]:
-    return own_files(directory, EXPLANATION, read_explanation)
+    return own_files(directory, lambda folder: (EXPLANATION, PAGE, *read_explanation(folder / EXPLANATION).files))
 
 
 def write_explanation(found: Explanation, target: Path, command: str) -> ExplanationRecord:

@@ -1,41 +1,47 @@
-"""The folder of a sweep or an explanation: document, text and figures, beside the outcomes that it is made from."""
+"""What the commands that write a folder share: which of its files are ours, and how outcomes are kept in it.
 
-import base64
-from collections.abc import Callable, Mapping, Sequence
+The folder of a sweep or an explanation is written here whole: document, text and figures.
+"""
+
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
 from toolkit.errors import DataError
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
-from toolkit.files.reading import read_input
-from toolkit.files.writing import replaced_directory
-from toolkit.report.run_directory import PAGE, take_over
-from toolkit.report.text import Table, as_html, in_html
+from toolkit.files.writing import replaced_directory, with_folders
 
 if TYPE_CHECKING:
     from toolkit.report.figures.style import NamedFigure
 
+PAGE = "report.html"
 _FIGURES = "figures"
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 
-class WithFiles(Protocol):
-    """A document that names the files of its folder."""
+def own_files(directory: Path, written: Callable[[Path], Iterable[str]]) -> frozenset[str]:
+    """Return what of ours is in a folder by its relative path, folders with a slash behind.
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Return the files, relative to the folder."""
-
-
-def own_files(directory: Path, document: str, read: Callable[[Path], WithFiles]) -> frozenset[str]:
-    """Return what in a folder was written with a document there, by its relative path; folders have a slash behind."""
+    It is outcomes, and what was ``written`` as the folder's document says, which may raise DataError where there is no
+    such document of ours: many programs write a file of that name.
+    """
     files = set(files_of_ours(directory))
     with suppress(DataError):
-        files |= {document, PAGE, *read(directory / document).files}
-    return frozenset(files | {f"{part.as_posix()}/" for file in files for part in PurePosixPath(file).parents} - {"./"})
+        files |= set(written(directory))
+    return with_folders(files)
+
+
+def take_over(file: Path, place: Path) -> None:
+    """Have a file in another place, too."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.hardlink_to(file)
+    except OSError:  # a file system without links
+        shutil.copyfile(file, place)
 
 
 def write_results(
@@ -63,17 +69,3 @@ def write_results(
         for name, text_of in texts.items():
             (directory / name).write_text(text_of(made), encoding="utf-8")
     return made
-
-
-def results_section(title: str, words: str, table: Table, figures: Mapping[str, str], directory: Path) -> str:
-    """Return the section of the page for a folder, with its figures (file -> caption) inside, as HTML.
-
-    Raises DataError where a figure is missing.
-    """
-    parts = [f"<h2>{in_html(title)}</h2>", f"<p>{in_html(words)}</p>", f'<div class="wide">{as_html(table)}</div>']
-    parts += [f'<p class="fine">{in_html(line)}</p>' for line in table.under]
-    for name, caption in figures.items():
-        image = base64.b64encode(read_input(directory / name)).decode("ascii")
-        figure = f'<img src="data:image/png;base64,{image}" alt="{in_html(caption)}" style="max-width: 100%">'
-        parts.append(f"<figure>{figure}<figcaption>{in_html(caption)}</figcaption></figure>")
-    return f'<section class="card results">{"".join(parts)}</section>'

@@ -5,11 +5,10 @@ It is read with nothing but its own files, so that this works on any machine.
 
 import io
 import os
-import shutil
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
@@ -43,6 +42,7 @@ from toolkit.report.report_json import (
     read_report,
     read_seeds_report,
 )
+from toolkit.report.results_folder import PAGE, own_files, take_over
 from toolkit.report.scores import (
     MetricsDocument,
     RunOverSeeds,
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 METRICS, SEEDS, REPORT, MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 # What a sweep or an explanation leaves in their place.
 _RESULTS = ("sweep.json", "explain.json")
-REPORT_TEXT, PAGE = "report.md", "report.html"
+REPORT_TEXT = "report.md"
 FOLDERS = ("figures", "landmarks", "states", "trajectories")
 
 
@@ -76,20 +76,17 @@ def written_by_us(directory: Path) -> frozenset[str]:
     """Return what in a directory an earlier run wrote: files by their relative path, folders with a slash behind.
 
     They are the outcomes of a run that is not complete or is continued; those its manifest lists; and the page that
-    ``vislam report`` puts beside them. None of these where there is no manifest of ours: many programs write a file of
-    that name.
+    ``vislam report`` puts beside them.
     """
-    files = set(files_of_ours(directory))
-    try:
-        manifest = read_manifest(directory / MANIFEST)
-    except DataError:
-        folders = set()
-    else:
-        files |= set(() if manifest.files is UNSET else manifest.files)
-        files |= {PAGE} if _is_page(directory / PAGE) else set()
-        folders = {f"{folder}/" for folder in FOLDERS}
-    folders |= {f"{folder.as_posix()}/" for file in files for folder in PurePosixPath(file).parents}
-    return frozenset(files | folders - {"./"})
+    return own_files(directory, _written)
+
+
+def _written(directory: Path) -> Iterator[str]:
+    files = read_manifest(directory / MANIFEST).files
+    yield from (f"{folder}/" for folder in FOLDERS)
+    yield from () if files is UNSET else files
+    if _is_page(directory / PAGE):
+        yield PAGE
 
 
 def _is_page(path: Path) -> bool:
@@ -180,15 +177,6 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
     trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
     for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
         take_over(target / name, directory / name)
-
-
-def take_over(file: Path, place: Path) -> None:
-    """Have a file in another place, too."""
-    place.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        place.hardlink_to(file)
-    except OSError:  # a file system without links
-        shutil.copyfile(file, place)
 
 
 def _files_in(directory: Path) -> tuple[str, ...]:

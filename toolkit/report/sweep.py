@@ -16,8 +16,9 @@ from toolkit.files.documents import of_attributes, read, to_text
 from toolkit.files.writing import check_replaceable
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import sequence_line
+from toolkit.report.html import card
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import own_files, results_section, write_results
+from toolkit.report.results_folder import PAGE, own_files, write_results
 from toolkit.report.text import (
     MISSING,
     Table,
@@ -237,8 +238,8 @@ def sweep_section(sweep: SweepRecord, directory: Path) -> str:
 
     Raises DataError where a figure is missing.
     """
-    title = f"Sweep of {sweep.sequence.name}"
-    return results_section(title, sweep.about, sweep_table(sweep), sweep.figures, directory)
+    figures = {directory / name: caption for name, caption in sweep.figures.items()}
+    return card(f"Sweep of {sweep.sequence.name}", [sweep.about], sweep_table(sweep), figures)
 
 
 def check_sweep_directory(target: Path) -> None:
@@ -247,7 +248,7 @@ def check_sweep_directory(target: Path) -> None:
 
 
 def _ours(directory: Path) -> frozenset[str]:
-    return own_files(directory, SWEEP, read_sweep)
+    return own_files(directory, lambda folder: (SWEEP, PAGE, *read_sweep(folder / SWEEP).files))
 
 
 def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Sequence[NamedFigure]") -> SweepRecord:

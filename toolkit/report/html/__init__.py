@@ -4,22 +4,26 @@ Reading order: payload (what is shown of what :mod:`toolkit.report.run_directory
 made of page.html, style.css and the scripts in ``scripts``): nothing is fetched, and no text of a recording is code.
 """
 
+import base64
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from toolkit.errors import printable
+from toolkit.files.reading import read_input
 from toolkit.files.writing import write_text
+from toolkit.report.text import Table, as_html, in_html
 
 # In the order in which they build upon each other; together they are the body of one function.
 SCRIPTS = (
     *("dom", "numbers", "state", "hints", "table", "canvas", "gestures", "scene", "top_view", "orbit_view"),
     *("axes", "chart", "charts", "seeds", "frames", "words", "case", "main"),
 )
+_IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 # Characters that could end the script element or open a comment in it, or that older parsers take as the end of a line.
 _ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
@@ -56,6 +60,25 @@ def page_text(payload: dict[str, Any], sections: str = "") -> str:
         "script": "\n".join(source(f"scripts/{name}.js") for name in SCRIPTS),
     }
     return filled_page("page.html", parts)
+
+
+def card(
+    title: str, lines: Iterable[str] = (), table: Table | None = None, figures: Mapping[Path, str] | None = None
+) -> str:
+    """Return a card of a page: lines, a table with those under it, figures (file -> caption) with the images inside.
+
+    A PDF is not shown in a page. Raises DataError where a figure is missing.
+    """
+    parts = [f"<h2>{in_html(title)}</h2>", *(f"<p>{in_html(line)}</p>" for line in lines)]
+    if table is not None:
+        parts.append(f'<div class="wide">{as_html(table)}</div>')
+        parts += [f'<p class="fine">{in_html(line)}</p>' for line in table.under]
+    for path, caption in (figures or {}).items():
+        if path.suffix in _IMAGES:
+            image, words = base64.b64encode(read_input(path)).decode("ascii"), in_html(caption)
+            shown = f'<img src="data:{_IMAGES[path.suffix]};base64,{image}" alt="{words}" style="max-width: 100%">'
+            parts.append(f"<figure>{shown}<figcaption>{words}</figcaption></figure>")
+    return f'<section class="card results">{"".join(parts)}</section>'
 
 
 def filled_page(name: str, parts: Mapping[str, str]) -> str:
