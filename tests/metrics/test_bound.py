@@ -30,8 +30,8 @@ def test_at_the_last_frame_the_causal_bound_is_the_final_one(sequence):
     causal, final = efficient(sequence, "causal"), efficient(sequence, "final")
     sigmas = np.sqrt(np.diag(final.covs[-1]))
     # GTSAM's Jacobians are taken at the residuals' values, those of the filter where they are zero: second order.
-    np.testing.assert_allclose((causal.covs[-1] - final.covs[-1]) / np.outer(sigmas, sigmas), 0.0, atol=1e-3)
-    np.testing.assert_allclose((causal.errors[-1] - final.errors[-1]) / sigmas, 0.0, atol=1e-2)
+    np.testing.assert_allclose((causal.covs[-1] - final.covs[-1]) / np.outer(sigmas, sigmas), 0.0, atol=1e-6)
+    np.testing.assert_allclose((causal.errors[-1] - final.errors[-1]) / sigmas, 0.0, atol=1e-6)
 
 
 def test_more_measurements_only_lower_the_bound(sequence):

@@ -44,6 +44,14 @@ def key_list(keys: Iterable[int]) -> gtsam.KeyList:
     return listed
 
 
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """Return the order in which variables are eliminated, or their rows are stacked."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
 def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array]:
     """Return the points (3,) of landmarks, by track: rows of one array, read at once.
 

@@ -36,7 +36,7 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.models.factors import linear_factor
+from toolkit.models.factors import linear_factor, ordering_of
 from toolkit.models.graph_state import MotionModel
 
 # Accepted relative error of a standard deviation, which is read to a tenth.
@@ -147,8 +147,8 @@ def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -
     """
     keys = [key for state in states for key in state]
     last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
-    _, left = linear.eliminatePartialSequential(_ordering(_others(last, keys)))
-    information, _ = left.hessian(_ordering(keys))
+    _, left = linear.eliminatePartialSequential(ordering_of(_others(last, keys)))
+    information, _ = left.hessian(ordering_of(keys))
     size = linear.gradientAtZero()
     ends = np.cumsum([sum(size.at(key).size for key in state) for state in states])
     return np.split(np.diag(np.linalg.inv(information)), ends[:-1])
@@ -183,7 +183,7 @@ def _in_time(
     for key, last in waiting.items():
         before[last].append(key)
     in_groups = [key for i, group in enumerate(groups) for key in (*before[i], *group)]
-    return _ordering([*(key for key in landmarks if key not in waiting), *in_groups])
+    return ordering_of([*(key for key in landmarks if key not in waiting), *in_groups])
 
 
 def _spans(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) -> dict[int, tuple[int, int]]:
@@ -203,19 +203,12 @@ def _spans(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) ->
 
 def _dissected(graph: gtsam.GaussianFactorGraph, last: Collection[int]) -> gtsam.Ordering:
     """Return the order of nested dissection, with some variables last."""
-    return _ordering([*_others(gtsam.Ordering.MetisGaussianFactorGraph(graph), last), *last])
+    return ordering_of([*_others(gtsam.Ordering.MetisGaussianFactorGraph(graph), last), *last])
 
 
 def _others(ordering: gtsam.Ordering, without: Collection[int]) -> list[int]:
     left_out = frozenset(without)
     return [key for key in (ordering.at(i) for i in range(ordering.size())) if key not in left_out]
-
-
-def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
 
 
 def _eliminated(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:

@@ -29,6 +29,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
+from toolkit.models.factors import ordering_of
 from toolkit.models.gating import LEAST_DISPARITY_PX, huber_losses, huber_weights
 from toolkit.models.graph_state import MotionModel
 
@@ -390,12 +391,10 @@ class Evaluated:
 
     def _of_motion(self, size: int) -> tuple[Array, Array]:
         """Return the normal equations of the motion factors, which involve the first states of the window, or all."""
-        tied, ordering = set(self.motion.keyVector()), gtsam.Ordering()
-        for key in self.window.all_keys:
-            if key in tied:
-                ordering.push_back(key)
+        tied = set(self.motion.keyVector())
         information, vector = np.zeros((0, 0)), np.zeros(0)
         if tied:
+            ordering = ordering_of(key for key in self.window.all_keys if key in tied)
             # The matrix is symmetric and column-major, so its transpose is the same matrix in NumPy's row-major order.
             augmented = self.motion.augmentedHessian(ordering).T
             information, vector = augmented[:-1, :-1], augmented[-1, :-1]

@@ -3,9 +3,9 @@
 No unbiased estimator has a smaller covariance than the inverse of Fisher's information (Van Trees, "Detection,
 estimation and modulation theory", part I, 1968, section 2.4). For Gaussian measurements that is the information of all
 factors linearised at the truth: the factors, the noise, the prior and the tracks are those the estimators have. No
-estimator is used to compute it: the causal bound comes from a forward information filter over the state and the
-landmarks that are still to be seen (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao bounds for discrete-time
-nonlinear filtering"), the final one by eliminating the whole graph.
+estimator is used to compute it: for the causal bound the factors are added frame by frame, and all but the state and
+the landmarks that are still to be seen is marginalised (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao
+bounds for discrete-time nonlinear filtering"), for the final one the whole graph is eliminated.
 
 The efficient estimate attains the bound: it is one linear step from the truth on the same measurements. The error of
 any unbiased estimator is that of the efficient one plus an uncorrelated part. The difference of both errors is
@@ -17,7 +17,7 @@ states.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -25,14 +25,14 @@ import numpy as np
 from toolkit.answers import Output
 from toolkit.arrays import rows_of
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import Packet, Prior, StereoFrame, StereoRig, is_left_only
 from toolkit.metrics.parts.against_truth import place_first
 from toolkit.metrics.parts.consistency import starts_in_the_truths_world
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors
+from toolkit.models.factors import StereoFactors, landmark_keys, ordering_of
 from toolkit.models.gating import chi2_bound
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
@@ -100,9 +100,33 @@ class _Problem:
     track_ids: IntArray
     points: Array
 
-    def rows(self, frame: StereoFrame) -> IntArray:
-        """Return the rows (N,) of the landmarks that a frame shows."""
-        return np.searchsorted(self.track_ids, frame.track_ids)
+    @cached_property
+    def values(self) -> gtsam.Values:
+        """The states and the landmarks."""
+        values = gtsam.Values()
+        for k, state in enumerate(self.states):
+            self.model.insert(values, state.estimate(0), k)
+        for key, point in zip(landmark_keys(self.track_ids.tolist()), self.points, strict=True):
+            values.insert(key, point)
+        return values
+
+    @cached_property
+    def frames(self) -> tuple[gtsam.GaussianFactorGraph, ...]:
+        """What each frame adds, linearised: the prior or the motion since the frame before, and its sightings."""
+        maker, frames = StereoFactors(self.rig), []
+        for k, packet in enumerate(self.packets):
+            if packet.motion is None:
+                graph = self.model.hold(self.prior, 0)
+            else:
+                graph = self.model.integrate(packet.motion, self.states[k - 1].bias).factors(k)
+            for factor in maker.of(packet.frame, k):
+                graph.add(factor)
+            frames.append(graph.linearize(self.values.extract(list(graph.keyVector()))))
+        return tuple(frames)
+
+    def error(self, k: int, moved: gtsam.Values) -> Array:
+        """Return the error (d,) of state k of other values: its difference to the true one."""
+        return self.states[k].at(self.model.read(moved, k, 0)).error_to(self.states[k])
 
 
 @lru_cache(maxsize=1)
@@ -188,7 +212,8 @@ def _sighting_chi_square(problem: _Problem) -> tuple[float, float]:
     squared, dof = 0.0, -3 * problem.track_ids.size
     for packet, state in zip(problem.packets, problem.states, strict=True):
         uvs_px = packet.frame.uvs_px
-        seen = stereo.predict(problem.points[problem.rows(packet.frame)], state.T_world_imu, problem.rig)
+        points = problem.points[np.searchsorted(problem.track_ids, packet.frame.track_ids)]
+        seen = stereo.predict(points, state.T_world_imu, problem.rig)
         squared += float(np.square(stereo.whitened_residuals(uvs_px, seen.uv_px, problem.rig)).sum())
         dof += int(np.broadcast_to(stereo.degrees_of_freedom(uvs_px), len(uvs_px)).sum())
     return (squared / dof, 5.0 * float(np.sqrt(2.0 / dof))) if dof > 0 else (1.0, 0.0)
@@ -248,112 +273,55 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
 
 
 def _causal(problem: _Problem) -> Efficient:
-    """Propagate the information of state and landmarks; a landmark is marginalised after its last sighting."""
-    last_seen = np.zeros(problem.track_ids.size, dtype=np.int64)
-    for packet in problem.packets:
-        last_seen[problem.rows(packet.frame)] = packet.index
-    known = _Information(problem)
+    """Add what each frame tells, and marginalise what no later frame concerns."""
+    model, sizes = problem.model, problem.values.dims()
+    last = {key: k for k, frame in enumerate(problem.frames) for key in frame.keyVector()}
+    known, information, vector = list[int](), np.zeros((0, 0)), np.zeros(0)
     covs, errors = [], []
-    for packet in problem.packets:
-        if packet.motion is not None:
-            known.predict(packet)
-        known.update(packet.frame, problem.states[packet.index].T_world_imu)
-        cov, mean = known.state()
-        covs.append(cov)
-        errors.append(-mean)
-        known.forget(np.asarray(last_seen <= packet.index))
+    for k, frame in enumerate(problem.frames):
+        seen, own = list(frame.keyVector()), model.keys(k)
+        known += sorted(set(seen).difference(known))
+        rows = _rows(known, sizes)
+        added = sum(sizes[key] for key in known) - len(vector)
+        information, vector = np.pad(information, (0, added)), np.pad(vector, (0, added))
+        of_frame, to_frame = frame.hessian(ordering_of(seen))
+        here = np.concatenate([rows[key] for key in seen])
+        information[np.ix_(here, here)] += of_frame
+        vector[here] += to_frame
+        of_state, to_state = _marginal(information, vector, np.concatenate([rows[key] for key in own]))
+        cov, delta = np.asarray(np.linalg.inv(of_state)), gtsam.VectorValues()
+        for key, at in _rows(own, sizes).items():
+            delta.insert(key, cov[at] @ to_state)
+        covs.append(model.estimate_cov(cov, problem.states[k].T_world_imu[:3, :3]))
+        errors.append(problem.error(k, problem.values.extract(own).retract(delta)))
+        known = [key for key in known if last[key] > k]
+        if known:
+            information, vector = _marginal(information, vector, np.concatenate([rows[key] for key in known]))
     return Efficient(problem.prior.layout, np.array(covs), np.array(errors))
 
 
-class _Information:
-    """The information matrix and vector of the state's and the landmarks' offsets from the truth, the state first."""
+def _rows(keys: list[int], sizes: dict[int, int]) -> dict[int, IntArray]:
+    """Return the rows of each variable, stacked in the order of the keys."""
+    ends = np.cumsum([sizes[key] for key in keys])
+    return {key: np.arange(end - sizes[key], end) for key, end in zip(keys, ends, strict=True)}
 
-    def __init__(self, problem: _Problem) -> None:
-        self._problem, self._size = problem, problem.prior.layout.size
-        self._matrix = np.asarray(np.linalg.inv(problem.prior.cov))
-        self._vector: Array = self._matrix @ problem.states[0].error_to(problem.prior)
-        self._landmarks = np.empty(0, dtype=np.int64)  # rows of the problem's landmarks
 
-    def predict(self, packet: Packet) -> None:
-        """Add the next state by the measured motion, and marginalise the one before it."""
-        problem, d, k = self._problem, self._size, packet.index
-        assert packet.motion is not None
-        before, now = problem.states[k - 1], problem.states[k]
-        increment = problem.model.integrate(packet.motion, before.bias)
-        prediction = increment.predict(before)
-        # Linearised at the true end, not at the predicted one, so that unobservable directions gain no information.
-        at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
-        transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
-        # By the measured motion the next state's offset is F x + r plus noise.
-        r = now.error_to(before.predicted(prediction))
-        weighted = transition.T @ precision
-        to_next = np.concatenate([-weighted, self._matrix[:d, d:]], axis=1)
-        score = self._vector[:d] - weighted @ r
-        gain = np.linalg.solve(self._matrix[:d, :d] + weighted @ transition, np.column_stack([to_next, score]))
-        self._matrix[:d], self._matrix[:, :d], self._matrix[:d, :d] = 0.0, 0.0, precision
-        self._matrix -= to_next.T @ gain[:, :-1]
-        self._vector = np.concatenate([precision @ r, self._vector[d:]]) - to_next.T @ gain[:, -1]
-
-    def update(self, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Add the sightings of a frame; landmarks seen for the first time are added to the state."""
-        problem, rows = self._problem, self._problem.rows(frame)
-        self._join(rows[~np.isin(rows, self._landmarks)])
-        seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
-        whitener = stereo.whitener(frame.uvs_px, problem.rig)
-        root = float(np.sqrt(problem.rig.track_weight))
-        H = root * np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
-        residuals = root * stereo.whitened_residuals(frame.uvs_px, seen.uv_px, problem.rig)
-        place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]
-        own = self._size + 3 * place[:, None] + np.arange(3)
-        columns = np.concatenate([np.broadcast_to(np.arange(6), (len(rows), 6)), own], axis=1)
-        H_transposed = np.swapaxes(H, 1, 2)
-        np.add.at(self._matrix, (columns[:, :, None], columns[:, None, :]), H_transposed @ H)
-        np.add.at(self._vector, columns, (H_transposed @ residuals[..., None])[..., 0])
-
-    def state(self) -> tuple[Array, Array]:
-        """Return the covariance (d, d) and the mean (d,) of the state's offset."""
-        d = self._size
-        inner = np.linalg.solve(self._matrix[d:, d:], np.column_stack([self._matrix[d:, :d], self._vector[d:]]))
-        cov = np.linalg.inv(self._matrix[:d, :d] - self._matrix[:d, d:] @ inner[:, :d])
-        return 0.5 * (cov + cov.T), cov @ (self._vector[:d] - self._matrix[:d, d:] @ inner[:, d])
-
-    def forget(self, gone: BoolArray) -> None:
-        """Marginalise landmarks that are not seen again: ``gone`` (M,) masks the problem's landmarks."""
-        leaving = gone[self._landmarks]
-        if not leaving.any():
-            return
-        out = np.concatenate([np.zeros(self._size, dtype=bool), np.repeat(leaving, 3)])
-        across = self._matrix[np.ix_(out, ~out)]
-        gain = np.linalg.solve(self._matrix[np.ix_(out, out)], np.column_stack([across, self._vector[out]]))
-        self._matrix = self._matrix[np.ix_(~out, ~out)] - across.T @ gain[:, :-1]
-        self._vector = self._vector[~out] - across.T @ gain[:, -1]
-        self._landmarks = self._landmarks[~leaving]
-
-    def _join(self, rows: IntArray) -> None:
-        full_size = len(self._matrix) + 3 * len(rows)
-        matrix, vector = np.zeros((full_size, full_size)), np.zeros(full_size)
-        matrix[: len(self._matrix), : len(self._matrix)], vector[: len(self._vector)] = self._matrix, self._vector
-        self._matrix, self._vector = matrix, vector
-        self._landmarks = np.concatenate([self._landmarks, rows])
+def _marginal(information: Array, vector: Array, rows: IntArray) -> tuple[Array, Array]:
+    """Return the information matrix and vector of some rows (m,), all others marginalised."""
+    out = np.setdiff1d(np.arange(len(vector)), rows)
+    across = information[np.ix_(out, rows)]
+    gain = np.linalg.solve(information[np.ix_(out, out)], np.column_stack([across, vector[out]]))
+    left = information[np.ix_(rows, rows)] - across.T @ gain[:, :-1]
+    return 0.5 * (left + left.T), vector[rows] - across.T @ gain[:, -1]
 
 
 def _final(problem: _Problem) -> Efficient:
-    """Solve the whole graph linearised at the truth."""
-    model, values = problem.model, gtsam.Values()
-    graph = model.hold(problem.prior, 0)
-    maker = StereoFactors(problem.rig)
-    for packet, state in zip(problem.packets, problem.states, strict=True):
-        model.insert(values, state.estimate(packet.frame.t_ns), packet.index)
-        if packet.motion is not None:
-            bias = problem.states[packet.index - 1].bias
-            graph.push_back(model.integrate(packet.motion, bias).factors(packet.index))
-        for factor in maker.of(packet.frame, packet.index):
-            graph.add(factor)
-    for track_id, point in zip(problem.track_ids.tolist(), problem.points, strict=True):
-        values.insert(L(track_id), point)
-    linear = graph.linearize(values)
-    poses = np.stack([state.T_world_imu for state in problem.states])
-    covs = state_covs(linear, model, poses)
-    moved = values.retract(linear.optimize())
-    errors = [state.at(model.read(moved, k, 0)).error_to(state) for k, state in enumerate(problem.states)]
-    return Efficient(problem.prior.layout, covs, np.array(errors))
+    """Solve the whole graph."""
+    linear = gtsam.GaussianFactorGraph()
+    for frame in problem.frames:
+        linear.push_back(frame)
+    covs = state_covs(linear, problem.model, np.stack([state.T_world_imu for state in problem.states]))
+    moved = problem.values.retract(linear.optimize())
+    return Efficient(
+        problem.prior.layout, covs, np.array([problem.error(k, moved) for k in range(len(problem.states))])
+    )
