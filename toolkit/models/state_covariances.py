@@ -8,23 +8,17 @@ GTSAM's Marginals traverses its Bayes tree again for each state, which takes a h
 Variables that depend on the same later ones, as pose, velocity and biases of one state do, are recovered together: one
 by one, in the second order below, all digits are lost within seconds of an IMU.
 
-Two orders are tried. In the order of time every state is recovered from the next, from the last to the first: with an
-IMU all are right to 1e-7 of a standard deviation. But where steps between states are known far better than the states,
-as with correlated errors of sightings, rounding grows from state to state. On a drive of 125 frames a standard
-deviation of the first state was wrong by 5 % of itself; along the 1010 frames of Dataset 03, with twists, by a factor
-of fifty. Nested dissection cuts the graph in halves recursively; the variables of a cut are eliminated last (George
-1973, "Nested dissection of a regular finite element mesh"): from the root to any state it is some tens of variables,
-and on those drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Nested
-dissection is tried first where states have no velocity (their steps are measured twists), but not where landmarks are
-seen for long, as while a vehicle stands: such landmarks connect hundreds of states: no cut is small. The
-result of an order is accepted if some of its covariances equal those computed for these states separately: for the
-order of time the first state, where rounding accumulates, else a few states.
+Two orders are tried, in a sequence that depends on the graph, and the first that holds is taken (docs/estimators.md,
+the covariances of `batch`): the order of time, in which every state is recovered from the next, and nested dissection
+(George 1973, "Nested dissection of a regular finite element mesh"), in which rounding does not grow from state to
+state, but which is slow where landmarks are seen for long and connect hundreds of states. An order holds if some of its
+covariances equal those computed for these states separately: for the order of time the first state, where rounding
+accumulates, else a few states.
 
-Where neither order is accepted, the coordinates of landmarks are changed. For a landmark thousands of baselines away
-the depth in metres is so uncertain that GTSAM rejects it as undetermined, or that rounding spoils the states'
-covariances, although its disparity is well determined. A linear change of a landmark's coordinates changes no state's
-covariance. So every landmark is expressed in the directions that the measurements determine, each scaled by its
-standard deviation, and undetermined directions are left out. Where this does not help either, RoundingError is raised.
+Where neither holds, every landmark is expressed in the directions that the measurements determine, each scaled by its
+standard deviation, and undetermined directions are left out: a linear change of a landmark's coordinates changes no
+state's covariance, and the depth in metres of one that is thousands of baselines away is nearly undetermined. Where
+this does not help either, RoundingError is raised.
 """
 
 from collections import Counter, defaultdict
@@ -48,8 +42,6 @@ _STANDING = 150
 # A direction of a variable with less than this share of the information on its best direction is lost in double
 # precision: for instance the depth of a landmark beyond 1e10 baselines.
 _LEAST_DETERMINED = 1e-10
-# Rows that may be added to a joint covariance before it is copied without the rows that are no longer needed.
-_ROOM = 100
 
 
 class RoundingError(RuntimeError):
@@ -259,40 +251,23 @@ def _clique(conditionals: Sequence[gtsam.GaussianConditional], sizes: Mapping[in
     return _Clique(own, later, -root @ terms[:, size:], root @ root.T)
 
 
-class _Joint:
-    """The joint covariance of some variables, in a matrix with room for more, so that adding variables moves no others.
+class _Joint(NamedTuple):
+    """The joint covariance of variables, with the rows of each by its key."""
 
-    Variables that are no longer needed stay until the room is used up.
-    """
-
-    def __init__(self, rows: dict[int, range], cov: Array, room: int) -> None:
-        self._rows, self._size = rows, len(cov)
-        self._matrix = np.empty((self._size + room, self._size + room))
-        self._matrix[: self._size, : self._size] = cov
+    rows: dict[int, range]
+    cov: Array
 
     def of(self, keys: Sequence[int]) -> Array:
         """Return the joint covariance of some of the variables, in the order of the keys."""
-        rows = _together(self._rows, keys)
-        return np.asarray(self._matrix[np.ix_(rows, rows)])
+        rows = _together(self.rows, keys)
+        return np.asarray(self.cov[np.ix_(rows, rows)])
 
-    def only(self, keys: Sequence[int], room: int) -> "_Joint":
-        """Return the covariance of some of the variables, with room for this many further rows."""
-        return _Joint(_rows({key: len(self._rows[key]) for key in keys}), self.of(keys), room)
-
-    def has_room(self, clique: _Clique) -> bool:
-        """Say whether a clique can be added."""
-        return self._size + len(clique.cov) <= len(self._matrix)
-
-    def add(self, clique: _Clique) -> None:
-        """Add the variables of a clique; all variables that it depends on must be present."""
-        before, size = self._size, self._size + len(clique.cov)
-        gain = np.zeros((size - before, before))
-        gain[:, _together(self._rows, clique.later)] = clique.gain
-        across = gain @ self._matrix[:before, :before]
-        self._matrix[before:size, :before], self._matrix[:before, before:size] = across, across.T
-        self._matrix[before:size, before:size] = clique.cov + across @ gain.T
-        self._rows |= {key: range(before + rows.start, before + rows.stop) for key, rows in _rows(clique.sizes).items()}
-        self._size = size
+    def extended(self, clique: _Clique) -> "_Joint":
+        """Return the joint covariance of a clique and of what it depends on, all of which must be present."""
+        later = self.of(clique.later)
+        across = clique.gain @ later
+        cov = np.block([[clique.cov + across @ clique.gain.T, across], [across.T, later]])
+        return _Joint(_rows(clique.sizes | {key: len(self.rows[key]) for key in clique.later}), cov)
 
 
 def _rows(sizes: Mapping[int, int]) -> dict[int, range]:
@@ -318,22 +293,13 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
     groups = defaultdict[int, list[Sequence[int]]](list)
     for group in together:
         groups[clique_of[min(group, key=place.__getitem__)]].append(group)
-    joints, waiting, covs = dict[int, _Joint](), Counter(next_of), dict[int, Array]()
+    joints, waiting, covs = dict[int | None, _Joint](), Counter(next_of), dict[int, Array]()
+    joints[None] = _Joint({}, np.empty((0, 0)))
     for i in reversed(range(len(cliques))):
-        joint = _room_for(cliques[i], next_of[i], joints, waiting)
-        joint.add(cliques[i])
+        joint = joints[next_of[i]].extended(cliques[i])
         covs |= {group[0]: joint.of(group) for group in groups[i]}
-        if waiting[i]:
-            joints[i] = joint
+        joints[i] = joint
+        waiting[next_of[i]] -= 1
+        if not waiting[next_of[i]]:
+            del joints[next_of[i]]
     return [covs[group[0]] for group in together]
-
-
-def _room_for(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
-    """Return a joint covariance to which a clique can be added; the last clique waiting for one reuses it in place."""
-    if after is None:
-        return _Joint({}, np.empty((0, 0)), _ROOM + len(clique.cov))
-    waiting[after] -= 1
-    joint = joints[after] if waiting[after] else joints.pop(after)
-    if not waiting[after] and joint.has_room(clique):
-        return joint
-    return joint.only(clique.later, _ROOM + len(clique.cov))
