@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from toolkit.errors import DataError
 from toolkit.evaluation.against_baseline import SequenceRecord, check_trajectories, new_trajectory_baseline
 from toolkit.evaluation.planning import CHANGES_PERCENT, planned
 from toolkit.evaluation.scoring import TIME_COVERAGE
@@ -73,4 +74,5 @@ def test_a_change_of_the_system_is_found_on_all_sequences_where_few_alone_show_i
 
 
 def test_without_repeated_runs_there_is_no_plan() -> None:
-    assert planned(baseline(Runs(2, np.random.default_rng(4)))) == ()
+    with pytest.raises(DataError, match="no sequence has 3 runs"):
+        planned(baseline(Runs(2, np.random.default_rng(4))))

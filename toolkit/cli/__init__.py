@@ -1,7 +1,7 @@
 """The command ``vislam``: subcommands by what they are about; whatever is slow to import is imported to run.
 
 Reading order: arguments (how a command is declared, and the arguments that several share), then the commands about one
-thing in a file each: compare, explain, sweep, evaluate, runs, recordings, gate, parts. Beside them
+thing in a file each: compare (with explain and sweep), evaluate, runs, recordings, gate, parts. Beside them
 progress_display, and completion for shells. Here: how a command is run, and what becomes of errors, signals and its
 output.
 """
@@ -20,7 +20,7 @@ from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
-from toolkit.cli import compare, completion, evaluate, explain, gate, parts, recordings, runs, sweep
+from toolkit.cli import compare, completion, evaluate, gate, parts, recordings, runs
 from toolkit.cli.arguments import Parser, ShowVersion
 from toolkit.errors import OutputError, SystemLimitError, VislamError, one_line
 
@@ -42,16 +42,8 @@ _LEAST_MEMORY = 300_000 * 1024
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
-    *(
-        compare.compare,
-        explain.explain,
-        sweep.sweep,
-        evaluate.evaluate,
-        runs.diff,
-        runs.report,
-        runs.export,
-        runs.reproduce,
-    ),
+    *(compare.compare, compare.explain, compare.sweep, evaluate.evaluate),
+    *(runs.diff, runs.report, runs.export, runs.reproduce),
     *(gate.check, gate.baseline, recordings.check_data, recordings.card, parts.verify, parts.list_parts, parts.cite),
     *(recordings.simulate, recordings.tracks, recordings.import_tables, completion.completion),
 )

@@ -300,6 +300,11 @@ COV_CONVENTION = arg(
     f"({', '.join(COV_CONVENTIONS)}; see docs/conventions.md)",
     choices=COV_CONVENTIONS,
 )
+FORMAT = choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text")
+FIGURES = (
+    choice("--figures", ("few", "all", "none"), "figures to draw with --out (see docs/figures.md)", default="few"),
+    choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
+)
 REPAIR = OneOf(
     (
         flag("--no-repair", "report the faults of a recording, repair none"),

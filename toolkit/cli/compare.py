@@ -1,22 +1,26 @@
-"""``vislam compare``: estimators side by side on the same measurements."""
+"""``vislam compare``, ``explain`` and ``sweep``: estimators on the same measurements, under one setting or many."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from toolkit.cli.arguments import (
     COV_CONVENTION,
+    FIGURES,
+    FORMAT,
     PART,
     REPAIR,
     SETTINGS,
     TOPICS,
     TRACKS,
     WORKERS,
+    UsageError,
     arg,
     at_least,
     choice,
@@ -28,16 +32,16 @@ from toolkit.cli.arguments import (
     names,
     output,
     requested_changes,
+    seconds_from_start,
     setting,
 )
 from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from msgspec import Struct
 
     from toolkit.experiment.comparison import Comparison
     from toolkit.experiment.configuration import Configuration
-    from toolkit.experiment.outcome_store import OutcomeStore
     from toolkit.report.comparison_table import Columns
 
 # The one with truth first: its table is the first impression.
@@ -45,16 +49,12 @@ SEQUENCES = ("drive", "kitti00")
 
 
 # How recordings are prepared and estimators run, of every command that does so.
-HOW = (
+_HOW = (
     *PART,
     REPAIR,
     setting(
         "start",
-        choice(
-            "--start",
-            ("measurements", "truth"),
-            "source of the first state; a start from the truth is labelled (default: measurements)",
-        ),
+        choice("--start", ("measurements", "truth"), "source of the first state, labelled (default: measurements)"),
     ),
     TRACKS,
     TOPICS,
@@ -62,17 +62,17 @@ HOW = (
     setting("seeds", arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1))),
     setting(
         "vary",
-        choice(
-            "--vary",
-            ("noise", "world"),
-            "what a seed draws of a simulation: the noise, or trajectory and landmarks as well (default: noise)",
-        ),
+        choice("--vary", ("noise", "world"), "what a seed draws: the noise, or the whole world too (default: noise)"),
     ),
     *SETTINGS,
 )
-SCHEDULER = arg(
-    "--scheduler ADDRESS",
-    "run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+_SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
+_TRUTH = arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE")
+_OUT = arg(
+    "--out DIR",
+    "run directory (default: runs/<date and time>); every run over seeds is kept there as it ends, and the same "
+    "command continues where it stopped",
+    Path,
 )
 
 
@@ -87,29 +87,20 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
     "run estimators on the same measurements and compare them",
     arg("sequences SEQUENCE", f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})", nargs="*"),
     estimators("estimators to compare, see 'vislam list estimators'; 'ladder' is every rung"),
-    arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE"),
+    _TRUTH,
     arg(
         "--trajectory NAME=FILE",
-        "another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the estimators, "
-        "as final or, with FILE:causal, as causal output; may be repeated; with exactly one SEQUENCE",
+        "another system's poses of the IMU, to be scored beside the estimators, as final or, with FILE:causal, as "
+        "causal output; may be repeated; with exactly one SEQUENCE",
         named_file,
         action="append",
         dest="trajectories",
         default=[],
     ),
     COV_CONVENTION,
-    arg(
-        "--out DIR",
-        "run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the same "
-        "command continues where it stopped",
-        Path,
-    ),
-    *HOW,
-    flag(
-        "--keep-trajectories",
-        "with --seeds, write the trajectories of every seed (of a single one they always are)",
-        default=None,
-    ),
+    _OUT,
+    *_HOW,
+    flag("--keep-trajectories", "with --seeds, write the trajectories of every seed", default=None),
     arg(
         "--columns NAME,...",
         "of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
@@ -117,16 +108,10 @@ class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
         default=(),
     ),
     WORKERS,
-    choice("--figures", ("few", "all", "none"), "figures to draw; docs/figures.md shows all of them", default="few"),
-    choice(
-        "--figure-format",
-        ("png", "pdf", "svg"),
-        "format of the figures; pdf and svg are vector graphics, for a paper",
-        default="png",
-    ),
-    choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text"),
+    *FIGURES,
+    FORMAT,
     output("what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"),
-    SCHEDULER,
+    _SCHEDULER,
     examples=("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",),
 )
 def compare(options: argparse.Namespace) -> int:
@@ -142,15 +127,20 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.report.scores import scores_document
 
     columns = requested_columns(options.columns)
-    requested = requested_configuration(options)
+    requested = _requested_configuration(options)
     plan = plan_of(requested, SEQUENCES, workers=options.workers, scheduler=options.scheduler)
     made_by = MadeBy(shlex.join(options.command_line), requested, options.figure_format, options.figures)
     progress_for, all_ok = of_this_process(), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
-        directories = directories_for(cases, options.out if options.out is not None else new_run())
+        directories = directories_for(cases, options.out if options.out is not None else _new_run())
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
-        open_files.enter_context(_kept_when_interrupted(stores))
+        for directory, store in stores.items():
+            open_files.callback(store.close)
+            if store.unusable:
+                what = f"{store.unusable} outcomes of other data, noise or repairs, or of another version"
+                print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
+        open_files.enter_context(_kept_where(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
             try:
@@ -174,17 +164,142 @@ def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) 
     from toolkit.report import comparison_text as texts
     from toolkit.report.text import width_of_output
 
-    if form == "csv":
-        text = texts.comparison_csv(comparison)
-        return text if first else text.partition("\n")[2]
-    if form == "latex":
-        return texts.comparison_latex(comparison, columns) + "\n"
-    if form == "markdown":
-        return texts.comparison_markdown(comparison, columns) + "\n"
+    match form:
+        case "csv":
+            text = texts.comparison_csv(comparison)
+            return text if first else text.partition("\n")[2]
+        case "latex":
+            return texts.comparison_latex(comparison, columns) + "\n"
+        case "markdown":
+            return texts.comparison_markdown(comparison, columns) + "\n"
     return texts.comparison_text(comparison, columns, width_of_output())
 
 
-def requested_configuration(options: argparse.Namespace) -> Configuration:
+@command(
+    "explain",
+    "say what makes one estimator more accurate than another, ingredient by ingredient",
+    arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
+    arg("--from NAME", "the first estimator (default: the lowest rung of those compared by default)", dest="start_at"),
+    arg("--to NAME", "the second estimator (default: the highest rung of those)", dest="goal"),
+    arg("--estimators NAME,...", "those whose variants may lie between the two, or files (default: all)", names),
+    _TRUTH,
+    _OUT,
+    arg("--since TIME", "leave out frames before it, as in 10s", seconds_from_start, dest="from_s"),
+    arg("--until TIME", "leave out frames after it, as in 10s", seconds_from_start, dest="to_s"),
+    *(one for one in _HOW if one not in PART[:2]),
+    WORKERS,
+    _SCHEDULER,
+    output("what explain.json holds, no table", "the run directory has everything"),
+    examples=(
+        "vislam explain drive --from ekf --to ekf-slam --until 3s --estimators ekf,ekf-slam --out runs/why",
+        "vislam report runs/why",
+    ),
+)
+def explain(options: argparse.Namespace) -> int:
+    """Run what lies between two estimators on one recording, and say what each ingredient in which they differ brings:
+    added to the first alone, and lost where the second lacks it; with 95 % intervals over seeds, or over stretches of
+    a recording. docs/explain.md tells how.
+    """
+    from toolkit.cli.progress_display import of_this_process
+    from toolkit.experiment.configuration import plan_of
+    from toolkit.experiment.explanation import default_ends, run_explanation
+    from toolkit.registry import discover
+    from toolkit.report.explanation import check_explanation_directory, explanation_text, write_explanation
+    from toolkit.report.text import width_of_output
+
+    options.sequences = [options.sequence]
+    options.estimators = options.estimators or tuple(discover())
+    plan = plan_of(_requested_configuration(options), (), workers=options.workers, scheduler=options.scheduler)
+    usual = default_ends()
+    ends = options.start_at or usual[0], options.goal or usual[1]
+    target, progress_for = options.out or _new_run(), of_this_process()
+    check_explanation_directory(target)
+    with _kept_where([target]):
+        found = run_explanation(plan, *ends, target, progress_for)
+    with progress_for(f"{found.grid.case.name}: figure"):
+        document = write_explanation(found, target, shlex.join(options.command_line))
+    _print(document, explanation_text(document, width_of_output()), target, options)
+    return 0
+
+
+def over(text: str) -> tuple[str, tuple[str, ...]]:
+    """Parse NAME=V1,V2,..., a setting or a fault and its values."""
+    name, equals, values = text.partition("=")
+    given = tuple(value.strip() for value in values.split(",") if value.strip())
+    if not (equals and name.strip() and given):
+        raise argparse.ArgumentTypeError(f"expected KEY=V1,V2,... or fault:NAME=D1,D2,..., not {text!r}")
+    return name.strip(), given
+
+
+@command(
+    "sweep",
+    "vary settings or plant faults in doses, and see where estimators break",
+    arg("sequence SEQUENCE", "a recording's path, or a built-in name", nargs="?"),
+    arg(
+        "--over KEY=V1,V2,...",
+        "vary a setting (see 'vislam list settings'), or plant fault:NAME in doses (see 'vislam list injectors'); two "
+        "are crossed, every value with every other",
+        over,
+        action="append",
+        default=[],
+    ),
+    flag("--each", "vary each of several by itself, and cross none", default=None),
+    estimators("estimators to run, see 'vislam list estimators'"),
+    _TRUTH,
+    _OUT,
+    *_HOW,
+    WORKERS,
+    _SCHEDULER,
+    output("what sweep.json holds, no table", "the run directory has everything"),
+    examples=(
+        "vislam sweep drive --over fault:dropped_frames=0.3,0.8 --estimators dead-reckoning,ekf --seeds 2 --to 3s "
+        "--out runs/sweep",
+    ),
+)
+def sweep(options: argparse.Namespace) -> int:
+    """Run estimators on one recording at every value of a setting, or with a fault planted in every dose of it, over
+    seeds, and tell how their errors compare with those without: a table with 95 % intervals, the dose at which each
+    breaks, what the audit would have said, and figures.
+    """
+    from toolkit.cli.progress_display import of_this_process
+    from toolkit.experiment.configuration import SweepRequest, plan_of, read_sweep_request
+    from toolkit.experiment.sweep import run_sweep
+    from toolkit.report.figures.sweeps import draw_sweep
+    from toolkit.report.sweep import check_sweep_directory, sweep_text, write_sweep
+    from toolkit.settings.reading import assigned
+
+    requested = SweepRequest() if options.config is None else read_sweep_request(options.config)
+    axes = {name: [assigned(f"{name}={value}")[1] for value in values] for name, values in options.over}
+    if len(axes) < len(options.over):
+        raise UsageError("--over names the same twice; give all its values at once")
+    options.sequences = None if options.sequence is None else [options.sequence]
+    plan = plan_of(_requested_configuration(options), (), workers=options.workers, scheduler=options.scheduler)
+    if not plan.sources:
+        raise UsageError("name the sequence to sweep, a path or a built-in name as drive")
+    target, progress_for = options.out or _new_run(), of_this_process()
+    check_sweep_directory(target)
+    with _kept_where([target]):
+        crossed = not (options.each or requested.each)
+        found = run_sweep(plan, axes or requested.over, crossed=crossed, directory=target, progress_for=progress_for)
+    with progress_for(f"{found.grid.case.name}: figures"):
+        document = write_sweep(found, target, shlex.join(options.command_line), list(draw_sweep(found)))
+    _print(document, sweep_text(document), target, options)
+    return 0
+
+
+def _print(document: Struct, text: str, target: Path, options: argparse.Namespace) -> None:
+    """Print what was found and is kept in a directory, as it is asked for."""
+    from toolkit.cli.progress_display import print_above
+    from toolkit.files.documents import to_line
+
+    where = printable(str(target))
+    if options.json:
+        print_above(to_line(document).rstrip())
+    elif not options.quiet:
+        print_above(f"{text}\n\nresults: {where}; as a page: vislam report {shlex.quote(where)}")
+
+
+def _requested_configuration(options: argparse.Namespace) -> Configuration:
     """Return what is to be compared and how: the file of --config, and over it the command line."""
     from toolkit.experiment.configuration import Request, configuration, read_configuration
     from toolkit.metrics import requests_of
@@ -204,41 +319,21 @@ def requested_configuration(options: argparse.Namespace) -> Configuration:
 
 
 @contextmanager
-def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
-    """Say what of the kept outcomes is of no use and, after an interrupt, where others are; close them in the end.
+def _kept_where(directories: Iterable[Path]) -> Iterator[None]:
+    """Say after an interrupt where outcomes are that were kept; raises Interrupted then, if there are any."""
+    from toolkit.experiment.outcome_store import OUTCOMES
 
-    Raises Interrupted in the place of KeyboardInterrupt where any outcome is kept.
-    """
-    for directory, store in stores.items():
-        if store.unusable:
-            what = f"{store.unusable} outcomes of other data, noise or repairs, or of another version"
-            print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
     try:
         yield
     except KeyboardInterrupt:
-        begun = [printable(str(directory)) for directory, store in stores.items() if store.is_there]
+        begun = [printable(str(directory)) for directory in directories if (directory / OUTCOMES).exists()]
         if not begun:
             raise
         kept = f"what has ended is kept in {', '.join(begun)}"
         raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
-    finally:
-        for store in stores.values():
-            store.close()
 
 
-@contextmanager
-def kept_where(target: Path) -> Iterator[None]:
-    """Say after an interrupt where the outcomes are that were kept; raises Interrupted then, if there are any."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if not target.exists():
-            raise
-        kept = f"what has ended is kept in {printable(str(target))}"
-        raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
-
-
-def new_run() -> Path:
+def _new_run() -> Path:
     """Return a directory named by the local time that does not exist yet."""
     from datetime import datetime
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     COV_CONVENTION,
+    FIGURES,
+    FORMAT,
     WORKERS,
     arg,
     at_least,
-    choice,
     command,
     flag,
     known_names,
@@ -40,29 +41,24 @@ MOST_RUNS = 10_000
         "SEQUENCE.tum or SEQUENCE/RUN.tum, or a FOLDER that has such a folder for each system",
         nargs="+",
     ),
-    arg(
-        "--max-dt S",
-        "pair each pose with the nearest one within S seconds, as evo does (default: interpolate)",
-        positive_seconds,
-    ),
+    arg("--max-dt S", "pair each pose with the nearest within S seconds (default: interpolate)", positive_seconds),
     COV_CONVENTION,
     arg("--offset S", "added to the trajectories' stamps", number_within("seconds", -1e9, 1e10), default=0.0),
     arg("--gap S", "the longest time between two poses that counts as covered", positive_seconds, default=5.0),
     flag("--imu", "the vertical is measured: place the first pose by heading and position only"),
     arg(
         "--least-coverage PERCENT",
-        "of the truth's time; a run that covers less counts as failed",
+        "of time; a run that covers less failed",
         number_within("percent", 0, 100),
         default=50.0,
     ),
     arg("--runs N", "expected runs of each system and sequence; missing ones count as failed", at_least(1, MOST_RUNS)),
     arg("--metric KEY", "metric that ranks and is tested", default="ate_se3_m"),
     arg("--columns KEY,...", "metrics of the table, uncertainty, or all (default: the usual)", names, default=()),
-    choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text"),
+    FORMAT,
     output("evaluation.json, and nothing else", "see the exit status and --out"),
     arg("--out DIR", "write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV", Path),
-    choice("--figures", ("few", "all", "none"), "to draw with --out: of three sequences, or of all", default="few"),
-    choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
+    *FIGURES,
     WORKERS,
     examples=(
         "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
@@ -81,7 +77,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from toolkit.experiment.workers import usable_cpus
     from toolkit.report.evaluation import check_evaluation_directory, write_evaluation
 
-    ranked_by, columns = _metric(options.metric), _metrics(options.columns)
+    (ranked_by, *_), columns = _metrics((options.metric,)), _metrics(options.columns)
     if options.out is not None:
         check_evaluation_directory(options.out)
     convention = None if options.cov_convention is None else convention_called(options.cov_convention)
@@ -102,24 +98,17 @@ def _shown(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argpar
     from toolkit.report import evaluation as texts
     from toolkit.report.text import width_of_output
 
-    if options.json:
-        return to_text(evaluation_document(found))
-    if options.format == "csv":
-        return texts.evaluation_csv(found)
-    if options.format == "latex":
-        return texts.evaluation_latex(found, columns)
-    if options.format == "markdown":
-        return texts.evaluation_markdown(found, columns)
+    match "json" if options.json else options.format:
+        case "json":
+            return to_text(evaluation_document(found))
+        case "csv":
+            return texts.evaluation_csv(found)
+        case "latex":
+            return texts.evaluation_latex(found, columns)
+        case "markdown":
+            return texts.evaluation_markdown(found, columns)
     where = "" if options.out is None else f"\nresults: {printable(str(options.out))}\n"
     return f"{texts.evaluation_text(found, columns, width_of_output())}\n{where}"
-
-
-def _metric(key: str) -> Metric:
-    """Return a metric by its key; raises UsageError for one that trajectories do not have."""
-    from toolkit.evaluation.scoring import METRICS
-
-    by_key = {metric.key: metric for metric in METRICS}
-    return by_key[known_names("metric of a trajectory", (key,), by_key)[0]]
 
 
 def _metrics(keys: tuple[str, ...]) -> tuple[Metric, ...]:

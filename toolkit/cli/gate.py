@@ -24,12 +24,12 @@ from toolkit.cli.arguments import (
     requested_changes,
     requested_settings,
 )
-from toolkit.errors import DataError, printable
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from toolkit.evaluation.against_baseline import GivenRuns, TrajectoryBaselineRecord
+    from toolkit.evaluation.against_baseline import GivenRuns
     from toolkit.gate.baseline import Baseline, Case
     from toolkit.gate.verdict import Check
     from toolkit.settings import Settings
@@ -53,8 +53,7 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
     arg("--duration S", "seconds of every sequence without its own (default: all of it)", positive_seconds),
     arg(
         "--truth SEQUENCE=FILE.tum",
-        "ground truth of a recorded sequence, from the same places; may be given several times; with --trajectories "
-        "also a folder that has SEQUENCE.tum",
+        "ground truth of a recorded sequence; may be repeated; with --trajectories also a folder with SEQUENCE.tum",
         action="append",
         default=[],
     ),
@@ -63,30 +62,13 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
         (
             arg(
                 "--trajectories DIR|FILE",
-                "run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against "
-                "--truth; or take the scores of an evaluation.json",
+                "run nothing; score SEQUENCE.tum or SEQUENCE/RUN.tum against --truth, or take an evaluation.json",
                 Path,
             ),
-            choice(
-                "--align",
-                ("se3", "yaw", "sim3"),
-                "what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
-            ),
-            arg(
-                "--gap S",
-                "the longest time between two keyframes that counts as covered (default: 5)",
-                positive_seconds,
-            ),
-            arg(
-                "--bound PERCENT",
-                "the growth of an error that is allowed (default: 5)",
-                number_within("a growth in percent", 0.0, 1000.0),
-            ),
-            flag(
-                "--plan",
-                "write nothing; say with what chance a growth by 5, 10 and 20 %% would be found with as many runs, and "
-                "how many runs find it",
-            ),
+            choice("--align", ("se3", "yaw", "sim3"), "what is fitted before positions are compared (default: se3)"),
+            arg("--gap S", "the longest time between two keyframes that is covered (default: 5)", positive_seconds),
+            arg("--bound PERCENT", "allowed growth of an error (default: 5)", number_within("percent", 0.0, 1000.0)),
+            flag("--plan", "write nothing; say how large a growth would be found, and how many runs find it"),
         ),
     ),
     *SETTINGS,
@@ -111,9 +93,8 @@ def baseline(options: argparse.Namespace) -> int:
     cases, settings = _cases(options), _settings(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
     check_writable(out, "{")
-    workers = options.workers or usable_cpus()
-    made_by = made_here(command_to_keep(options.command_line))
-    made = new_baseline(cases, workers, made_by, of_this_process(), settings)
+    made_by = made_here(_command_to_keep(options.command_line))
+    made = new_baseline(cases, options.workers or usable_cpus(), made_by, of_this_process(), settings)
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
@@ -130,9 +111,12 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     from toolkit.evaluation.against_baseline import BOUND_PERCENT, new_trajectory_baseline, to_text
+    from toolkit.evaluation.planning import planned
     from toolkit.evaluation.scoring import Terms
     from toolkit.files.writing import check_writable, write_text
+    from toolkit.report.gate import plan_text
     from toolkit.report.manifest import made_here
+    from toolkit.report.text import width_of_output
 
     asked = (options.sequences, options.estimators, options.duration, options.config, requested_changes(options))
     if any(asked):
@@ -140,46 +124,23 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     out = options.out or Path("trajectory-baseline.json")
     if not options.plan:
         check_writable(out, "{")
-    made_by = made_here(command_to_keep(options.command_line))
+    made_by = made_here(_command_to_keep(options.command_line))
     given = _runs_given(options.trajectories, options.truth)
     bound = BOUND_PERCENT if options.bound is None else options.bound
     made = new_trajectory_baseline(given, options.align or "se3", options.gap or Terms.gap_s, made_by, bound)
     if options.plan:
-        return _print_plan(made)
+        print(plan_text(planned(made), width_of_output()))
+        return 0
     write_text(out, to_text(made))
     runs = sum(len(one.files) for one in made.sequences)
     print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))
     return 0
 
 
-def _print_plan(made: TrajectoryBaselineRecord) -> int:
-    from toolkit.evaluation.planning import planned
-    from toolkit.gate.significance import FEWEST_RUNS
-    from toolkit.report.gate import plan_text
-    from toolkit.report.text import width_of_output
-
-    plan = planned(made)
-    if not plan:
-        raise DataError(
-            f"no sequence has {FEWEST_RUNS} runs, of which the scatter is known; give the files of repeated runs, "
-            "SEQUENCE/RUN.tum"
-        )
-    print(plan_text(plan, width_of_output()))
-    return 0
-
-
-def command_to_keep(words: list[str]) -> str:
+def _command_to_keep(words: list[str]) -> str:
     """Return the command line with the output's name alone: a baseline is shared, and its folder is of one machine."""
-    kept = []
-    for before, word in pairwise(["", *words]):
-        option, _, file = word.partition("=")
-        if before == "--out":
-            kept.append(Path(word).name)
-        elif option == "--out" and file:
-            kept.append(f"--out={Path(file).name}")
-        else:
-            kept.append(word)
-    return shlex.join(kept)
+    kept = [Path(word).name if before == "--out" else word for before, word in pairwise(["", *words])]
+    return shlex.join(f"--out={Path(word).name}" if word.startswith("--out=") else word for word in kept)
 
 
 def _cases(options: argparse.Namespace) -> list[Case]:
@@ -226,45 +187,27 @@ def _bad_ends(baseline: Baseline) -> Iterator[str]:
     """Yield every estimator that did not end well somewhere."""
     for case, measured in baseline.cases:
         for name, series in measured.runs.items():
-            bad = sum(status != "ok" for status in series.status)
-            if bad:
-                why = measured.why.get(name, "")
-                yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {why}"
+            if bad := sum(status != "ok" for status in series.status):
+                ends = f"did not end well in {bad} of {len(series.status)} runs"
+                yield f"{case.source}: {name} {ends}: {measured.why.get(name, '')}"
 
 
 @command(
     "check",
     "fail if accuracy, consistency or speed are not a baseline's",
-    arg(
-        "--baseline FILE",
-        "file that vislam baseline wrote; of a folder, the one for the releases installed here",
-        Path,
-        required=True,
-    ),
+    arg("--baseline FILE", "as vislam baseline wrote it, or a folder of such files", Path, required=True),
     WORKERS,
     *(arg(f"--{name} FILE", f"write the verdicts as {what}", Path) for name, what in _FILES.items()),
     arg(
         "--trajectories DIR|FILE",
-        "run nothing; check another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
-        "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
+        "run nothing; check another system's SEQUENCE.tum or SEQUENCE/RUN.tum, or an evaluation.json, against a "
+        "baseline that vislam baseline --trajectories wrote",
         Path,
     ),
-    arg(
-        "--truth DIR|SEQUENCE=FILE",
-        "with --trajectories: path of the truth, if it is not the baseline's",
-        action="append",
-        default=[],
-    ),
-    flag(
-        "--accept-better",
-        "let results that moved pass unless they are worse, after a change that is meant to move them",
-    ),
+    arg("--truth DIR|SEQUENCE=FILE", "of --trajectories, if it is not the baseline's", action="append", default=[]),
+    flag("--accept-better", "let results that moved pass unless they are worse"),
     flag("--skip-speed", "do not check time, for example on a machine of another make"),
-    arg(
-        "--speed-against REVISION|WHEEL",
-        "check time by alternating runs with another version of the code: a git revision of the current checkout, or "
-        "a wheel; detects 15 %%, on any machine",
-    ),
+    arg("--speed-against REVISION|WHEEL", "check time by runs in turn with another version of the code"),
     flag("--allow-other-releases", "compare although GTSAM or NumPy is another release than the baseline's"),
     flag("--verbose", "print every comparison, not only those that fail; files have them all"),
     examples=(

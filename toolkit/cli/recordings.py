@@ -122,10 +122,8 @@ def tracks(options: argparse.Namespace) -> int:
     recording = load_images(options.images, frontend)
     with of_this_process()(options.images) as progress:
         tracks = recording.tracks(frontend, progress)
-        if options.video:
-            names = write_video(recording, tracks, options.out, progress)
-        else:
-            names = write_stills(recording, tracks, options.out, options.count, progress)
+        written = (recording, tracks, options.out)
+        names = write_video(*written, progress) if options.video else write_stills(*written, options.count, progress)
     print(f"{printable(options.images)}: {_summary(tracks)}")
     for skipped in tracks.skipped:
         print(f"left out: {printable(skipped)}")
@@ -154,16 +152,8 @@ def _summary(tracks: ImageTracks) -> str:
         "images",
         (
             flag("--images", "render the images of a stereo pair (flight)"),
-            choice(
-                "--lens",
-                ("none", "radtan", "equidistant"),
-                "the distortion of both cameras, which are then not aligned (default: none, rectified)",
-            ),
-            arg(
-                "--blur MS",
-                "milliseconds of exposure (default: 0)",
-                number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS),
-            ),
+            choice("--lens", ("none", "radtan", "equidistant"), "distortion of the cameras (default: none, rectified)"),
+            arg("--blur MS", "exposure (default: 0)", number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS)),
             arg("--moving N", "moving crates (default: 0)", at_least(0, _MOST_CRATES)),
         ),
     ),
@@ -219,18 +209,11 @@ def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     "import",
     "make a recording of your own tables",
     arg("--tracks FILE.csv", "t, track_id, uL, uR and v, or vL and vR", Path, required=True),
-    arg(
-        "--motion FILE.csv",
-        "t and ax, ay, az, gx, gy, gz of an IMU, or vx, vy, vz, wx, wy, wz of the body",
-        Path,
-        required=True,
-    ),
+    arg("--motion FILE.csv", "t and ax ... gz of an IMU, or vx ... wz of the body", Path, required=True),
     arg("--rig FILE.toml", "calibration of the rectified pair, and noise", Path, required=True),
     arg("--truth FILE.tum", "ground truth", Path),
     arg("--out DIR", "directory of the recording", Path, required=True),
-    examples=(
-        "vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out recordings/own",
-    ),
+    examples=("vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out own",),
 )
 def import_tables(options: argparse.Namespace) -> int:
     """Make a recording of stereo tracks, IMU samples or body velocities, and a calibration in tables of your own.

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,17 +53,9 @@ def report(options: argparse.Namespace) -> int:
     arg("--estimator NAME", "an estimator, or truth (default: the only one there is)"),
     choice("--output", ("causal", "final"), "default: final, where there is one"),
     choice("--format", FORMATS, "of the file; KITTI has no stamps"),
-    arg(
-        "--cov-convention NAME",
-        f"write the covariances as well, in this convention ({', '.join(COV_CONVENTIONS)}; see docs/conventions.md)",
-        choices=COV_CONVENTIONS,
-    ),
+    choice("--cov-convention NAME", COV_CONVENTIONS, "write covariances, too, in one of these conventions"),
     arg("--out FILE", "the file to write", Path),
-    arg(
-        "--bundle FILE.zip",
-        "write settings, versions, hashes, trajectories and metrics of the run as one file for vislam reproduce",
-        Path,
-    ),
+    arg("--bundle FILE.zip", "write all of the run but its figures as one file for vislam reproduce", Path),
     examples=(
         "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
         "vislam export runs/drive --format kitti --out drive.kitti",
@@ -167,19 +157,16 @@ def reproduce(options: argparse.Namespace) -> int:
 
 
 def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
-    """Do what vislam compare does with the bundle's manifest; what it prints is not of interest here."""
+    """Do what vislam compare does with the bundle's manifest, and print nothing."""
     from toolkit.cli import parser
     from toolkit.report.run_directory import MANIFEST
 
     sequence = [] if options.data is None else [options.data]
     workers = [] if options.workers is None else ["--workers", str(options.workers)]
-    words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers]
+    words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers, "--quiet"]
     requested = parser().parse_args(words)
     requested.command_line = ["vislam", *words]
-    with ExitStack() as stack:
-        nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123
-        stack.enter_context(redirect_stdout(nowhere))
-        requested.command(requested)
+    requested.command(requested)
 
 
 def _print(found: DiffRecord, record: BundleRecord, bundle: Path) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, nctdtr, stdtrit
 
+from toolkit.errors import DataError
 from toolkit.evaluation.against_baseline import TrajectoryBaselineRecord, everywhere
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.significance import FEWEST_RUNS, Everywhere, Repeats, Where
@@ -45,10 +46,15 @@ class Planned:
 
 
 def planned(baseline: TrajectoryBaselineRecord) -> tuple[Planned, ...]:
-    """Return the plan of every metric that a check would test: those with three runs or more."""
+    """Return the plan of every metric that a check would test; raises DataError where none has three runs or more."""
     tests = list(_tests(baseline))
+    if not tests:
+        raise DataError(
+            f"no sequence has {FEWEST_RUNS} runs, of which the scatter is known; give the files of repeated runs, "
+            "SEQUENCE/RUN.tum"
+        )
     tests += everywhere(tests)
-    rate = baseline.false_alarm_rate / 2.0 / max(len(tests), 1)
+    rate = baseline.false_alarm_rate / 2.0 / len(tests)
     return tuple(_planned(one, rate) for one in tests)
 
 

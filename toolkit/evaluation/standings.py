@@ -24,7 +24,7 @@ from toolkit.experiment.statistics import holm, quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.metrics import Metric, Scores
 from toolkit.progress import SILENT, Progress
 
@@ -78,18 +78,11 @@ class Cell:
         """Return how many runs ended well."""
         return sum(run.status == "ok" for run in self.runs)
 
-    @property
-    def failed(self) -> int:
-        """Return how many did not."""
-        return len(self.runs) - self.ok
-
     def quantiles(self, metric: Metric) -> Quartiles | None:
         """Return the quartiles over all runs; None where runs are ok and none of them has a value."""
         good = [run.metrics.get(metric.key) for run in self.runs if run.status == "ok"]
         values = [value for value in good if value is not None]
-        if good and not values:
-            return None
-        return _quartiles(values, self.failed, metric)
+        return None if good and not values else _quartiles(values, len(self.runs) - self.ok, metric)
 
     def median(self, metric: Metric) -> float | None:
         """Return the median over all runs, None where failed runs decide it or there is no value."""
@@ -177,7 +170,9 @@ class EvaluatedSystems:
     @cached_property
     def leaderboard(self) -> tuple[StandingRecord, ...]:
         """The systems from the lowest mean rank up, and of the same mean rank in the order given."""
-        ranks = self._ranks()
+        from scipy.stats import rankdata  # its import takes as long as all others
+
+        ranks = rankdata(list(self._costs.values()), axis=0)  # (systems, sequences), from 1, of equals the mean
         standings = [self._standing(system, row) for system, row in zip(self.systems, ranks, strict=True)]
         return tuple(sorted(standings, key=lambda standing: standing.mean_rank))
 
@@ -186,13 +181,10 @@ class EvaluatedSystems:
         """Every pair of systems over the sequences, the one higher on the leaderboard first; none of one sequence."""
         order = [standing.estimator for standing in self.leaderboard]
         pairs = list(combinations(order, 2)) if len(self.sequences) > 1 else []
-        differences = [self._log_ratios(one, other) for one, other in pairs]
-        p_values = [signed_rank_p(given) for given in differences]
-        corrected = holm(np.array(p_values)).tolist() if pairs else []
-        return tuple(
-            _paired(*pair, given, p, p_holm)
-            for pair, given, p, p_holm in zip(pairs, differences, p_values, corrected, strict=True)
-        )
+        ratios = [_log_ratios(self._costs[one], self._costs[other]) for one, other in pairs]
+        p_values = [signed_rank_p(given) for given in ratios]
+        corrected = holm(np.array(p_values)).tolist()
+        return tuple(_paired(*one) for one in zip(pairs, ratios, p_values, corrected, strict=True))
 
     @cached_property
     def ranked_sequences(self) -> tuple[str, ...]:
@@ -201,22 +193,21 @@ class EvaluatedSystems:
         found = [s for s in self.sequences if any(cells[name, s].median(metric) is not None for name in self.systems)]
         return tuple(found) or self.sequences
 
-    def _costs(self, system: str) -> Array:
-        """Return the cost (sequences,), smaller being better: the median of the metric, infinite where there is none.
+    @cached_property
+    def _costs(self) -> Mapping[str, Array]:
+        """Each system's cost (sequences,), the smaller the better: the metric's median, infinite where there is none.
 
         Where the ideal value is 1, the cost is the factor by which the median differs from it.
         """
-        medians = [self.cells[system, sequence].median(self.ranked_by) for sequence in self.ranked_sequences]
-        return np.array([np.inf if value is None else _cost(value, self.ranked_by) for value in medians])
-
-    def _ranks(self) -> Array:
-        """Return ranks (systems, sequences) from 1, of equals the mean."""
-        costs = np.array([self._costs(system) for system in self.systems])
-        return np.array([_ranked(column) for column in costs.T]).T
+        cells, by = self.cells, self.ranked_by
+        return {
+            name: np.array([_cost(cells[name, sequence].median(by), by) for sequence in self.ranked_sequences])
+            for name in self.systems
+        }
 
     def _standing(self, system: str, ranks: Array) -> StandingRecord:
         cells = [self.cells[system, sequence] for sequence in self.sequences]
-        solved = np.isfinite(self._costs(system))
+        solved = np.isfinite(self._costs[system])
         return StandingRecord(
             estimator=system,
             mean_rank=float(ranks.mean()),
@@ -228,20 +219,19 @@ class EvaluatedSystems:
             metrics={metric.key: _over_sequences(cells, metric) for metric in self.scored_metrics},
         )
 
-    def _log_ratios(self, system: str, other: str) -> Array:
-        """Return the logarithms (sequences,) of the ratios of costs; infinite where one has none, 0 where both."""
-        one, two = self._costs(system), self._costs(other)
-        with np.errstate(all="ignore"):  # of two that are infinite, or zero, the ratio is no number
-            ratios = np.log(one / two)
-        return np.where(one == two, 0.0, ratios)
+
+def _log_ratios(one: Array, two: Array) -> Array:
+    """Return the logarithms (sequences,) of the ratios of costs; infinite where one is, 0 where both are."""
+    with np.errstate(all="ignore"):  # of two that are infinite, or zero, the ratio is no number
+        return np.where(one == two, 0.0, np.log(one / two))
 
 
-def _cost(value: float, metric: Metric) -> float:
-    if metric.best == "most":
-        return 1.0 / value if value > 0.0 else np.inf
+def _cost(value: float | None, metric: Metric) -> float:
+    if value is None or (metric.best in ("most", "one") and value <= 0.0):
+        return np.inf
     if metric.best == "one":
-        return float(np.exp(np.abs(np.log(value)))) if value > 0.0 else np.inf
-    return value
+        return max(value, 1.0 / value)
+    return 1.0 / value if metric.best == "most" else value
 
 
 def evaluate(
@@ -253,8 +243,10 @@ def evaluate(
     with the reason, and so does a run that covers too little of the truth's time.
     """
     truths = {name: read_truth(name, path, terms.cov_convention) for name, path in gathered.truths.items()}
-    by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
-    units = [_Unit(name, path, by_sequence[name], terms) for name, path in gathered.truths.items()]
+    units = [
+        _Unit(name, path, tuple(item for item in gathered.items if item.sequence == name), terms)
+        for name, path in gathered.truths.items()
+    ]
     scored: dict[Item, RunRecord] = {}
     processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
     for place, result in results_of(units, processes, _evaluated, progress):
@@ -303,9 +295,8 @@ def evaluated(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
 
 def _run(item: Item, scores: Scores | None, why: str = "") -> RunRecord:
     """Return a run with its scores, if it has any; one with a reason failed."""
-    if scores is None:
-        scores = Scores.none((metric.key for metric in METRICS), why)
-    values = {metric.key: scores.values.get(metric.key) for metric in METRICS}
+    scores = scores or Scores.none(METRIC_BY_KEY, why)
+    values = {key: scores.values.get(key) for key in METRIC_BY_KEY}
     return RunRecord(
         sequence=item.sequence,
         estimator=item.system,
@@ -328,7 +319,9 @@ def signed_rank_p(differences: Array) -> float:
     given = differences[differences != 0.0][:_MOST_EXACT]
     if not given.size:
         return 1.0
-    doubled = np.rint(2.0 * _ranked(np.abs(given))).astype(int)
+    from scipy.stats import rankdata
+
+    doubled = np.rint(2.0 * rankdata(np.abs(given))).astype(int)
     chance = np.zeros(int(doubled.sum()) + 1)
     chance[0] = 1.0
     for rank in doubled.tolist():
@@ -339,20 +332,13 @@ def signed_rank_p(differences: Array) -> float:
     return min(1.0, 2.0 * tail)
 
 
-def _ranked(values: Array) -> Array:
-    """Return the ranks (n,) of values from the least, 1, up; equal values share the mean of theirs."""
-    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
-    last: IntArray = np.cumsum(counts)
-    return np.asarray((last - 0.5 * (counts - 1))[place])
-
-
-def _paired(system: str, other: str, log_ratios: Array, p: float, p_holm: float) -> PairedRecord:
+def _paired(pair: tuple[str, str], log_ratios: Array, p: float, p_holm: float) -> PairedRecord:
     with np.errstate(invalid="ignore"):  # of two infinite ratios of either sign the median is no number
         median = float(np.median(log_ratios))
     better, worse = int((log_ratios < 0.0).sum()), int((log_ratios > 0.0).sum())
     return PairedRecord(
-        estimator=system,
-        other=other,
+        estimator=pair[0],
+        other=pair[1],
         better=better,
         worse=worse,
         tied=log_ratios.size - better - worse,

@@ -227,11 +227,6 @@ class OutcomeStore:
         of_others = (not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
         return self._of_version_1 + sum(of_others)
 
-    @property
-    def is_there(self) -> bool:
-        """Say whether anything is kept."""
-        return self._lines is not None
-
     def find(self, unit: Unit) -> Outcome | None:
         """Return the outcome of a unit with everything that is requested of it, or None."""
         if unit.build is not None:  # a function, which cannot be told from another of its name

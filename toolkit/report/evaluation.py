@@ -145,7 +145,7 @@ def sequences_table(evaluation: EvaluatedSystems) -> Table:
 
 def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
     """Return the median of the runs of a system on a sequence, and how many of them failed."""
-    failed = f"{runs.failed} of {len(runs.runs)} failed" if runs.failed else ""
+    failed = f"{len(runs.runs) - runs.ok} of {len(runs.runs)} failed" if runs.ok < len(runs.runs) else ""
     median = runs.median(metric)
     if median is None:
         return failed or MISSING
