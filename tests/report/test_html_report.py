@@ -174,26 +174,6 @@ def test_a_card_names_whom_the_contest_does_and_a_marked_row_wins_nothing(
     assert "ATE yaw 3.00" in card["detail"]
 
 
-def test_uncertainty_to_trust_is_that_of_every_row_without_a_mark() -> None:
-    rows = [_row("one"), _row("other"), _row("sure", mark="overconfident"), _row("mute", judged=False)]
-    (card,) = highlights((), rows, "one run")
-    assert card["answer"] == "one and other"
-    assert "sure is overconfident" in card["detail"]
-    assert highlights((), [_row("mute", judged=False)], "one run") == []
-
-
-def test_nobody_is_fastest_by_what_a_processor_scatters() -> None:
-    def fastest(first_ms: float, mark: str = "") -> str | None:
-        costs = {"one": first_ms, "other": 2.0, "last": 3.0}
-        rows = [_row(name, judged=False, metrics={"frame_cpu_ms_mean": cost}) for name, cost in costs.items()]
-        rows[0]["mark"] = mark
-        return highlights((), rows, "one run")[0]["answer"]
-
-    assert fastest(1.0) == "one"
-    assert fastest(1.8) == "no clear winner"
-    assert fastest(0.1, mark="timid") == "other"
-
-
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [

@@ -136,10 +136,6 @@ class QuantilesAll(Struct, frozen=True, kw_only=True):
     upper_quartile: float | None
     reason: Annotated[str, Meta(description="why a quartile is null")] | UnsetType = UNSET
 
-    def __post_init__(self) -> None:
-        if None in (self.lower_quartile, self.median, self.upper_quartile) and not self.reason:
-            raise ValueError("a quartile over all runs is null, and reason does not say why")
-
 
 class MetricOverSeeds(Struct, frozen=True, kw_only=True):
     """One metric: its spread over the runs that are ok, null where there are none, and its value under each seed."""
@@ -159,11 +155,6 @@ class MetricOverSeeds(Struct, frozen=True, kw_only=True):
         ]
         | UnsetType
     ) = UNSET
-
-    def __post_init__(self) -> None:
-        of_any = (self.mean, self.median, self.least, self.lower_quartile, self.upper_quartile, self.most)
-        if any((value is None) != (self.n == 0) for value in of_any) or (self.std is None) != (self.n < 2):
-            raise ValueError(f"n is {self.n}, which its mean, median, std, least, most or a quartile does not fit")
 
 
 class WholeRuns(Struct, frozen=True, kw_only=True):
@@ -193,15 +184,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
     ok_share: Annotated[float, Meta(description="of the seeds, from 0 to 1", ge=0, le=1)] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        ends: tuple[Status, ...] = ("ok", "diverged", "failed")
-        if self.counts != {status: self.status.count(status) for status in ends}:
-            raise ValueError("counts does not count status")
         check_promised(dict(self.metrics))
-        for key, metric in self.metrics.items():
-            if len(metric.values) != len(self.status):
-                raise ValueError(f"metrics.{key}.values does not have an entry a seed")
-            if metric.n == 0 and not self.notes.get(key):
-                raise ValueError(f"metrics.{key} has no value, and notes does not say why")
 
 
 class LogEntry(Struct, frozen=True, kw_only=True):
@@ -227,13 +210,6 @@ class Seeds(Struct, frozen=True, kw_only=True):
     estimators: Annotated[tuple[str, ...], Meta(description="in order")]
     runs: Annotated[tuple[RunOverSeeds, ...], Meta(description="by estimator, causal before final")]
     log: Annotated[tuple[LogEntry, ...], Meta(description="every run that has log lines")]
-
-    def __post_init__(self) -> None:
-        if len(self.hashes) != len(self.seeds):
-            raise ValueError("hashes does not have an entry a seed")
-        for i, run in enumerate(self.runs):
-            if len(run.status) != len(self.seeds):
-                raise ValueError(f"runs[{i}].status does not have an entry a seed")
 
 
 def read_metrics(path: Path) -> MetricsDocument:

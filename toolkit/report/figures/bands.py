@@ -16,20 +16,8 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.report.curves import available
-from toolkit.report.figures.style import (
-    BAND_COLOUR,
-    MUTED_COLOUR,
-    Entry,
-    NamedFigure,
-    annotate,
-    colour_of,
-    finish,
-    line_of,
-    output_entries,
-    panels_of,
-    scale_by_decades,
-    shown_as,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 
 # Values of a NEES or NIS over its expectation beyond these are drawn at the limit, and the panel gives the largest.
 RANGE = (1e-2, 1e4)
@@ -80,30 +68,30 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
 
     A panel whose values leave the figure says how large they become.
     """
-    figure, panels = panels_of(panels_for)
+    figure, panels = style.panels_of(panels_for)
     shares: dict[str, list[float]] = {}
     largest: dict[str, float] = {}
     least = most = 1.0
     for estimator, colour, output, series in drawn:
         axes, shown = panels[estimator], np.clip(series.value, *RANGE)
-        axes.fill_between(series.t_s, series.low, series.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
-        axes.plot(series.t_s, shown, color=colour, linestyle=line_of(output), linewidth=1.0)
+        axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
+        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(output), linewidth=1.0)
         shares.setdefault(estimator, []).append(series.in_band_percent)
         largest[estimator] = np.nanmax([largest.get(estimator, 0.0), *series.value])
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
         text = ", ".join(f"{percent:.0f} %" for percent in percents)
         beyond = f", up to {largest[estimator]:.0e}" if largest[estimator] > RANGE[1] else ""
-        annotate(panels, estimator, (f"{text} in band{beyond}", f"{text}{beyond}", text))
-    scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
-    finish(
+        style.annotate(panels, estimator, (f"{text} in band{beyond}", f"{text}{beyond}", text))
+    style.scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
+    style.finish(
         figure,
         panels,
         what,
         title,
         [
-            *output_entries({one.output for one in drawn}),
-            Entry("95 % band", (Patch(color=BAND_COLOUR, linewidth=0.0),)),
+            *style.output_entries({one.output for one in drawn}),
+            Entry("95 % band", (Patch(color=style.BAND_COLOUR, linewidth=0.0),)),
         ],
     )
     return figure
@@ -137,7 +125,7 @@ def _of_one_run(
     comparison: Comparison, found: Sequence[tuple[Row, Normalised | None]], name: str, what: str, caption: str
 ) -> Iterator[NamedFigure]:
     drawn = [
-        Drawn(row.estimator, colour_of(comparison, row.estimator), shown_as(row), series)
+        Drawn(row.estimator, style.colour_of(comparison, row.estimator), style.shown_as(row), series)
         for row, series in found
         if series is not None
     ]
@@ -155,7 +143,7 @@ def draw_over_seeds(over: Comparison) -> Iterator[NamedFigure]:
 
 
 def _errors(over: Comparison) -> NamedFigure:
-    figure, panels = panels_of(over.estimators)
+    figure, panels = style.panels_of(over.estimators)
     kinds: set[Output] = set()
     for group in over.lines:
         errors_m = group.position_m
@@ -163,14 +151,18 @@ def _errors(over: Comparison) -> NamedFigure:
             continue
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
-        kind = shown_as(group)
-        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], colour_of(over, group.estimator)
+        kind = style.shown_as(group)
+        axes, t_s, colour = (
+            panels[group.estimator],
+            over.sequence.frames_s[known],
+            style.colour_of(over, group.estimator),
+        )
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
-        axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
+        axes.plot(t_s, median, color=colour, linestyle=style.line_of(kind), linewidth=1.2)
         kinds.add(kind)
     title = f"{over.name}, {len(over.seeds)} seeds: position error from the common start"
-    quartiles = Entry("quartiles (lines: medians)", (Patch(color=MUTED_COLOUR, alpha=0.2),))
-    finish(figure, panels, "position error [m]", title, [*output_entries(kinds), quartiles])
+    quartiles = Entry("quartiles (lines: medians)", (Patch(color=style.MUTED_COLOUR, alpha=0.2),))
+    style.finish(figure, panels, "position error [m]", title, [*style.output_entries(kinds), quartiles])
     next(iter(panels.values())).set_ylim(bottom=0.0)
     caption = (
         f"Position error over time on {over.name}, {len(over.seeds)} seeds, from the common start: the median and, "
@@ -183,8 +175,8 @@ def _nees(over: Comparison) -> NamedFigure:
     drawn = [
         Drawn(
             group.estimator,
-            colour_of(over, group.estimator),
-            shown_as(group),
+            style.colour_of(over, group.estimator),
+            style.shown_as(group),
             Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high),
         )
         for group in over.lines

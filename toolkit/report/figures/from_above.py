@@ -22,26 +22,8 @@ from toolkit.files.writing import plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.report.curves import alignment_text, errors_to, onto_truth, shown_output, truth_during
-from toolkit.report.figures.style import (
-    LABEL_PT,
-    LANDMARK_COLOUR,
-    MUTED_COLOUR,
-    SMALL_PT,
-    TICK_PT,
-    TITLE_PT,
-    TRUTH_COLOUR,
-    WIDTH_IN,
-    Entry,
-    NamedFigure,
-    colour_of,
-    columns_for,
-    legend_below,
-    new_figure,
-    panels_of,
-    stroke_of,
-    style_axes,
-    width_of,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
 
 _LANDMARK_QUANTILES = (0.02, 0.98)
@@ -156,19 +138,23 @@ def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, tit
     shown += [] if truth is None else [truth]
     landmarks = NOWHERE if mapper is None else from_above(comparison, mapper, mapper.landmarks.points_world)
     view = view_of(shown, landmarks_shown(landmarks))
-    figure = new_figure(min(max(WIDTH_IN * view.ratio, _LOWEST_IN), _HIGHEST_IN) + _LABELS_IN)
+    figure = style.new_figure(min(max(style.WIDTH_IN * view.ratio, _LOWEST_IN), _HIGHEST_IN) + _LABELS_IN)
     axes = figure.subplots()
-    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=3.0, color=LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1)
+    axes.scatter(
+        landmarks[:, 0], landmarks[:, 1], s=3.0, color=style.LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1
+    )
     if truth is not None:
-        axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
+        axes.plot(*truth.xy.T, color=style.TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
     for run, track in zip(runs, tracks, strict=True):
-        width = _LINE_WIDTH if len(runs) == 1 else width_of(comparison, run.estimator)
-        axes.plot(*track.xy.T, linewidth=width, zorder=3, **stroke_of(comparison, run.estimator, shown_output(run)))
-        colour = colour_of(comparison, run.estimator)
+        width = _LINE_WIDTH if len(runs) == 1 else style.width_of(comparison, run.estimator)
+        axes.plot(
+            *track.xy.T, linewidth=width, zorder=3, **style.stroke_of(comparison, run.estimator, shown_output(run))
+        )
+        colour = style.colour_of(comparison, run.estimator)
         axes.plot(*track.xy[:1].T, "o", color=colour, ms=5.0, markeredgecolor="white", zorder=4)
     view.show(axes)
-    style_axes(axes, title, "x [m]", "y [m]")
-    legend_below(figure, _entries(comparison, runs, truth, mapper))
+    style.label_axes(axes, title, "x [m]", "y [m]")
+    style.legend_below(figure, _entries(comparison, runs, truth, mapper))
     return figure
 
 
@@ -176,12 +162,12 @@ def _entries(
     comparison: Comparison, runs: Sequence[Run], truth: PathFromAbove | None, mapper: Run | None
 ) -> list[Entry]:
     """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
-    entries = [] if truth is None else [Entry.of_line("truth", TRUTH_COLOUR, width=_TRUTH_WIDTH)]
+    entries = [] if truth is None else [Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH)]
     for run in runs:
-        line = Line2D([], [], linewidth=1.8, **stroke_of(comparison, run.estimator, shown_output(run)))
+        line = Line2D([], [], linewidth=1.8, **style.stroke_of(comparison, run.estimator, shown_output(run)))
         entries.append(Entry(_name(run), (line,)))
     if mapper is not None and len(mapper.landmarks):
-        dot = Line2D([], [], color=LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
+        dot = Line2D([], [], color=style.LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
         entries.append(Entry(f"landmarks of {mapper.estimator}", (dot,)))
     return entries
 
@@ -233,23 +219,23 @@ def _coloured_figure(comparison: Comparison, shown: Sequence[_Coloured]) -> Name
     view = view_of([one.track for one in good] + ([] if truth is None else [truth]), NOWHERE)
     scale = ScalarMappable(_norm(np.concatenate([one.value for one in good])), _COLOURS)
     names = [_name(one.run) for one in shown]
-    panel_in = (WIDTH_IN - _BAR_IN) / columns_for(len(names)) * view.ratio + _TITLE_IN
-    figure, panels = panels_of(names, "", panel_in)
+    panel_in = (style.WIDTH_IN - _BAR_IN) / style.columns_for(len(names)) * view.ratio + _TITLE_IN
+    figure, panels = style.panels_of(names, "", panel_in)
     for axes, one in zip(panels.values(), shown, strict=True):
         view.show(axes)
         if truth is not None:
-            axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=0.6, zorder=3)
+            axes.plot(*truth.xy.T, color=style.TRUTH_COLOUR, linewidth=0.6, zorder=3)
         axes.add_collection(_line(one, scale))
-        axes.set_title(f"{number(rmse(one.value))} m", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+        axes.set_title(f"{number(rmse(one.value))} m", fontsize=style.SMALL_PT, loc="right", color=style.MUTED_COLOUR)
     bar = figure.colorbar(scale, ax=list(panels.values()), shrink=0.9, aspect=35, pad=0.02, extend="both")
-    bar.set_label("position error [m]", fontsize=LABEL_PT)
-    bar.ax.tick_params(labelsize=TICK_PT)
+    bar.set_label("position error [m]", fontsize=style.LABEL_PT)
+    bar.ax.tick_params(labelsize=style.TICK_PT)
     bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
     bar.ax.yaxis.set_major_formatter("{x:g}")
     bar.ax.yaxis.set_minor_locator(NullLocator())
-    figure.suptitle(f"{comparison.name}: position error, from above", fontsize=TITLE_PT, x=0.01, ha="left")
-    figure.supxlabel("x [m]", fontsize=LABEL_PT)
-    figure.supylabel("y [m]", fontsize=LABEL_PT)
+    style.add_title(figure, f"{comparison.name}: position error, from above")
+    figure.supxlabel("x [m]", fontsize=style.LABEL_PT)
+    figure.supylabel("y [m]", fontsize=style.LABEL_PT)
     caption = (
         "Trajectories from above, coloured by the distance to the truth (thin line); its RMS stands above each. "
         f"{alignment_text(comparison.sequence)} All panels have one scale of colours, which is logarithmic."

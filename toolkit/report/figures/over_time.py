@@ -28,25 +28,8 @@ from toolkit.report.curves import (
     reference_estimate,
     running_median,
 )
-from toolkit.report.figures.style import (
-    MUTED_COLOUR,
-    SMALL_PT,
-    TITLE_PT,
-    TRUTH_COLOUR,
-    ZERO_COLOUR,
-    Entry,
-    NamedFigure,
-    colour_of,
-    entries_of,
-    legend_below,
-    line_of,
-    new_figure,
-    scale_by_decades,
-    shown_as,
-    stroke_of,
-    style_axes,
-    width_of,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
 
 # A heading larger than this many times that of the middle row leaves its panel, which has no logarithmic axis.
@@ -71,21 +54,21 @@ def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
-    figure = new_figure(4.4)
+    figure = style.new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
     for row, errors in curves.of_rows:
-        t_s, width = comparison.sequence.elapsed_s(errors.t_ns), width_of(comparison, row.estimator)
-        stroke = stroke_of(comparison, row.estimator, row.output)
+        t_s, width = comparison.sequence.elapsed_s(errors.t_ns), style.width_of(comparison, row.estimator)
+        stroke = style.stroke_of(comparison, row.estimator, row.output)
         position.plot(t_s, errors.position_m, linewidth=width, **stroke)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **stroke)
-    style_axes(position, f"{comparison.name}: position {curves.what}, {curves.placing}", "", "position [m]")
-    style_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
+    style.label_axes(position, f"{comparison.name}: position {curves.what}, {curves.placing}", "", "position [m]")
+    style.label_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
     _limit_position(position, curves.of_rows)
     _limit_heading(heading, curves.of_rows)
     figure.align_ylabels()
     rms_m = {row.estimator: f"{number(rmse(errors.position_m))} m" for row, errors in curves.of_rows}
-    entries = entries_of(comparison, [(row.estimator, row.output) for row, _ in curves.of_rows])
-    legend_below(figure, [entry._replace(label=f"{entry.label}: {rms_m[entry.label]}") for entry in entries])
+    entries = style.entries_of(comparison, [(row.estimator, row.output) for row, _ in curves.of_rows])
+    style.legend_below(figure, [entry._replace(label=f"{entry.label}: {rms_m[entry.label]}") for entry in entries])
     caption = (
         f"Position and heading {curves.what} over time, in the legend the RMS of the position, of the final output"
     )
@@ -101,7 +84,7 @@ def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     reach = 1.05 * max(_reach(largest), _LEAST_POSITION_M)
     sizes = [size for row, errors in curves if row.status == "ok" and (size := rmse(errors.position_m)) > 0.0]
     if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and reach > 2.0 * _LEAST_POSITION_M:
-        scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), reach)
+        style.scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), reach)
     else:
         axes.set_ylim(0.0, reach)
     _say_who_leaves(axes, largest, reach, "m")
@@ -128,7 +111,7 @@ def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: s
     beyond = {row.estimator: size for row, size in largest.items() if size > 1.01 * reach}
     if beyond:
         listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
-        axes.set_title(f"beyond it: {listed}", fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+        axes.set_title(f"beyond it: {listed}", fontsize=style.SMALL_PT, loc="right", color=style.MUTED_COLOUR)
 
 
 def _without_wraps(heading_deg: Array) -> Array:
@@ -166,24 +149,24 @@ def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
 
 
 def _components_figure(comparison: Comparison, name: str, found: list[tuple[Row, Components]]) -> NamedFigure:
-    figure = new_figure(4.6)
+    figure = style.new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
     reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
     what = "error" if reference is None else f"difference from {reference.name}"
-    colour = colour_of(comparison, name)
+    colour = style.colour_of(comparison, name)
     for column, block, label in ((0, POSITION, "{} [m]"), (1, ROTATION, "about {} [deg]")):
         for i, axis in enumerate(_ROWS):
             axes = grid[i, column]
             for row, one in found:
-                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, colour, shown_as(row))
+                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, colour, style.shown_as(row))
             _limit(axes, [one for _, one in found], block.start + i)
-            style_axes(axes, "", "time [s]" if i == 2 else "", label.format(axis))
+            style.label_axes(axes, "", "time [s]" if i == 2 else "", label.format(axis))
     stated = "" if comparison.sequence.truth is None else _nees_text(comparison, name)
-    figure.suptitle(f"{comparison.name}: {name}{stated}", fontsize=TITLE_PT, x=0.01, ha="left")
-    grid[0, 0].set_title(f"position {what}", fontsize=TITLE_PT, loc="left")
-    grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
+    style.add_title(figure, f"{comparison.name}: {name}{stated}")
+    grid[0, 0].set_title(f"position {what}", fontsize=style.TITLE_PT, loc="left")
+    grid[0, 1].set_title(f"rotation {what}", fontsize=style.TITLE_PT, loc="left")
     figure.align_ylabels(grid)
-    legend_below(figure, _entries(found, what.split(maxsplit=1)[0], colour))
+    style.legend_below(figure, _entries(found, what.split(maxsplit=1)[0], colour))
     caption = _caption(name, reference.name if reference is not None else "", comparison.sequence.truth is not None)
     return NamedFigure(f"components_{plain_name(name)}", caption, figure)
 
@@ -195,7 +178,7 @@ def _nees_text(comparison: Comparison, name: str) -> str:
 
 
 def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as: Output) -> None:
-    line = line_of(shown_as)
+    line = style.line_of(shown_as)
     if one.sigma is not None:
         band = _SIGMAS * one.sigma[:, i]
         if shown_as == "final":
@@ -211,17 +194,17 @@ def _limit(axes: Axes, drawn: Collection[Components], i: int) -> None:
     bands = [_SIGMAS * float(np.nanmax(one.sigma[:, i])) for one in drawn if one.sigma is not None]
     reach = max(error, _LEAST, min(max(bands, default=0.0), _BAND_REACH * max(error, _LEAST)))
     axes.set_ylim(-1.08 * reach, 1.08 * reach)
-    axes.axhline(0.0, color=ZERO_COLOUR, linewidth=0.8, zorder=1)
+    axes.axhline(0.0, color=style.ZERO_COLOUR, linewidth=0.8, zorder=1)
 
 
 def _entries(found: list[tuple[Row, Components]], what: str, colour: str) -> list[Entry]:
     entries = []
     for row, one in found:
         name = "causal = final" if row.label == "both" else row.output
-        line = line_of(shown_as(row))
+        line = style.line_of(style.shown_as(row))
         entries.append(Entry.of_line(f"{name}: {what}", colour, line))
         if one.sigma is not None:
-            alpha = _BAND_ALPHA if shown_as(row) == "final" else 0.0
+            alpha = _BAND_ALPHA if style.shown_as(row) == "final" else 0.0
             band = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
             entries.append(Entry(f"{name}: ± 3 standard deviations", (band,)))
     return entries
@@ -266,30 +249,31 @@ def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
-    figure = new_figure(4.8)
+    figure = style.new_figure(4.8)
     position, rotation = figure.subplots(2, 1, sharex=True)
     of_output = {row.output: one for row, one in reversed(found)}  # the bound is that of any estimator's output
     outputs = list(dict.fromkeys(row.output for row, _ in found))
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
-            t_s, stroke = comparison.sequence.elapsed_s(one.t_ns), stroke_of(comparison, row.estimator, shown_as(row))
+            t_s = comparison.sequence.elapsed_s(one.t_ns)
+            stroke = style.stroke_of(comparison, row.estimator, style.shown_as(row))
             lost = np.linalg.norm(one.excess[:, block], axis=1)
             axes.plot(t_s, scale * lost, linewidth=1.6, label=f"{row.estimator} {row.label}", **stroke)
             axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
         bounds = {output: scale * _sigma(of_output[output].bound, block) for output in outputs}
         for output, sigma in bounds.items():
-            t_s, line = comparison.sequence.elapsed_s(of_output[output].t_ns), line_of(output)
-            axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
+            t_s, line = comparison.sequence.elapsed_s(of_output[output].t_ns), style.line_of(output)
+            axes.plot(t_s, sigma, color=style.TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
         axes.set_yscale("log")
         # There is room for what is a thousand times below the bound.
         axes.set_ylim(bottom=_LEAST_SHARE * min(float(sigma.min()) for sigma in bounds.values()))
-    style_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
-    style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
+    style.label_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
+    style.label_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
-    entries = [Entry.of_line(f"bound {output}", TRUTH_COLOUR, line_of(output), 2.0) for output in outputs]
-    entries += entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
-    entries += [Entry.of_line("thin: stated", MUTED_COLOUR, width=_STATED_WIDTH)]
-    legend_below(figure, entries)
+    entries = [Entry.of_line(f"bound {output}", style.TRUTH_COLOUR, style.line_of(output), 2.0) for output in outputs]
+    entries += style.entries_of(comparison, [(row.estimator, style.shown_as(row)) for row, _ in found])
+    entries += [Entry.of_line("thin: stated", style.MUTED_COLOUR, width=_STATED_WIDTH)]
+    style.legend_below(figure, entries)
     return NamedFigure("against_bound", _OF_BOUND, figure)
 
 
@@ -303,18 +287,18 @@ def draw_frame_times(comparison: Comparison) -> Iterator[NamedFigure]:
     timed = [(run, run.timings) for run in comparison.runs if run.timings is not None and run.timings.step_s.size]
     if not timed:
         return
-    figure = new_figure(3.4)
+    figure = style.new_figure(3.4)
     axes = figure.add_subplot()
     entries = []
     for run, timings in timed:
         step_ms = np.maximum(timings.step_s * _MS, 1e-4)
-        stroke = stroke_of(comparison, run.estimator, "final")
+        stroke = style.stroke_of(comparison, run.estimator, "final")
         axes.plot(step_ms, ".", color=stroke["color"], markersize=2.5, alpha=0.35)
         cpu_ms = _MS * timings.cpu_s / timings.step_s.size
         label = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
         if timings.finish_s > timings.step_s.sum():
             label += f", end {timings.finish_s:.1f} s"
-        (median,) = axes.plot(running_median(step_ms), linewidth=width_of(comparison, run.estimator), **stroke)
+        (median,) = axes.plot(running_median(step_ms), linewidth=style.width_of(comparison, run.estimator), **stroke)
         entries.append(Entry(label, (median,)))
     axes.set_yscale("log")
     low, high = axes.get_ylim()
@@ -322,8 +306,8 @@ def draw_frame_times(comparison: Comparison) -> Iterator[NamedFigure]:
     axes.set_ylim(low / widened, high * widened)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    style_axes(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
-    legend_below(figure, entries)
+    style.label_axes(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
+    style.legend_below(figure, entries)
     caption = (
         "Wall-clock time of each step (dots) and its running median (lines). In the legend their mean, and the "
         "processor time (CPU) a frame, the finish included: on a busy machine it alone is the estimator's. An "

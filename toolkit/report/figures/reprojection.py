@@ -15,7 +15,8 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, reprojection
 from toolkit.metrics.parts.leave_one_out import CAP_PX
 from toolkit.report.curves import available, shown_output
-from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, annotate, colour_of, finish, panels_of
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 
 # A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
 _SMALLEST_PX = 0.01
@@ -32,12 +33,12 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     drawable = {name: kinds for name, kinds in errors.items() if kinds}
     if not drawable:
         return
-    figure, panels = panels_of(list(drawable), "reprojection error [px]")
+    figure, panels = style.panels_of(list(drawable), "reprojection error [px]")
     for name, kinds in drawable.items():
         for kind, error_px in kinds.items():
-            _histogram(panels[name], kind, error_px, colour_of(comparison, name))
+            _histogram(panels[name], kind, error_px, style.colour_of(comparison, name))
         medians = " / ".join(f"{float(np.median(error_px)):.2f}" for error_px in kinds.values())
-        annotate(panels, name, (f"median {medians} px", f"{medians} px"))
+        style.annotate(panels, name, (f"median {medians} px", f"{medians} px"))
     first = next(iter(panels.values()))
     first.set_xscale("log")
     first.set_xlim(_SMALLEST_PX, CAP_PX)
@@ -45,7 +46,9 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     for axes in panels.values():
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
-    finish(figure, panels, "share [%]", f"{comparison.name}: reprojection error of every sighting", _entries(drawable))
+    style.finish(
+        figure, panels, "share [%]", f"{comparison.name}: reprojection error of every sighting", _entries(drawable)
+    )
     caption = (
         "Reprojection error of every sighting: the root mean square of its uL, uR and v residuals. Filled: against the "
         "estimator's own landmarks (in-sample). Outlined: of the tracks withheld from every estimator (held-out). The "
@@ -58,8 +61,8 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
 def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
     """Return the legend's entries for the kinds of error that any panel shows."""
     samples: dict[str, Artist] = {
-        "in-sample": Patch(color=MUTED_COLOUR, alpha=0.35, linewidth=0.0),
-        "held-out": Line2D([], [], color=MUTED_COLOUR, linewidth=1.5),
+        "in-sample": Patch(color=style.MUTED_COLOUR, alpha=0.35, linewidth=0.0),
+        "held-out": Line2D([], [], color=style.MUTED_COLOUR, linewidth=1.5),
     }
     shown = {kind for kinds in drawable.values() for kind in kinds}
     return [Entry(kind, (sample,)) for kind, sample in samples.items() if kind in shown]

@@ -108,7 +108,12 @@ def new_figure(height_in: float) -> Figure:
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
 
 
-def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+def add_title(figure: Figure, text: str) -> None:
+    """Put a title above all panels, to the left."""
+    figure.suptitle(text, fontsize=TITLE_PT, x=0.01, ha="left")
+
+
+def label_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     """Label axes (with units), draw a light grid behind the data and no frame on the open sides."""
     axes.set_title(title, fontsize=TITLE_PT, loc="left")
     axes.set_xlabel(x_label, fontsize=LABEL_PT)
@@ -180,7 +185,7 @@ def panels_of(
         axes.set_axis_off()
     panels = dict(zip(names, grid, strict=False))
     for name, axes in panels.items():
-        style_axes(axes, name, "", "")
+        label_axes(axes, name, "", "")
     # A panel with nothing below it has the numbers of the axis, too.
     for axes in grid[: len(names)][-columns:]:
         axes.tick_params(labelbottom=True)
@@ -195,13 +200,17 @@ def columns_for(count: int) -> int:
     return 2 if count in (2, 4) else min(3, count)
 
 
+def say(axes: Axes, text: str) -> None:
+    """Write in the middle of axes without data."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+
+
 def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entries: Sequence[Entry]) -> None:
     """Give the figure its title, its vertical axis and its legend, which stands in a spare panel where there is one."""
     for axes in panels.values():
         if not axes.has_data():
-            text = "nothing to show"
-            axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
-    figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
+            say(axes, "nothing to show")
+    add_title(figure, title)
     figure.supylabel(what, fontsize=LABEL_PT)
     spare = figure.axes[len(panels) :]
     if spare:

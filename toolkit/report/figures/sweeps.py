@@ -10,20 +10,8 @@ from matplotlib.axes import Axes
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, CLEAN, Axis, Point, Sweep
 from toolkit.files.writing import plain_name
-from toolkit.report.figures.style import (
-    MUTED_COLOUR,
-    SMALL_PT,
-    TICK_PT,
-    TITLE_PT,
-    ZERO_COLOUR,
-    Entry,
-    NamedFigure,
-    legend_below,
-    new_figure,
-    scale_by_decades,
-    stroke_among,
-    style_axes,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.sweep import metric_of, shown_value
 
 # Doses that span more than this factor are laid out by their logarithm.
@@ -70,18 +58,18 @@ def _word(axis: Axis) -> str:
 
 
 def _curves(sweep: Sweep, axis: Axis) -> NamedFigure:
-    figure = new_figure(_HEIGHT_IN)
+    figure = style.new_figure(_HEIGHT_IN)
     panels, places = figure.subplots(1, 3, sharex=True), _Places(axis)
     titles = ("error over clean", "pose NEES / 6", "withheld tracks over clean")
     for axes, title, field in zip(panels, titles, ("over_clean", "nees", "held_out"), strict=True):
-        style_axes(axes, title, f"{axis.name.removeprefix('fault:')}{f' [{axis.unit}]' if axis.unit else ''}", "")
-        axes.axhline(1.0, color=ZERO_COLOUR, linewidth=0.8)
+        style.label_axes(axes, title, f"{axis.name.removeprefix('fault:')}{f' [{axis.unit}]' if axis.unit else ''}", "")
+        axes.axhline(1.0, color=style.ZERO_COLOUR, linewidth=0.8)
         lines = {name: _line(sweep, axis, places, name, field) for name in sweep.estimators}
         _draw_lines(axes, lines)
-        axes.set_xticks(list(places.ticks), list(places.ticks.values()), fontsize=TICK_PT)
-    panels[0].axhline(BREAKS_AT, color=MUTED_COLOUR, linewidth=0.8, linestyle=":")
-    figure.suptitle(f"{sweep.grid.case.name}: {axis.name}", fontsize=TITLE_PT, x=0.01, ha="left")
-    legend_below(figure, _entries(sweep))
+        axes.set_xticks(list(places.ticks), list(places.ticks.values()), fontsize=style.TICK_PT)
+    panels[0].axhline(BREAKS_AT, color=style.MUTED_COLOUR, linewidth=0.8, linestyle=":")
+    style.add_title(figure, f"{sweep.grid.case.name}: {axis.name}")
+    style.legend_below(figure, _entries(sweep))
     over = f"{len(sweep.grid.plan.seeds)} seeds, paired" if sweep.over_seeds else "stretches of the recording"
     caption = (
         f"{axis.name} on {sweep.grid.case.name} ({axis.meaning.rstrip('.')}): error over that of the clean recording "
@@ -99,17 +87,17 @@ def _line(sweep: Sweep, axis: Axis, places: _Places, name: str, field: str) -> l
 
 def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> None:
     if not any(lines.values()):
-        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+        style.say(axes, "not known")
     values = [min(one.value, _MOST) for line in lines.values() for _, one in line if math.isfinite(one.value)]
     low, high = 0.7 * min([0.9, *values]), 1.5 * max([BREAKS_AT, *values])
     for name, line in lines.items():
-        stroke, place = stroke_among(lines, name), [place for place, _ in line]
+        stroke, place = style.stroke_among(lines, name), [place for place, _ in line]
         value, below, above = (np.clip([one[end] for _, one in line], low, high) for end in range(3))
         axes.fill_between(place, below, above, color=stroke["color"], alpha=0.13, linewidth=0.0)
         axes.plot(place, value, linewidth=1.3, marker="o", markersize=2.5, **stroke)
         bad = [place for place, one in line if math.isinf(one.value)]
         axes.scatter(bad, [high] * len(bad), color=stroke["color"], marker="x", clip_on=False)
-    scale_by_decades(axes, low, high)
+    style.scale_by_decades(axes, low, high)
 
 
 def _steps(axis: Axis) -> tuple[Point, ...]:
@@ -118,13 +106,13 @@ def _steps(axis: Axis) -> tuple[Point, ...]:
 
 def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     metric = metric_of(sweep)
-    figure = new_figure(3.6)
+    figure = style.new_figure(3.6)
     axes = figure.subplots()
-    style_axes(axes, "", "CPU of a frame [ms]", f"{metric.name} [{metric.unit}]")
+    style.label_axes(axes, "", "CPU of a frame [ms]", f"{metric.name} [{metric.unit}]")
     reached = {name: _reached(sweep, axis, name) for name in sweep.estimators}
     everywhere = [at for points in reached.values() for at in points.values()]
     for name, points in reached.items():
-        stroke = stroke_among(reached, name)
+        stroke = style.stroke_among(reached, name)
         line = [at for point, at in points.items() if point]
         axes.plot(*np.reshape(line, (-1, 2)).T, linewidth=1.0, alpha=0.6, **stroke)
         for point, at in points.items():
@@ -132,14 +120,16 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
             face = stroke["color"] if on_front else "white"
             axes.plot(*at, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face, **stroke)
             word = shown_value(point[0][1]) if point else _word(axis)
-            axes.annotate(word, at, (4, 4), textcoords="offset points", fontsize=SMALL_PT, color=MUTED_COLOUR)
+            axes.annotate(
+                word, at, (4, 4), textcoords="offset points", fontsize=style.SMALL_PT, color=style.MUTED_COLOUR
+            )
     cpu_ms, errors = np.reshape(everywhere, (-1, 2)).T
     if cpu_ms.size:
-        scale_by_decades(axes, 0.8 * cpu_ms.min(), 1.25 * cpu_ms.max(), "x")
-        scale_by_decades(axes, 0.8 * errors.min(), 1.25 * errors.max())
+        style.scale_by_decades(axes, 0.8 * cpu_ms.min(), 1.25 * cpu_ms.max(), "x")
+        style.scale_by_decades(axes, 0.8 * errors.min(), 1.25 * errors.max())
     title = f"{sweep.grid.case.name}: error against time over {axis.name}"
-    figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
-    legend_below(figure, _entries(sweep))
+    style.add_title(figure, title)
+    style.legend_below(figure, _entries(sweep))
     caption = (
         f"{metric.name} against processor time over the values of {axis.name} on {sweep.grid.case.name}, means over "
         "the runs. Filled: on the Pareto front, no other is both more accurate and faster."
@@ -159,7 +149,7 @@ def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, fl
 
 
 def _entries(sweep: Sweep) -> list[Entry]:
-    strokes = {name: stroke_among(sweep.estimators, name) for name in sweep.estimators}
+    strokes = {name: style.stroke_among(sweep.estimators, name) for name in sweep.estimators}
     return [Entry.of_line(name, stroke["color"], stroke["linestyle"]) for name, stroke in strokes.items()]
 
 

@@ -18,18 +18,8 @@ from toolkit.geometry import Array, IntArray, yaw_of
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
 from toolkit.metrics.parts.against_truth import Matched, angles_deg, changes, lengths, rmse
-from toolkit.report.figures.style import (
-    TRUTH_COLOUR,
-    Entry,
-    NamedFigure,
-    colour_at,
-    finish,
-    legend_below,
-    new_figure,
-    panels_of,
-    scale_by_decades,
-    style_axes,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
 
 # Systems in a figure of trajectories, from the first of the leaderboard; sequences that are drawn unless all are asked
@@ -37,7 +27,7 @@ from toolkit.report.text import number
 _MOST_SYSTEMS, _FEW_SEQUENCES, _MOST_PANELS = 7, 3, 12
 _ORDER_OF_MAGNITUDE = 12.0
 _FITTED = "after the fit of SE(3)"
-_TRUTH = Entry.of_line("truth", TRUTH_COLOUR)
+_TRUTH = Entry.of_line("truth", style.TRUTH_COLOUR)
 
 
 class _Drawn(NamedTuple):
@@ -81,7 +71,7 @@ def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
             matched = aligned_file(Path(run.file), truth, evaluation.terms)
         except (DataError, Unavailable):  # a file that went away, or one whose positions nothing can be fitted to
             continue
-        found.append(_Drawn(system, colour_at(evaluation.systems.index(system)), matched))
+        found.append(_Drawn(system, style.colour_at(evaluation.systems.index(system)), matched))
     return found
 
 
@@ -107,22 +97,22 @@ def _entries(drawn: list[_Drawn]) -> list[Entry]:
 
 
 def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
-    figure = new_figure(5.0)
+    figure = style.new_figure(5.0)
     axes = figure.subplots()
-    axes.plot(*truth.poses[:, :2, 3].T, color=TRUTH_COLOUR, linewidth=2.2)
+    axes.plot(*truth.poses[:, :2, 3].T, color=style.TRUTH_COLOUR, linewidth=2.2)
     for one in drawn:
         axes.plot(*one.matched.estimate[:, :2, 3].T, color=one.colour, linewidth=1.2)
-    axes.plot(*truth.poses[0, :2, 3], "o", color=TRUTH_COLOUR, markersize=5.0)
+    axes.plot(*truth.poses[0, :2, 3], "o", color=style.TRUTH_COLOUR, markersize=5.0)
     axes.set_aspect("equal", adjustable="datalim")
-    style_axes(axes, f"{truth.name} from above, {_FITTED}", "x [m]", "y [m]")
-    legend_below(figure, [_TRUTH, *_entries(drawn)])
+    style.label_axes(axes, f"{truth.name} from above, {_FITTED}", "x [m]", "y [m]")
+    style.legend_below(figure, [_TRUTH, *_entries(drawn)])
     return NamedFigure(f"map_{name}", f"{truth.name} from above, from the dot on, {_FITTED} to all positions.", figure)
 
 
 def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     """Return distances, and angles where the truth has orientations, with RMSE and median in the legend."""
     with_angles = changes(truth.poses[:, :3, :3])
-    figure = new_figure(4.4 if with_angles else 2.8)
+    figure = style.new_figure(4.4 if with_angles else 2.8)
     grid = figure.subplots(1 + with_angles, 1, sharex=True, squeeze=False).ravel()
     entries: list[Entry] = []
     sizes: list[float] = []
@@ -138,14 +128,14 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
             grid[1].plot(at_s, error_deg, color=one.colour, linewidth=1.2)
             told += f"; {number(rmse(error_deg))} deg, {number(float(np.median(error_deg)))} deg"
         entries.append(Entry.of_line(told, one.colour))
-    style_axes(grid[0], f"{truth.name}: position error, {_FITTED}", "", "position [m]")
+    style.label_axes(grid[0], f"{truth.name}: position error, {_FITTED}", "", "position [m]")
     if with_angles:
-        style_axes(grid[1], "rotation error", "", "rotation [deg]")
+        style.label_axes(grid[1], "rotation error", "", "rotation [deg]")
         grid[1].set_ylim(bottom=0.0)
     grid[-1].set_xlabel(_x_label(truth))
     _fit_scale(grid[0], sizes, largest)
     figure.align_ylabels()
-    legend_below(figure, entries)
+    style.legend_below(figure, entries)
     return NamedFigure(
         f"errors_{name}", f"Errors on {truth.name} over time, {_FITTED}, with their RMSE and median.", figure
     )
@@ -155,7 +145,7 @@ def _fit_scale(axes: Axes, sizes: list[float], largest: float) -> None:
     """Make an axis logarithmic where the errors differ by more than an order of magnitude."""
     least = min((size for size in sizes if size > 0.0), default=0.0)
     if least and max(sizes) > _ORDER_OF_MAGNITUDE * least:
-        scale_by_decades(axes, 0.2 * least, 1.2 * largest)
+        style.scale_by_decades(axes, 0.2 * least, 1.2 * largest)
     else:
         axes.set_ylim(bottom=0.0)
 
@@ -171,16 +161,16 @@ def _components(
     """Return three panels, one a component of the truth's values (N, 3) and of each estimate's (n, 3)."""
     true, estimates = values
     unit = "m" if rows == "xyz" else "deg"
-    figure = new_figure(4.6)
+    figure = style.new_figure(4.6)
     grid = figure.subplots(3, 1, sharex=True)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
-        axes.plot(_since_start(truth, truth.t_ns), true[:, i], color=TRUTH_COLOUR, linewidth=2.0)
+        axes.plot(_since_start(truth, truth.t_ns), true[:, i], color=style.TRUTH_COLOUR, linewidth=2.0)
         for one, t_s, estimate in zip(drawn, at_s, estimates, strict=True):
             axes.plot(t_s, estimate[:, i], color=one.colour, linewidth=1.2)
         title = f"{truth.name}: {'position' if unit == 'm' else 'angles'}, {_FITTED}" if i == 0 else ""
-        style_axes(axes, title, _x_label(truth) if i == 2 else "", f"{row} [{unit}]")
+        style.label_axes(axes, title, _x_label(truth) if i == 2 else "", f"{row} [{unit}]")
     figure.align_ylabels()
-    legend_below(figure, [_TRUTH, *_entries(drawn)])
+    style.legend_below(figure, [_TRUTH, *_entries(drawn)])
     what = "Position" if unit == "m" else "Roll, pitch and yaw (about z, then y, then x)"
     return NamedFigure(name, f"{what} on {truth.name} over time, {_FITTED}, with the truth.", figure)
 
@@ -209,13 +199,13 @@ def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
             }
             for sequence in sequences
         }
-    figure, panels = panels_of(list(groups), "", 2.0)
+    figure, panels = style.panels_of(list(groups), "", 2.0)
     every = []
     for sequence, axes in panels.items():
         axes.set_xticks([])
         for place, name in enumerate(systems):
             values = [value for value in groups[sequence][name] if value is not None]
-            colour = colour_at(place)
+            colour = style.colour_at(place)
             if values:
                 line = {"color": colour, "linewidth": 1.3}
                 axes.boxplot(
@@ -227,9 +217,9 @@ def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
     if not every:
         return
     if min(every) > 0.0 and max(every) > _ORDER_OF_MAGNITUDE * min(every):
-        scale_by_decades(next(iter(panels.values())), 0.8 * min(every), 1.2 * max(every))
+        style.scale_by_decades(next(iter(panels.values())), 0.8 * min(every), 1.2 * max(every))
     unit = f" [{metric.unit}]" if metric.unit not in ("", "1") else ""
-    entries = [Entry.of_line(name, colour_at(place)) for place, name in enumerate(systems)]
-    finish(figure, panels, f"{metric.name}{unit}", f"{metric.name} over {over}", entries)
+    entries = [Entry.of_line(name, style.colour_at(place)) for place, name in enumerate(systems)]
+    style.finish(figure, panels, f"{metric.name}{unit}", f"{metric.name} over {over}", entries)
     caption = f"{metric.name} over {over}: median, quartiles, least and most, and every value as a dot."
     yield NamedFigure("boxes", caption, figure)

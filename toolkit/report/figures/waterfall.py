@@ -10,17 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from toolkit.report.explanation import ContributionRecord, ExplanationRecord, Kind, over, placed, where
-from toolkit.report.figures.style import (
-    LABEL_PT,
-    MUTED_COLOUR,
-    SMALL_PT,
-    TICK_PT,
-    Entry,
-    NamedFigure,
-    legend,
-    new_figure,
-    style_axes,
-)
+from toolkit.report.figures import style
+from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
 
 _FIRST, _LAST, _WHOLE = "#0072B2", "#D55E00", "#5b6670"
@@ -67,28 +58,28 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
         top = row - 0.5 * _BAR * (len(part.effects) - 1)
         for k, (of_second, kind, effect) in enumerate(placed(found, part)):
             bars.append(_Bar(top + k * _BAR, *((_LAST, gap) if of_second else (_FIRST, 0.0)), effect, kind))
-    figure = new_figure(_AROUND_IN + _ROW_IN * (1 + len(parts)))
+    figure = style.new_figure(_AROUND_IN + _ROW_IN * (1 + len(parts)))
     axes, words = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.2))
     ends = [0.0, gap, *(bar.ends[0] for bar in bars if bar.effect.error is not None)]
     least, most = (min(max(end, min(0.0, gap) - _MOST), max(0.0, gap) + _MOST) for end in (min(ends), max(ends)))
     axes.set_xlim(least - _ROOM, most + _ROOM)
     axes.set_ylim(len(parts) + 0.6, -0.7)
-    style_axes(axes, "", f"times as accurate as {start}", "")
+    style.label_axes(axes, "", f"times as accurate as {start}", "")
     _log_ticks(axes)
-    axes.set_yticks(range(len(parts) + 1), ["all of it", *(part.ingredient for part in parts)], fontsize=LABEL_PT)
+    axes.set_yticks(range(len(parts) + 1), ["all of it", *(part.ingredient for part in parts)], fontsize=style.LABEL_PT)
     for at, name, colour in ((0.0, start, _FIRST), (gap, goal, _LAST)):
         axes.axvline(at, color=colour, linewidth=1.0)
         axes.annotate(
             name, (at, 1.0), (0.0, 3.0), xycoords=("data", "axes fraction"), textcoords="offset points",
-            color=colour, fontsize=TICK_PT, ha="right" if at == min(0.0, gap) else "left",
+            color=colour, fontsize=style.TICK_PT, ha="right" if at == min(0.0, gap) else "left",
         )  # fmt: skip
     words.axis("off")
     words.set_xlim(0.0, 1.0)
     for at, head in ((_EFFECT_AT, "error without/with"), (_BASE_AT, "base")):
-        words.text(at, -0.62, head, fontsize=TICK_PT, color=MUTED_COLOUR)
+        words.text(at, -0.62, head, fontsize=style.TICK_PT, color=style.MUTED_COLOUR)
     for bar in bars:
         _draw(axes, words, bar)
-    legend(figure, _key(found), columns=1, loc="outside lower left")
+    style.legend(figure, _key(found), columns=1, loc="outside lower left")
     yield NamedFigure(
         "waterfall",
         f"What each ingredient brings near {start} (blue) and near {goal} (orange), in the pair of estimators that "
@@ -123,11 +114,11 @@ def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
         axes.barh(bar.row, end - bar.start, _BAR, bar.start, color=bar.colour, alpha=1.0 if is_sure else _PALE)
         axes.plot(interval, [bar.row, bar.row], color="black", linewidth=1.0, marker="|", markersize=5.0)
         told = f"{number(one.factor)} ({number(one.low)}-{number(one.high)})"
-    colour = bar.colour if is_sure else MUTED_COLOUR
-    words.text(_EFFECT_AT, bar.row, told, fontsize=SMALL_PT, color=colour, va="center")
+    colour = bar.colour if is_sure else style.MUTED_COLOUR
+    words.text(_EFFECT_AT, bar.row, told, fontsize=style.SMALL_PT, color=colour, va="center")
     if bar.kind is not None:
         at = where(bar.kind, effect)
-        words.text(_BASE_AT, bar.row, at, fontsize=SMALL_PT, color=MUTED_COLOUR, va="center", wrap=True)
+        words.text(_BASE_AT, bar.row, at, fontsize=style.SMALL_PT, color=style.MUTED_COLOUR, va="center", wrap=True)
 
 
 def _log_ticks(axes: Axes) -> None:

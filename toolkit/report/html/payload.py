@@ -6,7 +6,7 @@ recording's points, as many as a screen can show, to keep the file small.
 
 import base64
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from toolkit.report.curves import look_numbers
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
-from toolkit.report.text import listed, number, unit_of
+from toolkit.report.text import unit_of
 from toolkit.report.verdict import ContestRecord, contest_text
 
 Json = dict[str, Any]
@@ -38,10 +38,6 @@ _TITLES = {
     "accuracy in the end": "Most accurate in the end (final)",
     "withheld tracks": "Best on withheld tracks",
 }
-_UNDECIDED = "no clear winner"
-_COST = "frame_cpu_ms_mean"
-# The processor time of one run scatters: nobody is called faster by less than this factor.
-_FASTER = 1.5
 
 
 def payload_of(runs: Sequence[Files]) -> Json:
@@ -59,12 +55,16 @@ def payload_of(runs: Sequence[Files]) -> Json:
 
 def _titles(runs: Sequence[Files]) -> list[str]:
     """Return the sequences' names, with the directory's where several share one, as given where that is shared too."""
-    names = [files.scores.sequence.name for files in runs]
-    with_directory = [f"{name} ({files.directory.resolve().name})" for name, files in zip(names, runs, strict=True)]
-    as_given = [f"{name} ({files.directory})" for name, files in zip(names, runs, strict=True)]
-    choices = list(zip(names, with_directory, as_given, strict=True))
-    counts = Counter(title for choice in choices for title in choice)
-    return [next((title for title in choice if counts[title] == 1), choice[-1]) for choice in choices]
+    forms = ["{name}", "{name} ({short})", "{name} ({given})"]
+    named = [
+        {"name": one.scores.sequence.name, "short": one.directory.resolve().name, "given": str(one.directory)}
+        for one in runs
+    ]
+    counts = Counter(form.format(**names) for names in named for form in forms)
+    return [
+        next((title for form in forms if counts[title := form.format(**names)] == 1), forms[-1].format(**names))
+        for names in named
+    ]
 
 
 def _case(files: Files, case_id: str, title: str, colours: dict[str, int]) -> Json:
@@ -151,8 +151,7 @@ def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
 def _row(run: ScoredRun | RunOverSeeds, row_id: str, colours: dict[str, int]) -> Json:
     """Return a run as its document has it, with its id and look, and what its stated uncertainty is marked as."""
     mark = "" if run.consistency is UNSET or run.consistency.verdict == "consistent" else run.consistency.verdict
-    page = {"id": row_id, "colour": colours[run.estimator], "mark": mark, "judged": run.consistency is not UNSET}
-    return {**to_builtins(run), **page}
+    return {**to_builtins(run), "id": row_id, "colour": colours[run.estimator], "mark": mark}
 
 
 def _rows_of(estimator: str, rows: list[Json]) -> list[str]:
@@ -250,9 +249,7 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
         rows.append(
             _row(run, f"{case_id}r{i}", colours)
             | {
-                "status": "ok"
-                if run.counts["ok"] == len(run.status)
-                else f"{run.counts['ok']} of {len(run.status)} ok",
+                "status": "ok" if ok == seeds else f"{ok} of {seeds} ok",
                 "good": ok == seeds,
                 "change": run.change or "",
                 "metrics": {key: metric.mean for key, metric in run.metrics.items()},
@@ -291,43 +288,18 @@ def highlights(contests: Sequence[ContestRecord], rows: Sequence[Json], runs: st
     """
     found = []
     for contest in contests:
-        outputs = (contest.rivals[0].output, "both")
-        first = contest.rivals[0].estimator
-        row = next((row for row in rows if row["estimator"] == first and row["output"] in outputs), None)
-        undecided = "no winner" if len(contest.leaders) == 1 else _UNDECIDED
+        first = contest.rivals[0]
+        same = (row for row in rows if row["estimator"] == first.estimator and row["output"] in (first.output, "both"))
+        row: Json = next(same, {"id": None, "mark": ""})
         found.append(
             {
                 "question": _TITLES[contest.question],
-                "answer": contest.winner or undecided,
-                "row": None if row is None or contest.winner is None else row["id"],
-                "detail": contest_text(contest, runs, "" if row is None else row["mark"]),
+                "answer": contest.winner or ("no winner" if len(contest.leaders) == 1 else "no clear winner"),
+                "row": row["id"] if contest.winner else None,
+                "detail": contest_text(contest, runs, row["mark"]),
             }
         )
-    return [*found, *_uncertainty(rows), *_fastest(rows)]
-
-
-def _uncertainty(rows: Sequence[Json]) -> Iterator[dict[str, str | None]]:
-    """Yield whose stated uncertainty can be trusted, where any is tested; that is no contest."""
-    tested = [row for row in rows if row["judged"]]
-    if tested:
-        sound = [row["estimator"] for row in tested if not row["mark"] and row["good"]]
-        marked = [f"{row['estimator']} is {row['mark']}" for row in tested if row["mark"]]
-        answer = listed(sound) if sound else "nobody's"
-        yield {"question": "Stated uncertainty to trust", "answer": answer, "row": None, "detail": listed(marked)}
-
-
-def _fastest(rows: Sequence[Json]) -> Iterator[dict[str, str | None]]:
-    """Yield who takes the least processor time, of the rows that ended well without a mark."""
-    able = [row for row in rows if row["good"] and not row["mark"] and row["metrics"].get(_COST) is not None]
-    cost_of: dict[str, float] = {row["estimator"]: row["metrics"][_COST] for row in able}
-    if len(cost_of) < 2:
-        return
-    (name, cost), (other, next_cost), *_ = sorted(cost_of.items(), key=lambda pair: pair[1])
-    detail = f"{number(cost)} ms of processor time a frame; next: {other}, {number(next_cost)} ms"
-    row = next(row["id"] for row in able if row["estimator"] == name)
-    if next_cost < _FASTER * cost:
-        name, row = _UNDECIDED, None
-    yield {"question": "Fastest", "answer": name, "row": row, "detail": detail}
+    return found
 
 
 def evenly(count: int, most: int) -> IntArray:
