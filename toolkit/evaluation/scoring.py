@@ -19,13 +19,8 @@ import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
-    BodyTurn,
     Reference,
-    check_axes,
-    check_body,
-    check_clock,
-    check_length_unit,
-    check_mirrored,
+    body_of,
     other_axes,
     range_s,
 )
@@ -246,10 +241,11 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     length, order of quaternions or number of lines is named.
     """
     file, estimate = _read(path, truth, terms)
-    turn = _checked(file, estimate, truth)
+    if len(file) == 0:
+        raise DataError(f"{path}: it holds no poses")
+    near = matched_poses(estimate, truth)
+    turn = body_of(file, truth.reference, estimate.t_ns, (near.truth, near.estimate))
     matched = _matched(estimate, truth, terms.max_dt_s)
-    if turn is None or not turn.is_other_body:
-        check_axes(str(path), matched.truth, matched.estimate)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
@@ -298,19 +294,6 @@ def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
         what = f"{file.path}: {len(file)} lines without stamps, and the truth has {len(truth.poses)} poses"
         raise DataError(f"{what}; write a pose for each, or a format with stamps")
     return Poses(file.path, truth.t_ns, file.T_world_imu)
-
-
-def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> BodyTurn | None:
-    """Check that a trajectory belongs to the truth; return how its body is turned, where that shows."""
-    what = str(file.path)
-    if len(file) == 0:
-        raise DataError(f"{what}: it holds no poses")
-    reference = truth.reference
-    check_clock(what, reference, estimate.t_ns)
-    check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
-    matched = matched_poses(estimate, truth)
-    check_mirrored(what, matched.truth, matched.estimate)
-    return check_body(file, reference, estimate.t_ns, (matched.truth, matched.estimate))
 
 
 def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:

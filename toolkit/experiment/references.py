@@ -11,10 +11,7 @@ from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
     Reference,
-    check_axes,
-    check_body,
-    check_clock,
-    check_length_unit,
+    body_of,
     of_the_camera,
     other_axes,
     range_s,
@@ -100,19 +97,14 @@ def check_names(references: Mapping[str, Trajectory], files: Iterable[str]) -> N
 def _external(name: str, file: ExternalFile, recording: Sequence, sequence: Sequence) -> Run:
     poses = file.poses
     trajectory, what = _stamped(poses, recording, sequence), str(poses.path)
-    reference = Reference.of_recording(recording)
-    check_clock(what, reference, trajectory.t_ns)
-    check_length_unit(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
     matched = None
     if recording.truth is not None:
         pairs = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
         matched = pairs.truth, pairs.estimate
-    turn = check_body(poses, reference, trajectory.t_ns, matched, of_the_camera(recording))
+    turn = body_of(poses, Reference.of_recording(recording), trajectory.t_ns, matched, of_the_camera(recording))
     if turn is not None and turn.is_other_body:
         axes = other_axes(turn.R_truth_body)
         raise DataError(f"{what}: its poses are of a body with other axes than the IMU's: {axes}")
-    if matched is not None:
-        check_axes(what, *matched)
     remarks = [] if recording.truth is not None else _of_another_scale(trajectory, sequence)
     read = f"read from {what} ({poses.format}, {len(poses)} poses)"
     remarks += _of_covariances(poses.covariances, trajectory, recording)

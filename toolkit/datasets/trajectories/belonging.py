@@ -1,4 +1,8 @@
-"""Checks that a trajectory belongs to a recording, or to a truth: the same clock, units, rotations and axes.
+"""Whether a trajectory belongs to a recording, or to a truth: the same clock, unit of length, rotations and axes.
+
+Each check asks for rival readings of the file, and accuses it only where one of them fits far better than the file as
+it is given: another unit of time, of length, another order of quaternions, inverse poses, poses that run backwards,
+another body, exchanged axes. A file that fits under none is an estimate that went wrong, and is scored as it is.
 
 Axes are exchanged, or have the wrong sign, where columns of a file are exchanged or its world is left-handed. Positions
 that fit the truth's far better after a reflection are mirrored; those that fit, with orientations that are off by one
@@ -7,15 +11,15 @@ as simple, both fit. The fit is Kabsch's, "A solution for the best rotation to r
 without its rotations' handedness where a reflection is allowed.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import permutations, product
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from toolkit.datasets.trajectories.formats import OtherOrder, PosesFile, check_order
+from toolkit.datasets.trajectories.formats import CONJUGATE, INVERT_EACH, OtherOrder, PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.geometry import (
     Array,
@@ -27,6 +31,7 @@ from toolkit.geometry import (
     se3_inverse,
     so3_exp,
     so3_log,
+    transposed,
 )
 from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import TwistSamples
@@ -46,13 +51,9 @@ _EPOCH_S = 1e6
 # A unit is wrong where most stamps miss the frames, and nearly all meet and cover half of them in another.
 _MOST, _NEARLY_ALL, _COVERED = 0.5, 0.9, 0.5
 _SCALES = (1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9)
-
-
 # A unit of length is named where the median ratio of speeds, over enough steps in motion, is within this factor of it.
 _LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 _WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
-
-Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 # Largest errors of a fit: positions in shares of their extent, orientations by an angle. Estimates with more drift are
 # not judged.
 _FITTING_SHARE, _FITTING_RAD = 0.1, float(np.deg2rad(10.0))
@@ -70,6 +71,7 @@ _STEADY, _STILL = 0.95, 1e-9
 # A turn of a body that is told, and is no other axes: an extrinsic that is a little off.
 _LEAST_TOLD_RAD = float(np.deg2rad(2.0))
 _NAMES = "xyz"
+Struck = Literal["positions alone", "positions and quaternions", "the whole world"]
 
 
 class Reference(NamedTuple):
@@ -108,11 +110,10 @@ class Reference(NamedTuple):
     @classmethod
     def of_truth(cls, name: str, t_ns: IntArray, T_world_imu: Array) -> "Reference":
         """Return a truth (N,), (N, 4, 4) whose recording is not there: its turns are in the place of a gyro's."""
-        turns = so3_log(np.swapaxes(T_world_imu[:-1, :3, :3], 1, 2) @ T_world_imu[1:, :3, :3])
+        turns = so3_log(transposed(T_world_imu[:-1, :3, :3]) @ T_world_imu[1:, :3, :3])
         rates: Array = turns / (np.diff(t_ns) / NS_PER_S)[:, None]
-        middle_ns = t_ns[:-1] + np.diff(t_ns) // 2
+        middle_ns, positions = t_ns[:-1] + np.diff(t_ns) // 2, T_world_imu[:, :3, 3]
         unknown = np.full(middle_ns.size, np.nan)
-        positions = T_world_imu[:, :3, 3]
         return cls(name, "the truth", "the truth does", t_ns, middle_ns, rates, t_ns, positions, unknown)
 
 
@@ -133,31 +134,46 @@ def in_other_order(order: OtherOrder) -> Reading:
     return Reading(f"read {order.name}", order.remedy, order.reread)
 
 
-# Rotations from the world to the IMU.
-INVERTED = Reading(
-    "inverted",
-    "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
-    lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2),
-)
-_EACH_INVERTED = Reading(
-    "each pose is inverted",
-    "the poses look like those of the world in the IMU frame: invert each one",
-    lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2),
-)
-# Poses in the reverse of their order, on stamps that go on.
-BACKWARDS = Reading(
-    "read backwards",
-    "its poses run backwards: write them in the order of their stamps",
-    lambda R_world_imu: R_world_imu[::-1],
-    -1,
-)
-
-
 def of_the_camera(sequence: Sequence) -> Reading:
     """Return the reading of poses of the left camera."""
     R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T
     remedy = "the poses look like the left camera's: multiply each by the inverse of T_imu_cam from the right"
     return Reading("read as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
+
+
+_INVERTED = Reading("inverted", CONJUGATE, transposed)
+_EACH_INVERTED = Reading("each pose is inverted", INVERT_EACH, transposed)
+# Poses in the reverse of their order, on stamps that go on.
+_BACKWARDS = Reading(
+    "read backwards",
+    "its poses run backwards: write them in the order of their stamps",
+    lambda rotations: rotations[::-1],
+    -1,
+)
+
+
+def body_of(
+    file: PosesFile, reference: Reference, t_ns: IntArray, matched: tuple[Array, Array] | None, *readings: Reading
+) -> "BodyTurn | None":
+    """Return the turn of a file's body against the truth's, which may have other axes; None where it does not show.
+
+    ``t_ns`` (N,) are the stamps of its poses, ``matched`` the truth's and the estimate's poses (n, 4, 4) of the same
+    times, where there is a truth; ``readings`` are tried beside the usual ones. Raises DataError where it belongs to
+    the reference only in another clock or unit, under another reading or with exchanged axes, with the remedy.
+    """
+    what = str(file.path)
+    check_clock(what, reference, t_ns)
+    _check_length_unit(what, reference, t_ns, file.T_world_imu[:, :3, 3])
+    if matched is not None:
+        # The effect of a reflection on orientations resembles other mistakes in them, so it is checked first.
+        check_mirrored(what, *matched)
+    turn = _body(file, reference, t_ns, matched, readings)
+    if matched is not None and (turn is None or not turn.is_other_body):
+        check_axes(what, *matched)
+    return turn
+
+
+# Clock and unit of length --------------------------------------------------------------------------------------------
 
 
 def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:
@@ -178,6 +194,105 @@ def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:
     raise DataError(f"{reference.name}: {ranges}: {mismatch}; {cause}")
 
 
+def range_s(t_ns: IntArray) -> str:
+    """Return the first and the last of stamps as text."""
+    return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
+
+
+def _fitting_scale(frames_t_ns: IntArray, t_ns: IntArray) -> float | None:
+    """Return the factor that alone makes stamps (N,) those of the frames, or None."""
+    first, last = float(frames_t_ns[0]), float(frames_t_ns[-1])
+
+    def share_within(stamps: Array) -> float:
+        return float(((stamps >= first) & (stamps <= last)).mean())
+
+    stamps = t_ns.astype(np.float64)
+    if share_within(stamps) > _MOST:
+        return None
+    for scale in _SCALES:
+        scaled: Array = scale * stamps
+        if share_within(scaled) >= _NEARLY_ALL and scaled[-1] - scaled[0] >= _COVERED * (last - first):
+            return scale
+    return None
+
+
+def _clock_difference(frames_t_ns: IntArray, t_ns: IntArray) -> str:
+    """Name the likely reason why two recordings of one drive do not overlap in time."""
+    frames_s, other_s = frames_t_ns[0] / NS_PER_S, t_ns[0] / NS_PER_S
+    hours = (frames_s - other_s) / 3600.0
+    if abs(frames_s) > _EPOCH_S > abs(other_s) or abs(other_s) > _EPOCH_S > abs(frames_s):
+        return f"one counts from its own start: add {frames_s - other_s:.3f} s to it if both start together"
+    if abs(hours) < 24.5 and abs(hours - round(hours)) * 3600.0 < max(1.0, abs(t_ns[-1] / NS_PER_S - other_s)):
+        return f"the clocks are about {hours:.0f} h apart, as time zones are: shift it"
+    return "it is of another drive or clock"
+
+
+def _check_length_unit(what: str, reference: Reference, t_ns: IntArray, positions: Array) -> None:
+    """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
+    steps = _Steps.of(t_ns)
+    if reference.positions_t_ns.size > 1:
+        measured_mps = steps.speeds(_at(reference.positions_t_ns, reference.positions, t_ns))
+    elif reference.rates_t_ns.size > 1:
+        measured_mps = _at(reference.rates_t_ns, reference.speeds_mps[:, None], t_ns[steps.start])[:, 0]
+    else:
+        return
+    known = np.isfinite(measured_mps) & (measured_mps > _MOVING_MPS)
+    if known.sum() < _FEWEST_STEPS:
+        return
+    ratio = float(np.median(steps.speeds(positions)[known] / measured_mps[known]))
+    for unit, factor in _LENGTHS.items():
+        if factor / _WITHIN_FACTOR < ratio < factor * _WITHIN_FACTOR:
+            found = f"{what} moves {ratio:.4g} times as fast as measured"
+            raise DataError(f"{reference.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
+
+
+def _at(t_ns: IntArray, values: Array, at_ns: IntArray) -> Array:
+    """Return values (S, C) on stamps, taken as straight lines, at others (N,); NaN outside their time."""
+    t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
+    return np.stack([np.interp(at_s, t_s, column, np.nan, np.nan) for column in values.T], axis=1)
+
+
+# Rates of rotation ---------------------------------------------------------------------------------------------------
+
+
+class _Steps(NamedTuple):
+    """Steps between stamps (N,), of their indices (M,): from each one to the first that is far enough behind it."""
+
+    t_ns: IntArray
+    start: IntArray
+    end: IntArray
+    duration_s: Array
+
+    @classmethod
+    def of(cls, t_ns: IntArray) -> "_Steps":
+        """Return the steps that end within the stamps."""
+        end = np.searchsorted(t_ns, t_ns + _STEP_NS)
+        start = np.flatnonzero(end < t_ns.size)
+        return cls(t_ns, start, end[start], (t_ns[end[start]] - t_ns[start]) / NS_PER_S)
+
+    def rates(self, R_world_imu: Array) -> Array:
+        """Return the mean rates of rotation (M, 3) rad/s of orientations (N, 3, 3), in the body frame."""
+        turns = so3_log(transposed(R_world_imu[self.start]) @ R_world_imu[self.end])
+        return np.asarray(turns / self.duration_s[:, None])
+
+    def mean_rates(self, reference: Reference) -> Array:
+        """Return the means (M, 3) of the reference's rates, taken as straight lines."""
+        at_stamps = turned(reference.rates_t_ns, reference.rates_radps, self.t_ns)
+        return np.asarray((at_stamps[self.end] - at_stamps[self.start]) / self.duration_s[:, None])
+
+    def speeds(self, positions: Array) -> Array:
+        """Return the speeds (M,) m/s of positions (N, 3)."""
+        return np.asarray(np.linalg.norm(positions[self.end] - positions[self.start], axis=1) / self.duration_s)
+
+
+def turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
+    """Return the integrals (N, 3) rad of rates (S, 3), taken as straight lines, from the first to stamps (N,)."""
+    sample_s, at_s = (sample_t_ns - sample_t_ns[0]) / NS_PER_S, (at_ns - sample_t_ns[0]) / NS_PER_S
+    areas = 0.5 * (rates_radps[1:] + rates_radps[:-1]) * np.diff(sample_s)[:, None]
+    reached = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+    return np.stack([np.interp(at_s, sample_s, axis) for axis in reached.T], axis=1)
+
+
 def check_turns(
     what: str, reference: Reference, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]
 ) -> bool:
@@ -187,33 +302,98 @@ def check_turns(
     and about other axes.
     """
     within = _within(t_ns, reference.rates_t_ns)
-    steps = _Steps.of(t_ns[within])
+    steps, given = _Steps.of(t_ns[within]), R_world_imu[within]
     if steps.start.size < 2:
         return False
-    measured = steps.mean_rates(reference.rates_t_ns, reference.rates_radps)
-    given = R_world_imu[within]
+    measured = steps.mean_rates(reference)
     as_given = _correlation(steps.rates(given), measured)
     if as_given > _SURE_CORRELATION:
         return True
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
     if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):
-        raise DataError(_only_if(what, reference, best))
+        raise _only_if(what, reference, best)
     return as_given > _FITTING_CORRELATION and as_given >= fit
 
 
-def check_body(
-    file: PosesFile, reference: Reference, t_ns: IntArray, matched: tuple[Array, Array] | None, *readings: Reading
-) -> "BodyTurn | None":
-    """Return the turn of a file's body against the truth's, which may have other axes; None where it does not show.
+def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
+    """Return R_reference_body (3, 3) where rotations (N, 3, 3) are those of a body with other axes, or None.
 
-    ``matched`` are the truth's and the estimate's poses (n, 4, 4) of the same times, where there is a truth. Every
-    reading is judged by what it leaves of the orientations once the positions are laid over each other: at best one
-    turn of the body, however large. Where positions do not tell, the rates of rotation on the stamps (N,) do.
-    Raises DataError where another reading leaves far less than the given one, which is named with its remedy.
+    Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
+    they are. A camera's poses beside an IMU's are the usual case.
+    """
+    within = _within(t_ns, reference.rates_t_ns)
+    steps = _Steps.of(t_ns[within])
+    if steps.start.size < _FEWEST_STEPS:
+        return None
+    both = steps.mean_rates(reference), steps.rates(R_world_body[within])
+    measured, rates = (x - x.mean(axis=0) for x in both)
+    turn, _ = nearest_rotation(measured.T @ rates)
+    as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
+    is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
+    return turn if is_other and _angle_rad(turn) > _OTHER_AXES_RAD else None
+
+
+def _within(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
+    """Say which stamps (N,) lie between the first and the last of samples (S,); none where there are fewer than two."""
+    if sample_t_ns.size < 2:
+        return np.zeros(t_ns.size, dtype=bool)
+    return np.asarray((t_ns >= sample_t_ns[0]) & (t_ns <= sample_t_ns[-1]))
+
+
+def _correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series (N, 3) about their means (a gyro has a bias), over all axes at once."""
+    a, b = one - one.mean(axis=0), other - other.mean(axis=0)
+    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float((a * b).sum()) / norm if norm > 0.0 else 0.0
+
+
+def _only_if(what: str, reference: Reference, reading: Reading) -> DataError:
+    return DataError(f"{reference.name}: {what} turns as {reference.turns} only if {reading.only_if}; {reading.remedy}")
+
+
+# The body ------------------------------------------------------------------------------------------------------------
+
+
+class BodyTurn(NamedTuple):
+    """The turn R_truth_body (3, 3) that orientations have in common, how they scatter about it, and what hides it.
+
+    ``scatter_rad`` is the median angle from it; the fit of the positions leaves a turn of ``unknown_rad`` open.
+    """
+
+    R_truth_body: Array
+    scatter_rad: float
+    unknown_rad: float
+
+    @property
+    def angle_rad(self) -> float:
+        """The angle of the turn."""
+        return float(_angle_rad(self.R_truth_body))
+
+    @property
+    def is_told(self) -> bool:
+        """Say whether the turn is more than the errors of both."""
+        return self.angle_rad > max(_LEAST_TOLD_RAD, _TIMES * self.scatter_rad, _TIMES * self.unknown_rad)
+
+    @property
+    def is_other_body(self) -> bool:
+        """Say whether the body's axes are others."""
+        return self.is_told and self.angle_rad > _OTHER_AXES_RAD
+
+
+def _body(
+    file: PosesFile,
+    reference: Reference,
+    t_ns: IntArray,
+    matched: tuple[Array, Array] | None,
+    readings: tuple[Reading, ...],
+) -> BodyTurn | None:
+    """Judge every reading by what it leaves of the orientations once the positions are laid over each other.
+
+    That is at best one turn of the body, however large. Where positions do not tell, the rates of rotation do.
     """
     what, order = str(file.path), file.other_order
-    others = (*(() if order is None else (in_other_order(order),)), INVERTED, BACKWARDS, *readings)
+    others = (*(() if order is None else (in_other_order(order),)), _INVERTED, _BACKWARDS, *readings)
     fit = None if matched is None else _fit(*matched)
     if fit is not None and fit.turns:
         given, left = fit.body, {one: fit.reread(one).body for one in others}
@@ -225,15 +405,15 @@ def check_body(
         best = min(left, key=lambda one: left[one].scatter_rad)
         is_better = not left[best].is_other_body if fits else left[best].scatter_rad < given.scatter_rad / _TIMES
         if is_better and left[best].scatter_rad < most_rad:
-            raise DataError(_only_if(what, reference, best))
+            raise _only_if(what, reference, best)
         if fits:
             return given
     if matched is not None and fit is None and _fits_inverted(*matched):
-        raise DataError(_only_if(what, reference, _EACH_INVERTED))
+        raise _only_if(what, reference, _EACH_INVERTED)
     some = slice(None, None, 1 + len(file) // _ENOUGH_TURNS)
-    t_ns, poses = t_ns[some], file.T_world_imu[some]
-    confirmed = check_turns(what, reference, t_ns, poses[:, :3, :3], others)
-    turn = _turned_body(reference, t_ns, poses[:, :3, :3])
+    t_ns, R_world_body = t_ns[some], file.T_world_imu[some, :3, :3]
+    confirmed = check_turns(what, reference, t_ns, R_world_body, others)
+    turn = _turned_body(reference, t_ns, R_world_body)
     if turn is None and matched is not None:
         turn = _turned_on_a_line(*matched)
     if order is not None and not confirmed and turn is None:
@@ -271,8 +451,7 @@ def _turned_on_a_line(truth: Array, estimate: Array) -> Array | None:
         return None
     if np.linalg.norm(axis) < _STILL:  # backwards, about whatever is upright
         axis = np.cross(x, np.eye(3)[int(np.argmin(np.abs(x)))])
-    turn: Array = so3_exp(angle * axis / np.linalg.norm(axis))
-    return turn
+    return np.asarray(so3_exp(angle * axis / np.linalg.norm(axis)))
 
 
 def _travels(poses: Array) -> Array:
@@ -281,12 +460,7 @@ def _travels(poses: Array) -> Array:
         return np.zeros(3)
     way = poses[-1, :3, 3] - poses[0, :3, 3]
     path_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    mean: Array = (np.swapaxes(poses[:, :3, :3], 1, 2) @ way).mean(axis=0) / max(path_m, _STILL)
-    return mean
-
-
-def _only_if(what: str, reference: Reference, reading: Reading) -> str:
-    return f"{reference.name}: {what} turns as {reference.turns} only if {reading.only_if}; {reading.remedy}"
+    return np.asarray((transposed(poses[:, :3, :3]) @ way).mean(axis=0) / max(path_m, _STILL))
 
 
 def other_axes(R_reference_body: Array) -> str:
@@ -297,152 +471,13 @@ def other_axes(R_reference_body: Array) -> str:
         signed = [f"{sign}{_NAMES[row]}" for sign, row in zip(signs, largest, strict=True)]
         along = f"its x, y and z point along the truth's {signed[0]}, {signed[1]} and {signed[2]}"
     else:
-        along = f"turned by {float(np.degrees(np.linalg.norm(so3_log(R_reference_body)))):.0f} deg"
+        along = f"turned by {float(np.degrees(_angle_rad(R_reference_body))):.0f} deg"
     x, y, z, w = quaternion_from_rotation(R_reference_body).tolist()
     quaternion = f"x y z w {x:.3f} {y:.3f} {z:.3f} {w:.3f}"
     return f"{along}; multiply each pose by the inverse of the extrinsic (about {quaternion}) from the right"
 
 
-def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
-    """Return R_reference_body (3, 3) where rotations (N, 3, 3) are those of a body with other axes, or None.
-
-    Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
-    they are. A camera's poses beside an IMU's are the usual case.
-    """
-    within = _within(t_ns, reference.rates_t_ns)
-    steps = _Steps.of(t_ns[within])
-    if steps.start.size < _FEWEST_STEPS:
-        return None
-    measured, rates = (x - x.mean(axis=0) for x in (
-        steps.mean_rates(reference.rates_t_ns, reference.rates_radps), steps.rates(R_world_body[within])
-    ))  # fmt: skip
-    turn, _ = nearest_rotation(measured.T @ rates)
-    as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
-    is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
-    return turn if is_other and np.linalg.norm(so3_log(turn)) > _OTHER_AXES_RAD else None
-
-
-def check_length_unit(what: str, reference: Reference, t_ns: IntArray, positions: Array) -> None:
-    """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
-    steps = _Steps.of(t_ns)
-    measured_mps = _speeds_along(reference, steps)
-    known = np.isfinite(measured_mps) & (measured_mps > _MOVING_MPS)
-    if known.sum() < _FEWEST_STEPS:
-        return
-    ratio = float(np.median(steps.speeds(positions)[known] / measured_mps[known]))
-    for unit, factor in _LENGTHS.items():
-        if factor / _WITHIN_FACTOR < ratio < factor * _WITHIN_FACTOR:
-            found = f"{what} moves {ratio:.4g} times as fast as measured"
-            raise DataError(f"{reference.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
-
-
-def range_s(t_ns: IntArray) -> str:
-    """Return the first and the last of stamps as text."""
-    return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
-
-
-def _fitting_scale(frames_t_ns: IntArray, t_ns: IntArray) -> float | None:
-    """Return the factor that alone makes stamps (N,) those of the frames, or None."""
-    first, last = float(frames_t_ns[0]), float(frames_t_ns[-1])
-
-    def share_within(stamps: Array) -> float:
-        return float(((stamps >= first) & (stamps <= last)).mean())
-
-    stamps = t_ns.astype(np.float64)
-    if share_within(stamps) > _MOST:
-        return None
-    for scale in _SCALES:
-        scaled: Array = scale * stamps
-        if share_within(scaled) >= _NEARLY_ALL and scaled[-1] - scaled[0] >= _COVERED * (last - first):
-            return scale
-    return None
-
-
-def _within(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
-    """Say which stamps (N,) lie between the first and the last of samples (S,); none where there are fewer than two."""
-    if sample_t_ns.size < 2:
-        return np.zeros(t_ns.size, dtype=bool)
-    return np.asarray((t_ns >= sample_t_ns[0]) & (t_ns <= sample_t_ns[-1]))
-
-
-def _speeds_along(reference: Reference, steps: "_Steps") -> Array:
-    """Return the speeds (M,) m/s of the truth over steps, else of the twists; NaN where neither is known."""
-    t_ns = reference.positions_t_ns
-    if t_ns.size > 1:
-        t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (steps.t_ns - t_ns[0]) / NS_PER_S
-        axes = reference.positions.T
-        return steps.speeds(np.stack([np.interp(at_s, t_s, x, np.nan, np.nan) for x in axes], axis=1))
-    t_ns = reference.rates_t_ns
-    if t_ns.size < 2:
-        return np.full(steps.start.size, np.nan)
-    t_s, middle_s = (t_ns - t_ns[0]) / NS_PER_S, (steps.t_ns[steps.start] - t_ns[0]) / NS_PER_S
-    return np.asarray(np.interp(middle_s, t_s, reference.speeds_mps, np.nan, np.nan))
-
-
-class _Steps(NamedTuple):
-    """Steps between stamps (N,), of their indices (M,): from each one to the first that is far enough behind it."""
-
-    t_ns: IntArray
-    start: IntArray
-    end: IntArray
-
-    @classmethod
-    def of(cls, t_ns: IntArray) -> "_Steps":
-        """Return the steps that end within the stamps."""
-        end = np.searchsorted(t_ns, t_ns + _STEP_NS)
-        start = np.flatnonzero(end < t_ns.size)
-        return cls(t_ns, start, end[start])
-
-    def rates(self, R_world_imu: Array) -> Array:
-        """Return the mean rates of rotation (M, 3) rad/s of orientations (N, 3, 3), in the body frame."""
-        turns = np.swapaxes(R_world_imu[self.start], -1, -2) @ R_world_imu[self.end]
-        rates: Array = so3_log(turns) / self._duration_s[:, None]
-        return rates
-
-    def mean_rates(self, sample_t_ns: IntArray, samples_radps: Array) -> Array:
-        """Return the means (M, 3) of samples (S, 3), taken as straight lines."""
-        at_stamps = turned(sample_t_ns, samples_radps, self.t_ns)
-        means: Array = (at_stamps[self.end] - at_stamps[self.start]) / self._duration_s[:, None]
-        return means
-
-    def speeds(self, positions: Array) -> Array:
-        """Return the speeds (M,) m/s of positions (N, 3)."""
-        moved: Array = np.linalg.norm(positions[self.end] - positions[self.start], axis=1)
-        return moved / self._duration_s
-
-    @property
-    def _duration_s(self) -> Array:
-        duration_s: Array = (self.t_ns[self.end] - self.t_ns[self.start]) / NS_PER_S
-        return duration_s
-
-
-def turned(sample_t_ns: IntArray, rates_radps: Array, at_ns: IntArray) -> Array:
-    """Return the integrals (N, 3) rad of rates (S, 3), taken as straight lines, from the first to stamps (N,)."""
-    sample_s, at_s = (sample_t_ns - sample_t_ns[0]) / NS_PER_S, (at_ns - sample_t_ns[0]) / NS_PER_S
-    areas = 0.5 * (rates_radps[1:] + rates_radps[:-1]) * np.diff(sample_s)[:, None]
-    reached = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
-    return np.stack([np.interp(at_s, sample_s, axis) for axis in reached.T], axis=1)
-
-
-def _correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series (N, 3) about their means (a gyro has a bias), over all axes at once."""
-    a, b = one - one.mean(axis=0), other - other.mean(axis=0)
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float((a * b).sum()) / norm if norm > 0.0 else 0.0
-
-
-def _clock_difference(frames_t_ns: IntArray, t_ns: IntArray) -> str:
-    """Name the likely reason why two recordings of one drive do not overlap in time."""
-    frames_s, other_s = frames_t_ns[0] / NS_PER_S, t_ns[0] / NS_PER_S
-    hours = (frames_s - other_s) / 3600.0
-    if abs(frames_s) > _EPOCH_S > abs(other_s) or abs(other_s) > _EPOCH_S > abs(frames_s):
-        return f"one counts from its own start: add {frames_s - other_s:.3f} s to it if both start together"
-    if abs(hours) < 24.5 and abs(hours - round(hours)) * 3600.0 < max(1.0, abs(t_ns[-1] / NS_PER_S - other_s)):
-        return f"the clocks are about {hours:.0f} h apart, as time zones are: shift it"
-    return "it is of another drive or clock"
-
-
-# Exchanged axes ----------------------------------------------------------------------------------------------
+# Exchanged axes ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -463,7 +498,7 @@ class Exchange:
             return se3(rotations, positions)
         turned = self.matrix @ rotations @ self.matrix.T
         inverted = self.struck == "positions and quaternions" and np.linalg.det(self.matrix) < 0.0
-        return se3(np.swapaxes(turned, 1, 2) if inverted else turned, positions)
+        return se3(transposed(turned) if inverted else turned, positions)
 
     @property
     def description(self) -> str:
@@ -488,15 +523,11 @@ def exchanges() -> tuple[Exchange, ...]:
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.diag(signs) @ np.eye(3)[list(order)]
         moved = sum(axis != place for place, axis in enumerate(order)) + 1.5 * sum(sign < 0.0 for sign in signs)
-        found += [(moved, Exchange(matrix, struck)) for struck in _struck(matrix)] if moved else []
+        struck: tuple[Struck, ...] = ("positions alone", "positions and quaternions", "the whole world")
+        # With a proper permutation the last two are the same.
+        those = struck if np.linalg.det(matrix) < 0.0 else struck[:2]
+        found += [(moved, Exchange(matrix, one)) for one in those] if moved else []
     return tuple(exchange for _, exchange in sorted(found, key=lambda one: one[0]))
-
-
-def _struck(matrix: Array) -> Iterator[Struck]:
-    yield "positions alone"
-    yield "positions and quaternions"
-    if np.linalg.det(matrix) < 0.0:
-        yield "the whole world"
 
 
 def check_mirrored(what: str, truth: Array, estimate: Array) -> None:
@@ -523,9 +554,8 @@ def exchanged(truth: Array, estimate: Array) -> str | None:
         return None
     if fit.is_mirrored:
         return _named(fit) or "its positions mirrored"
-    if not fit.turns or fit.turned_rad(_AS_GIVEN) < _WRONG_RAD or fit.is_other_body:
-        return None
-    return _named(fit)
+    turns_alike = fit.turned_rad(_AS_GIVEN) < _WRONG_RAD or fit.body.scatter_rad < _FITTING_RAD
+    return None if turns_alike or not fit.turns else _named(fit)
 
 
 def _refused(what: str, found: str) -> DataError:
@@ -535,19 +565,9 @@ def _refused(what: str, found: str) -> DataError:
     )
 
 
-def _fit(truth: Array, estimate: Array) -> "_Fit | None":
-    """Return the fit of poses (n, 4, 4); None where they are few, on a line, or near the truth in no axes."""
-    finite = np.isfinite(truth).all(axis=(1, 2)) & np.isfinite(estimate).all(axis=(1, 2))
-    rows = np.flatnonzero(finite)[:: 1 + len(truth) // _ENOUGH]
-    if rows.size < _FEWEST:
-        return None
-    fit = _Fit(truth[rows], estimate[rows])
-    return fit if fit.is_determined and fit.is_near else None
-
-
 def _named(fit: "_Fit") -> str | None:
     """Name the simplest exchange under which positions and orientations fit, these far better than as given."""
-    inverse = fit.of_inverse()
+    inverse = _Fit(fit.truth, se3_inverse(fit.estimate))
     if inverse.is_near and not inverse.is_mirrored and inverse.turned_rad(_AS_GIVEN) < _FITTING_RAD:
         return "each pose inverted"
     if not fit.turns:
@@ -560,30 +580,18 @@ def _named(fit: "_Fit") -> str | None:
 _AS_GIVEN = Exchange(np.eye(3), "positions alone")
 
 
-class BodyTurn(NamedTuple):
-    """The turn R_truth_body (3, 3) that orientations have in common, how they scatter about it, and what hides it.
+# The fit -------------------------------------------------------------------------------------------------------------
 
-    ``scatter_rad`` is the median angle from it; the fit of the positions leaves a turn of ``unknown_rad`` open.
-    """
 
-    R_truth_body: Array
-    scatter_rad: float
-    unknown_rad: float
-
-    @property
-    def angle_rad(self) -> float:
-        """The angle of the turn."""
-        return float(np.linalg.norm(so3_log(self.R_truth_body)))
-
-    @property
-    def is_told(self) -> bool:
-        """Say whether the turn is more than the errors of both."""
-        return self.angle_rad > max(_LEAST_TOLD_RAD, _TIMES * self.scatter_rad, _TIMES * self.unknown_rad)
-
-    @property
-    def is_other_body(self) -> bool:
-        """Say whether the body's axes are others."""
-        return self.is_told and self.angle_rad > _OTHER_AXES_RAD
+def _fit(truth: Array, estimate: Array) -> "_Fit | None":
+    """Return the fit of poses (n, 4, 4); None where they are few, on a line, or near the truth in no axes."""
+    finite = np.isfinite(truth).all(axis=(1, 2)) & np.isfinite(estimate).all(axis=(1, 2))
+    rows = np.flatnonzero(finite)[:: 1 + len(truth) // _ENOUGH]
+    if rows.size < _FEWEST:
+        return None
+    fit = _Fit(truth[rows], estimate[rows])
+    leaves_a_line = float(fit.overlaps[1]) > _LEAST_SIDEWAYS**2 * float(fit.overlaps[0])
+    return fit if leaves_a_line and fit.is_near else None
 
 
 class _Fit:
@@ -591,16 +599,11 @@ class _Fit:
 
     def __init__(self, truth: Array, estimate: Array) -> None:
         y, x = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (truth, estimate))
-        self._truth, self._estimate = truth, estimate
+        self.truth, self.estimate = truth, estimate
         # Each in its own extent: the scale of a single camera's estimate is free.
         extents = float(np.linalg.norm(y) * np.linalg.norm(x))
         self._covariance = y.T @ x / (extents or 1.0)
-
-    @property
-    def is_determined(self) -> bool:
-        """Say whether the positions leave a line."""
-        _, overlaps = nearest_rotation(self._covariance)
-        return float(overlaps[1]) > _LEAST_SIDEWAYS**2 * float(overlaps[0])
+        _, self.overlaps = nearest_rotation(self._covariance)
 
     @property
     def is_near(self) -> bool:
@@ -612,41 +615,31 @@ class _Fit:
         """Say whether the positions fit far better after a reflection."""
         return bool(self.off_share(np.eye(3)) > max(_TIMES * self.off_share(-np.eye(3)), _LEAST_SHARE))
 
-    def of_inverse(self) -> "_Fit":
-        """Return the fit of the inverse poses."""
-        return _Fit(self._truth, se3_inverse(self._estimate))
-
     @property
     def turns(self) -> bool:
         """Say whether both have orientations that change."""
         return self.turned_by_rad > _FITTING_RAD
 
-    @property
+    @cached_property
     def turned_by_rad(self) -> float:
         """How much the orientations of that which turns less change: the median angle from their mean."""
-        return min(_spread_rad(poses[:, :3, :3]) for poses in (self._truth, self._estimate))
+        both = (poses[:, :3, :3] for poses in (self.truth, self.estimate))
+        return min(_scatter_rad(rotations)[1] for rotations in both)
 
-    @property
-    def is_other_body(self) -> bool:
-        """Say whether the orientations differ by a constant turn of the body, as a camera's from an IMU's do."""
-        return self.body.scatter_rad < _FITTING_RAD
-
-    @property
+    @cached_property
     def body(self) -> BodyTurn:
         """The turn of the body that is left of the orientations once the positions are laid over each other."""
         if not self.is_near:
             return BodyTurn(np.eye(3), np.inf, np.inf)
-        aligned = self._rotation(np.eye(3)) @ self._estimate[:, :3, :3]
-        left = np.swapaxes(self._truth[:, :3, :3], 1, 2) @ aligned
-        turn, _ = nearest_rotation(left.mean(axis=0))
-        _, overlaps = nearest_rotation(self._covariance)
-        unknown_rad = self.off_share(np.eye(3)) / max(float(np.sqrt(max(overlaps[1], 0.0))), 1e-9)
-        return BodyTurn(turn, float(np.median(np.linalg.norm(so3_log(turn.T @ left), axis=1))), unknown_rad)
+        aligned = nearest_rotation(self._covariance)[0] @ self.estimate[:, :3, :3]
+        turn, scatter_rad = _scatter_rad(transposed(self.truth[:, :3, :3]) @ aligned)
+        unknown_rad = self.off_share(np.eye(3)) / max(float(np.sqrt(max(self.overlaps[1], 0.0))), 1e-9)
+        return BodyTurn(turn, scatter_rad, unknown_rad)
 
     def reread(self, reading: Reading) -> "_Fit":
         """Return the fit of the poses read otherwise."""
-        rotations, positions = self._estimate[:, :3, :3], self._estimate[:, :3, 3]
-        return _Fit(self._truth, se3(reading.reread(rotations), positions[:: reading.step]))
+        rotations, positions = self.estimate[:, :3, :3], self.estimate[:, :3, 3]
+        return _Fit(self.truth, se3(reading.reread(rotations), positions[:: reading.step]))
 
     def off_share(self, matrix: Array) -> float:
         """Return how far positions whose axes are exchanged are off the truth's at best, of the truth's extent."""
@@ -655,15 +648,16 @@ class _Fit:
 
     def turned_rad(self, exchange: Exchange) -> float:
         """Return the median angle between the truth's orientations and those under an exchange."""
-        R_world_body = exchange.reread(self._estimate)[:, :3, :3]
-        off = self._rotation(exchange.matrix) @ R_world_body @ np.swapaxes(self._truth[:, :3, :3], 1, 2)
-        return float(np.median(np.linalg.norm(so3_log(off), axis=1)))
-
-    def _rotation(self, matrix: Array) -> Array:
-        return nearest_rotation(self._covariance @ matrix.T)[0]
+        aligned = nearest_rotation(self._covariance @ exchange.matrix.T)[0] @ exchange.reread(self.estimate)[:, :3, :3]
+        return float(np.median(_angle_rad(aligned @ transposed(self.truth[:, :3, :3]))))
 
 
-def _spread_rad(rotations: Array) -> float:
-    """Return the median angle of rotations (n, 3, 3) from their mean (the nearest rotation to the mean matrix)."""
+def _scatter_rad(rotations: Array) -> tuple[Array, float]:
+    """Return the rotation (3, 3) nearest to the mean of rotations (n, 3, 3), and their median angle from it."""
     mean, _ = nearest_rotation(rotations.mean(axis=0))
-    return float(np.median(np.linalg.norm(so3_log(mean.T @ rotations), axis=1)))
+    return mean, float(np.median(_angle_rad(mean.T @ rotations)))
+
+
+def _angle_rad(rotations: Array) -> Array:
+    """Return the angles (...) of rotations (..., 3, 3)."""
+    return np.asarray(np.linalg.norm(so3_log(rotations), axis=-1))

@@ -37,7 +37,15 @@ from toolkit.datasets.trajectories.headings import Named, is_of_the_globe, named
 from toolkit.errors import DataError
 from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.files.reading import read_text_input
-from toolkit.geometry import Array, BoolArray, IntArray, quaternion_from_rotation, rotation_from_quaternion, se3
+from toolkit.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    se3,
+    transposed,
+)
 from toolkit.measurements import NS_PER_S
 
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
@@ -47,6 +55,8 @@ _TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove t
 _IDENTITY_TOLERANCE = 1e-2
 # Share of the rows that have the stamp of the one before, from which on stamps have too few digits.
 _MOST_OF_ONE_STAMP = 0.2
+INVERT_EACH = "the poses look like those of the world in the IMU frame: invert each one"
+CONJUGATE = "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them"
 # Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
 _VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.9, 0.1
 
@@ -683,7 +693,10 @@ def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
     positions, R_world_imu = T_world_imu[:, :3, 3], T_world_imu[:, :3, :3]
     reread = other.reread(R_world_imu)
     as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
-    remedy, inverted = max(_inverted(positions, R_world_imu), key=lambda reading: reading[1])
+    R_imu_world = transposed(R_world_imu)
+    inverted_positions = -np.einsum("nij,nj->ni", R_imu_world, positions)
+    readings = ((INVERT_EACH, inverted_positions), (CONJUGATE, positions))
+    inverted, remedy = max((_concentration(at, R_imu_world), remedy) for remedy, at in readings)
     is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
     # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is named.
     if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
@@ -691,22 +704,6 @@ def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
     starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
     if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
         raise DataError(f"{path}: {other.remedy}")
-
-
-def _inverted(positions: Array, R_world_imu: Array) -> tuple[tuple[str, float], ...]:
-    """Return what to do where poses (N, 3), (N, 3, 3) are inverted, in two ways, and how well each reading fits."""
-    R_imu_world = np.swapaxes(R_world_imu, 1, 2)
-    p_inverted = -np.einsum("nij,nj->ni", R_imu_world, positions)
-    return (
-        (
-            "the poses look like those of the world in the IMU frame: invert each one",
-            _concentration(p_inverted, R_imu_world),
-        ),
-        (
-            "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
-            _concentration(positions, R_imu_world),
-        ),
-    )
 
 
 def _concentration(positions: Array, R_world_imu: Array) -> float:
