@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, skew, so3_exp
-from toolkit.jackknife import STRETCHES, jackknife_error
+from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics.parts.against_truth import AgainstTruth, Matched, fit_se3, lengths, rmse
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
@@ -43,7 +43,7 @@ _FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
 # If a smaller share of the velocity remains after the alignment, a shift in time cannot be told from one in space.
 _LEAST_LEFT = 0.02
 # An offset is reported from this many standard errors and from a millisecond on; few stamps are more accurate.
-_SIGMAS, _LEAST_S = 5.0, 1e-3
+_SIGMAS, _LEAST_MS = 5.0, 1.0
 # A rate is reported between the first two values (beyond the second, other stretches of a path fit as well, and the
 # shift of the time is limited likewise) if positions fit this many times as well as with any offset. The fit takes in
 # these shares of the pairs about the middle, one after the other.
@@ -67,21 +67,15 @@ _POINT_REMARK = (
 
 
 class _Fit(NamedTuple):
-    """An offset and its standard error (s), and the RMS distance of positions without it and with it (m)."""
+    """The offset (s) of a clock and, if it is fitted, by how much slower it runs (c,); their standard errors (c,).
 
-    offset_s: float
-    error_s: float
+    Also the RMS distance of positions without and with it (m).
+    """
+
+    clock: Array
+    errors: Array
     before_m: float
     after_m: float
-
-
-class _Rate(NamedTuple):
-    """The rate error of the estimate's clock, its standard error, and the RMS distances with it and without it (m)."""
-
-    value: float
-    error: float
-    after_m: float
-    before_m: float
 
 
 class _Linearised(NamedTuple):
@@ -97,18 +91,17 @@ class _Linearised(NamedTuple):
 def score(evaluation: AgainstTruth) -> Scores:
     """Score the offset of the estimate's clock, and how well it is known."""
     try:
-        fit = _fit(evaluation)
+        fit = _fit(evaluation.compared, with_rate=False)
     except Unavailable as reason:
-        alone = _rate(evaluation, None)
-        why = str(reason) if alone is None else _RATE_REMARK.format(*alone)
+        why = _of_rate(evaluation, np.inf) or str(reason)
         return Scores({OFFSET: None, ERROR: None}, {OFFSET: why, ERROR: why})
-    scores = Scores({OFFSET: 1e3 * fit.offset_s, ERROR: 1e3 * fit.error_s})
-    if (rate := _rate(evaluation, fit)) is not None:
-        return scores.remarked([OFFSET], _RATE_REMARK.format(*rate))
-    if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s) or other_point(evaluation) is not None:
+    offset_ms, error_ms = 1e3 * float(fit.clock[0]), 1e3 * float(fit.errors[0])
+    scores = Scores({OFFSET: offset_ms, ERROR: error_ms})
+    if remark := _of_rate(evaluation, fit.after_m):
+        return scores.remarked([OFFSET], remark)
+    if abs(offset_ms) < max(_LEAST_MS, _SIGMAS * error_ms) or other_point(evaluation) is not None:
         return scores
-    remark = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
-    return scores.remarked([OFFSET], remark)
+    return scores.remarked([OFFSET], _REMARK.format(offset_ms, error_ms, fit.after_m, fit.before_m))
 
 
 def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
@@ -124,26 +117,34 @@ def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
     return t_s, usable
 
 
-def _fit(evaluation: AgainstTruth) -> _Fit:
-    """Fit the offset by Gauss-Newton; raises Unavailable where it is not determined."""
+def _fit(pairs: Matched, with_rate: bool) -> _Fit:
+    """Fit a clock by Gauss-Newton: with a rate over more and more of the pairs, from the middle of the time outwards.
+
+    Raises Unavailable where it is not determined.
+    """
     from scipy.interpolate import CubicSpline  # slow to import, and most processes do not need it
 
-    true, estimated = evaluation.compared.positions
-    t_s, usable = _usable(evaluation.compared)
-    path, offset_s = CubicSpline(t_s, true), 0.0
-    for _ in range(_ITERATIONS):
-        # A pair that a step moved beyond the ends stays out, so that the fit does not oscillate with it.
-        usable &= (t_s + offset_s >= t_s[0]) & (t_s + offset_s <= t_s[-1])
-        if usable.sum() < _FEWEST_PAIRS:
-            raise Unavailable("no offset within the recording makes the positions fit")
-        at, constant = _linearised(path, t_s[usable] + offset_s, estimated[usable]), np.ones((usable.sum(), 1))
-        step_s = float(_clock_step(*at, constant)[0])
-        offset_s += step_s
-        if abs(step_s) < _SETTLED_S:
-            before_m = rmse(lengths(_linearised(path, t_s[usable], estimated[usable]).error_m))
-            error_s = jackknife_error(lambda *some: float(_clock_step(*some)[0]), *at, constant)
-            return _Fit(offset_s, error_s, before_m, rmse(lengths(at.error_m)))
-    raise Unavailable("the fit of the offset did not converge")
+    true, estimated = pairs.positions
+    t_s, usable = _usable(pairs)
+    path, middle_s = CubicSpline(t_s, true), 0.5 * t_s[-1]
+    since_s = np.vander(t_s - middle_s, 2, increasing=True)[:, : 1 + with_rate]
+    clock = np.zeros(1 + with_rate)
+    for share in _SHARES if with_rate else _SHARES[-1:]:
+        rows = usable & (np.abs(t_s - middle_s) <= share * middle_s)
+        for _ in range(_ITERATIONS):
+            at_s = t_s + since_s @ clock
+            # A pair that a step moved beyond the ends stays out, so that the fit does not oscillate with it.
+            rows &= (at_s >= t_s[0]) & (at_s <= t_s[-1])
+            if rows.sum() < _FEWEST_PAIRS:
+                break
+            at = _linearised(path, at_s[rows], estimated[rows])
+            step = _clock_step(*at, since_s[rows])
+            clock += step
+            if share == 1.0 and abs(step[0]) < _SETTLED_S:
+                before_m = rmse(lengths(_linearised(path, t_s[rows], estimated[rows]).error_m))
+                errors = np.sqrt(np.diag(jackknife_cov(_clock_step, *at, since_s[rows])))
+                return _Fit(clock, errors, before_m, rmse(lengths(at.error_m)))
+    raise Unavailable("no offset within the recording makes the positions fit")
 
 
 def other_point(evaluation: AgainstTruth) -> str | None:
@@ -174,52 +175,29 @@ def other_point(evaluation: AgainstTruth) -> str | None:
     if not _TIMES_NEARER * after_m < before_m:
         return None
     try:
-        if _TIMES_NEARER * after_m > _fit(evaluation).after_m:
+        if _TIMES_NEARER * after_m > _fit(pairs, with_rate=False).after_m:
             return None
     except Unavailable:
         pass
     return _POINT_REMARK.format(after_m, before_m, *point_m)
 
 
-def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:
-    """Return the rate error of the estimate's clock; None if it is not determined, or an offset fits nearly as well."""
-    try:
-        slower, since_s, at = _from_the_middle(evaluation.compared)
-    except Unavailable:
-        return None
-    error = jackknife_error(lambda *some: float(_clock_step(*some)[1]), *at, since_s)
-    true, estimated = evaluation.compared.truth, evaluation.compared.estimate
-    before_m = rmse(lengths(evaluation.se3_alignment.apply(estimated)[:, :3, 3] - true[:, :3, 3]))
-    after_m = rmse(lengths(at.error_m))
-    best_m = before_m if fit is None else min(before_m, fit.after_m)
-    if abs(slower) < max(_LEAST_RATE, _SIGMAS * error) or _TIMES_BETTER * after_m > best_m:
-        return None
-    return _Rate(1.0 / (1.0 + slower), error, after_m, before_m)
+def _of_rate(evaluation: AgainstTruth, by_offset_m: float) -> str:
+    """Return the remark on the rate of the estimate's clock; empty if it is not determined, or an offset does as well.
 
-
-def _from_the_middle(pairs: Matched) -> tuple[float, Array, _Linearised]:
-    """Return by how much slower the estimate's clock runs, the factors (m, 2) of offset and rate, and errors of pairs.
-
-    Gauss-Newton over more and more of the pairs; raises Unavailable if it does not converge.
+    ``by_offset_m`` is the RMS distance that an offset alone leaves.
     """
-    from scipy.interpolate import CubicSpline  # as above
-
-    true, estimated = pairs.positions
-    t_s, usable = _usable(pairs)
-    path, since_s = CubicSpline(t_s, true), np.column_stack([np.ones(len(t_s)), t_s - 0.5 * t_s[-1]])
-    clock = np.zeros(2)
-    for share in _SHARES:
-        for _ in range(_ITERATIONS):
-            at_s = t_s + clock[0] + clock[1] * since_s[:, 1]
-            rows = usable & (np.abs(since_s[:, 1]) <= 0.5 * share * t_s[-1]) & (at_s >= t_s[0]) & (at_s <= t_s[-1])
-            if rows.sum() < _FEWEST_PAIRS or abs(clock[1]) > _MOST_RATE:
-                break
-            at = _linearised(path, at_s[rows], estimated[rows])
-            step = _clock_step(*at, since_s[rows])
-            clock += step
-            if share == 1.0 and abs(step[0]) < _SETTLED_S and abs(clock[0]) < _MOST_RATE * t_s[-1]:
-                return float(clock[1]), since_s[rows], at
-    raise Unavailable("the fit of the rate did not converge")
+    try:
+        fit = _fit(evaluation.compared, with_rate=True)
+    except Unavailable:
+        return ""
+    slower, error = float(fit.clock[1]), float(fit.errors[1])
+    if not max(_LEAST_RATE, _SIGMAS * error) <= abs(slower) <= _MOST_RATE:
+        return ""
+    beyond = abs(fit.clock[0]) >= _MOST_RATE * (evaluation.compared.t_ns[-1] - evaluation.compared.t_ns[0]) / NS_PER_S
+    if beyond or _TIMES_BETTER * fit.after_m > min(fit.before_m, by_offset_m):
+        return ""
+    return _RATE_REMARK.format(1.0 / (1.0 + slower), error, fit.after_m, fit.before_m)
 
 
 def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Linearised:
