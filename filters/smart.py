@@ -25,7 +25,7 @@ from toolkit.models.stereo_adjustment import (
     Ending,
     RobustCamera,
     SolvedWindow,
-    TrackedWindow,
+    StereoWindow,
     solve_window,
     without_oldest,
 )
@@ -60,23 +60,21 @@ class Smart:
         self._outlier_check, self._landmarks = OutlierCheck(setup.rig, outliers), KnownLandmarks(setup.rig)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
-        self._tracked = TrackedWindow.empty()
-        self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
+        self._window = StereoWindow.empty()
+        self._solution = SolvedWindow(self._window, np.empty((0, 0)))
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        tracked = self._extended(packet)
         try:
-            self._solution = solve_window(tracked.window, self._camera, _ENDING)
+            self._solution = solve_window(self._extended(packet), self._camera, _ENDING)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; the window starts again at this frame")
             self._complete_all()
-            tracked = self._started(packet)
-            self._solution = solve_window(tracked.window, self._camera, _ENDING)
-        self._tracked = replace(tracked, window=self._solution.window)
+            self._solution = solve_window(self._started(packet), self._camera, _ENDING)
+        self._window = self._solution.window
         self._read(packet)
         self._shorten(packet)
         return self._states[-1]
@@ -86,7 +84,7 @@ class Smart:
         self._complete_all()
         return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
 
-    def _extended(self, packet: Packet) -> TrackedWindow:
+    def _extended(self, packet: Packet) -> StereoWindow:
         """Return the window with the packet's predicted state and its sightings."""
         if packet.motion is None:
             return self._started(packet)
@@ -96,32 +94,32 @@ class Smart:
         # The predicted state is the initial value; the solver iterates from it.
         _, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks)
         self._belief = self._belief.predicted(prediction)
-        return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
+        return self._with_state(self._window, packet.index, sound, increment.factors(packet.index))
 
-    def _started(self, packet: Packet) -> TrackedWindow:
+    def _started(self, packet: Packet) -> StereoWindow:
         """Return a window that begins here, its state tied to the prediction."""
         hold = self._motion.hold(self._belief, packet.index)
-        return self._with_state(TrackedWindow.empty(), packet.index, packet.frame, hold)
+        return self._with_state(StereoWindow.empty(), packet.index, packet.frame, hold)
 
     def _with_state(
-        self, tracked: TrackedWindow, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph
-    ) -> TrackedWindow:
+        self, window: StereoWindow, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph
+    ) -> StereoWindow:
         estimate = self._belief.estimate(frame.t_ns)
-        return tracked.extended(self._motion, estimate, factors, frame, k, self._rig)
+        return window.extended(self._motion, estimate, factors, frame, k, self._rig)
 
     def _read(self, packet: Packet) -> None:
         """Read every state and landmark of the window; drop the landmarks that fell behind a camera."""
-        self._tracked, behind = self._tracked.in_front(self._rig)
+        self._window, behind = self._window.in_front(self._rig)
         self._log += [f"frame {packet.index}: landmark {i} fell behind a camera and was dropped" for i in behind]
-        window, first = self._tracked.window, packet.index + 1 - len(self._tracked.window.keys)
+        window, first = self._window, packet.index + 1 - len(self._window.keys)
         stamps_ns = [s.t_ns for s in self._states[first:]] + [packet.frame.t_ns]
         self._states[first:] = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
         self._complete([len(window.keys) - 1])
-        points = self._tracked.points_by_id()
+        points = window.points_by_id()
         self._points |= points
         self._belief = self._belief.at(self._states[-1])
         self._landmarks.keep(points)
-        self._landmarks.see(self._tracked.newest(packet.frame), points, self._belief.T_world_imu)
+        self._landmarks.see(window.newest(packet.frame), points, self._belief.T_world_imu)
 
     def _complete(self, places: Iterable[int]) -> None:
         """Give states of the window, by their indices in it, their covariance there."""
@@ -136,9 +134,8 @@ class Smart:
 
     def _shorten(self, packet: Packet) -> None:
         """Remove the states that are older than the lag, all at once."""
-        oldest_ns, in_window = packet.frame.t_ns - self._lag_ns, len(self._tracked.window.keys)
+        oldest_ns, in_window = packet.frame.t_ns - self._lag_ns, len(self._window.keys)
         leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
         if leaving:
             self._complete(range(leaving))
-            window = without_oldest(self._tracked.window, leaving, self._camera)
-            self._tracked = replace(self._tracked, window=window).compacted()
+            self._window = without_oldest(self._window, leaving, self._camera)

@@ -15,7 +15,6 @@ from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.stereo_adjustment import (
     Ending,
     Evaluated,
-    MarginalPrior,
     RobustCamera,
     Sightings,
     StereoWindow,
@@ -111,10 +110,10 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
     for k, pose in enumerate(poses):
         values.insert(X(k), gtsam.Pose3(pose))
         motion.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, 1e-2)))
-    keys, nothing = tuple((X(k),) for k in range(POSES)), MarginalPrior.nothing()
+    keys, empty = tuple((X(k),) for k in range(POSES)), StereoWindow.empty()
     ends = []
     for begin in (start, points):
-        window = StereoWindow(keys, values, (motion,), nothing, seen, begin)
+        window = replace(empty, keys=keys, values=values, motion=(motion,), sightings=seen, points=begin)
         first_step = Evaluated.of(window, CAMERA).linearised().vision.point_steps(np.zeros(6 * POSES))
         for _ in range(6):
             window = solve_window(window, CAMERA, Ending()).window
@@ -138,7 +137,7 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     poses, points, seen = scene
     behind = points.copy()
     behind[0] = transform(RIG.T_imu_cam, np.array([0.0, 0.0, -4.0]))
-    others = seen.of_points(np.arange(1, POINTS))
+    others = Sightings(*(part[seen.point != 0] for part in (seen.pose, seen.point, seen.uv_px)))
     one, other = (Vision.at(poses, behind, s, CAMERA).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
     assert Vision.at(poses, behind, seen, CAMERA).losses.sum() > Vision.at(poses, behind, others, CAMERA).losses.sum()

@@ -31,7 +31,7 @@ from toolkit.models import stereo
 from toolkit.models.factors import B, X
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, MOST_MISMATCHED, chi2_bound
 from toolkit.models.motion import motion_model
-from toolkit.models.stereo_adjustment import Ending, RobustCamera, StereoWindow, TrackedWindow, Vision, solve_window
+from toolkit.models.stereo_adjustment import Ending, RobustCamera, StereoWindow, Vision, solve_window
 from toolkit.sequence import Observations, Sequence
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
@@ -111,23 +111,22 @@ def _adjusted(
     """
     model, camera = motion_model(sequence.noise, sequence.gravity_world), RobustCamera(sequence.rig, _HUBER)
     factors = [model.integrate(motion, guess.bias).factors(k) for k, motion in enumerate(motions, start=1)]
-    tracked = TrackedWindow.empty()
+    window = StereoWindow.empty()
     for k, (frame, own) in enumerate(zip(frames, [_held(sequence, guess), *factors], strict=True)):
         estimate = Estimate(frame.t_ns, guess.T_world_imu[k], v_world=guess.v_world[k], bias=guess.bias)
-        tracked = tracked.extended(model, estimate, own, frame, k, sequence.rig)
-    all_tracks = tracked.track_ids.size
+        window = window.extended(model, estimate, own, frame, k, sequence.rig)
+    all_tracks = window.track_ids.size
     for _ in range(_ROUNDS):
         try:
-            solved = solve_window(tracked.window, camera, _ENDING)
+            solved = solve_window(window, camera, _ENDING)
             cov = solved.cov(0)
         except (EstimatorError, np.linalg.LinAlgError) as refusal:
             raise NoSoundStartError("the adjustment of the first frames has no sound solution") from refusal
         scale2, mismatched = _fit(solved.window, camera)
         if scale2 > _MOST_SIGMAS**2:
             raise NoSoundStartError(f"the tracks scatter by {np.sqrt(scale2):.0f} of their sigmas about any motion")
-        fitting = ~mismatched[solved.window.sightings.point]
-        tracked = replace(tracked, window=solved.window).with_sightings(fitting)
-        if tracked.track_ids.size < (1.0 - MOST_MISMATCHED) * all_tracks:
+        window = solved.window.with_sightings(~mismatched[solved.window.sightings.point])
+        if window.track_ids.size < (1.0 - MOST_MISMATCHED) * all_tracks:
             raise NoSoundStartError("most tracks of the first frames do not fit the motion of the others")
         if not mismatched.any():
             break

@@ -1,10 +1,9 @@
 """The one adjustment of states to stereo tracks: landmarks eliminated, the states solved for, the oldest left out.
 
 A :class:`StereoWindow` is the problem: states, motion factors between them, a linear prior, and sightings of points
-that are no variables. A :class:`TrackedWindow` adds the track id of each point. ``solve_window`` finds its minimum by
-Levenberg-Marquardt and the covariance of each state. The fixed-lag smoother `smart` solves one frame by frame, the
-start and the measurement of noise on stretches of a recording. Everything is dense: a window has a few hundred
-unknowns.
+that are no variables. ``solve_window`` finds its minimum by Levenberg-Marquardt and the covariance of each state. The
+fixed-lag smoother `smart` solves one frame by frame, the start and the measurement of noise on stretches of a
+recording. Everything is dense: a window has a few hundred unknowns.
 
 Each track is a smart factor (Carlone, Kira, Beall, Indelman & Dellaert 2014, "Eliminating conditionally independent
 sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur complement,
@@ -59,11 +58,6 @@ class Sightings:
     pose: IntArray
     point: IntArray
     uv_px: Array
-
-    def of_points(self, points: IntArray) -> "Sightings":
-        """Return the sightings of some points (M,); their row numbers stay."""
-        rows = np.isin(self.point, points)
-        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
 
 
 class ReducedVision(NamedTuple):
@@ -213,17 +207,13 @@ class MarginalPrior:
     vector: Array
     about: gtsam.Values
 
-    @classmethod
-    def nothing(cls) -> "MarginalPrior":
-        """Return a prior without information."""
-        return cls(np.zeros((0, 0)), np.zeros(0), gtsam.Values())
-
 
 @dataclass(frozen=True, eq=False)
 class StereoWindow:
     """States in the order of time: their keys (each [pose, velocity, bias] or [pose, bias]), factors and sightings.
 
-    ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
+    ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings, of the tracks
+    ``track_ids`` (M,).
     """
 
     keys: tuple[tuple[int, ...], ...]
@@ -232,6 +222,14 @@ class StereoWindow:
     prior: MarginalPrior
     sightings: Sightings
     points: Array
+    track_ids: IntArray
+
+    @classmethod
+    def empty(cls) -> "StereoWindow":
+        """Return a window without states."""
+        none, values = np.empty(0, dtype=np.int64), gtsam.Values()
+        prior = MarginalPrior(np.zeros((0, 0)), np.zeros(0), values)
+        return cls((), values, (), prior, Sightings(none, none, np.empty((0, 3))), np.empty((0, 3)), none)
 
     @property
     def poses(self) -> Array:
@@ -248,21 +246,6 @@ class StereoWindow:
         """Return the number of unknowns of one state."""
         return int(self.values.extract(list(self.keys[0])).dim())
 
-
-@dataclass(frozen=True, eq=False)
-class TrackedWindow:
-    """A window and the track ids (M,) of its points."""
-
-    window: StereoWindow
-    track_ids: IntArray
-
-    @classmethod
-    def empty(cls) -> "TrackedWindow":
-        """Return a window without states."""
-        none = np.empty(0, dtype=np.int64)
-        sightings = Sightings(none, none, np.empty((0, 3)))
-        return cls(StereoWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
-
     def extended(
         self,
         model: MotionModel,
@@ -271,66 +254,58 @@ class TrackedWindow:
         frame: StereoFrame,
         k: int,
         rig: StereoRig,
-    ) -> "TrackedWindow":
+    ) -> "StereoWindow":
         """Return the window with state k at an estimate, the factors that tie it, and the frame it sees.
 
         Known tracks continue, new ones are triangulated; new tracks of too small a disparity are left out.
         """
-        values, window = gtsam.Values(self.window.values), self.window
+        values, seen = gtsam.Values(self.values), self.sightings
         model.insert(values, estimate, k)
-        keys = (*window.keys, tuple(model.keys(k)))
-        window = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
-        return replace(self, window=window)._seeing(frame, estimate.T_world_imu, rig)
-
-    def points_by_id(self) -> dict[int, Array]:
-        """Return the point (3,) m of every track."""
-        return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
-
-    def _seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
         known = np.isin(frame.track_ids, self.track_ids)
         new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
         used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
         ids = np.concatenate([self.track_ids, new.track_ids])
-        points = np.concatenate([self.window.points, stereo.triangulate_world(new.uvs_px, T_world_imu, rig)])
         order = np.argsort(ids)
-        rows, seen = order[np.searchsorted(ids, used.track_ids, sorter=order)], self.window.sightings
-        newest = np.full(rows.size, len(self.window.keys) - 1)
-        sightings = Sightings(
-            np.concatenate([seen.pose, newest]),
-            np.concatenate([seen.point, rows]),
-            np.concatenate([seen.uv_px, used.uvs_px]),
+        rows, newest = (
+            order[np.searchsorted(ids, used.track_ids, sorter=order)],
+            np.full(len(used.uvs_px), len(self.keys)),
         )
-        return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
+        return replace(
+            self,
+            keys=(*self.keys, tuple(model.keys(k))),
+            values=values,
+            motion=(*self.motion, factors),
+            points=np.concatenate([self.points, stereo.triangulate_world(new.uvs_px, estimate.T_world_imu, rig)]),
+            track_ids=ids,
+            sightings=Sightings(
+                np.concatenate([seen.pose, newest]),
+                np.concatenate([seen.point, rows]),
+                np.concatenate([seen.uv_px, used.uvs_px]),
+            ),
+        )
+
+    def points_by_id(self) -> dict[int, Array]:
+        """Return the point (3,) m of every track."""
+        return dict(zip(self.track_ids.tolist(), self.points, strict=True))
 
     def newest(self, frame: StereoFrame) -> StereoFrame:
         """Return the newest state's frame without the sightings that are not in the window."""
-        seen = self.window.sightings
-        taken = self.track_ids[seen.point[seen.pose == len(self.window.keys) - 1]]
+        taken = self.track_ids[self.sightings.point[self.sightings.pose == len(self.keys) - 1]]
         return frame.select(np.isin(frame.track_ids, taken))
 
-    def with_sightings(self, kept: BoolArray) -> "TrackedWindow":
+    def with_sightings(self, kept: BoolArray) -> "StereoWindow":
         """Return the window with some of its sightings, a mask (N,), and without points that have none."""
-        seen = self.window.sightings
-        left = Sightings(seen.pose[kept], seen.point[kept], seen.uv_px[kept])
-        return TrackedWindow(replace(self.window, sightings=left), self.track_ids).compacted()
+        seen = self.sightings
+        points, rows = np.unique(seen.point[kept], return_inverse=True)
+        left = Sightings(seen.pose[kept], rows.astype(np.int64), seen.uv_px[kept])
+        return replace(self, points=self.points[points], track_ids=self.track_ids[points], sightings=left)
 
-    def compacted(self) -> "TrackedWindow":
-        """Drop the points without sightings."""
-        seen = self.window.sightings
-        kept, rows = np.unique(seen.point, return_inverse=True)
-        sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px)
-        return TrackedWindow(
-            replace(self.window, points=self.window.points[kept], sightings=sightings), self.track_ids[kept]
-        )
-
-    def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
+    def in_front(self, rig: StereoRig) -> tuple["StereoWindow", IntArray]:
         """Drop the points that are behind a camera that saw them; return the window and the ids (n,) of these."""
-        seen = self.window.sightings
-        in_front = Vision.at(self.window.poses, self.window.points, seen, RobustCamera(rig, None)).in_front
+        seen = self.sightings
+        in_front = Vision.at(self.poses, self.points, seen, RobustCamera(rig, None)).in_front
         behind = np.unique(seen.point[~in_front])
-        if not behind.size:
-            return self, self.track_ids[behind]
-        return self.with_sightings(~np.isin(seen.point, behind)), self.track_ids[behind]
+        return self.with_sightings(~np.isin(seen.point, behind)) if behind.size else self, self.track_ids[behind]
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,9 +325,7 @@ class System:
         """Return the lower Cholesky factor (D, D) with a share of the diagonal added; raises as ``root`` does."""
         if damping == 0.0:
             return self.root
-        damped = self.information.copy()
-        damped.flat[:: len(damped) + 1] *= 1.0 + damping
-        return _lower_factor(damped)
+        return _lower_factor(self.information + damping * np.diag(np.diag(self.information)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,31 +450,26 @@ def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> 
 
 
 def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> StereoWindow:
-    """Marginalise the ``count`` oldest states with every track they saw; the row numbers of other points stay."""
+    """Marginalise the ``count`` oldest states with every track they saw."""
     seen = window.sightings
-    leaving_points = np.unique(seen.point[seen.pose < count])
-    leaving = replace(_with_points(window, leaving_points), motion=window.motion[: count + 1])
+    is_leaving = np.isin(seen.point, seen.point[seen.pose < count])
+    leaving = replace(window.with_sightings(is_leaving), motion=window.motion[: count + 1])
     system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
     root = np.linalg.cholesky(system.information[:gone, :gone])
     across = solve_triangular(root, system.information[:gone, gone:], lower=True)
     information = system.information[gone:, gone:] - across.T @ across
     vector = system.vector[gone:] - across.T @ solve_triangular(root, system.vector[:gone], lower=True)
-    values = gtsam.Values(window.values)
-    for keys in window.keys[:count]:
-        for key in keys:
-            values.erase(key)
-    left = ~np.isin(seen.point, leaving_points)
-    kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
-    prior = MarginalPrior(information, vector, values)
-    motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
-    return StereoWindow(window.keys[count:], values, motion, prior, kept, window.points)
-
-
-def _with_points(window: StereoWindow, points: IntArray) -> StereoWindow:
-    """Return the window with some points (M,), by their ascending rows, and their sightings."""
-    seen = window.sightings.of_points(points)
-    rows = np.searchsorted(points, seen.point).astype(np.int64)
-    return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
+    left, values = window.with_sightings(~is_leaving), gtsam.Values(window.values)
+    for key in (key for keys in window.keys[:count] for key in keys):
+        values.erase(key)
+    return replace(
+        left,
+        keys=window.keys[count:],
+        values=values,
+        motion=(gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :]),
+        prior=MarginalPrior(information, vector, values),
+        sightings=replace(left.sightings, pose=left.sightings.pose - count),
+    )
 
 
 class _DescentStep(NamedTuple):

@@ -27,7 +27,6 @@ from toolkit.models.stereo_adjustment import (
     Evaluated,
     RobustCamera,
     StereoWindow,
-    TrackedWindow,
     Vision,
     solve_window,
 )
@@ -70,12 +69,12 @@ class Stretch:
 
         Raises EstimatorError where the measurements do not determine the states.
         """
-        tracked, model = TrackedWindow.empty(), motion_model(noise, self.gravity_world)
+        window, model = StereoWindow.empty(), motion_model(noise, self.gravity_world)
         for packet, state in zip(self.packets, self.start, strict=True):
             estimate, nothing = state.estimate(packet.frame.t_ns), gtsam.NonlinearFactorGraph()
-            tracked = tracked.extended(model, estimate, nothing, packet.frame, packet.index, rig)
-        tracked, _ = tracked.in_front(rig)
-        return self._solved(tracked.window, model, rig)
+            window = window.extended(model, estimate, nothing, packet.frame, packet.index, rig)
+        window, _ = window.in_front(rig)
+        return self._solved(window, model, rig)
 
     def adjusted_again(self, before: "Adjusted", rig: StereoRig, noise: MotionNoise) -> "Adjusted":
         """Return the stretch adjusted under another noise, by the sightings that were sound, from the solution before.
@@ -180,7 +179,7 @@ class Adjusted:
         vision, seen = self.vision, self.window.sightings
         bound = chi2_bound(stereo.degrees_of_freedom(seen.uv_px), SOUND)
         sound = (np.square(vision.whitened).sum(axis=1) < bound) & vision.in_front
-        return TrackedWindow(self.window, np.arange(len(self.window.points))).with_sightings(sound).window
+        return self.window.with_sightings(sound)
 
     def residuals(self, fewest_sightings: int) -> SoundResiduals:
         """Return the residuals of the plausible sightings of tracks with ``fewest_sightings`` or more of them."""
