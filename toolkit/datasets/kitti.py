@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,6 +43,7 @@ from toolkit.datasets.io.image_pairs import (
     seen_in,
 )
 from toolkit.datasets.trajectories import read_poses
+from toolkit.datasets.trajectories.formats import read_rows
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified
@@ -181,6 +181,18 @@ def _rectified_pair(file: Path, names: list[str], P: tuple[Array, Array], size_p
     return already_rectified(pinhole_of(left), baseline_m, size_px)
 
 
+def _calibration(file: Path, where: str) -> Fields:
+    """Read rows of numbers with a name, else P0, P1, ...; what is no number, such as a date, is left out."""
+    if not file.exists():
+        raise DataError(f"{file}: is missing; {where}")
+    arrays: dict[str, np.ndarray] = {}
+    for line in read_text_input(file, "KITTI's calibration is text").splitlines():
+        key, colon, rest = line.rpartition(":")
+        with suppress(ValueError):
+            arrays[key.strip() if colon else f"P{len(arrays)}"] = np.array([float(word) for word in rest.split()])
+    return Fields(file, arrays)
+
+
 # Odometry sequences: calib.txt, times.txt, poses ---------------------------------------------------------------------
 
 _PERIOD_S = 0.1
@@ -197,8 +209,14 @@ def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
 
     Images without motion samples have nothing else that would contradict a calibration of images half as large.
     """
-    file, names = layout.root / "calib.txt", [f"P{row}" for row in _rows(layout)]
-    left, right = _projections(file, names)
+    file, rows = layout.root / "calib.txt", (2, 3) if layout.left.name == "image_2" else (0, 1)
+    names = [f"P{row}" for row in rows]
+    fields = _calibration(file, "put the calib.txt of this sequence there, with the rows P0: to P3:")
+    projections = {name: row for name, row in fields.arrays.items() if row.size == 12}
+    if lacking := [name for name in names if name not in projections]:
+        there = ", ".join(projections) or "none"
+        raise DataError(f"{file}: missing {', '.join(lacking)}, twelve numbers each; it has {there}")
+    left, right = (fields.array(name, 12).reshape(3, 4) for name in names)
     pair = _rectified_pair(file, names, (left, right), size_px)
     centre, size = f"{pair.cx_px:g} {pair.cy_px:g}", f"{size_px[0]}x{size_px[1]} px"
     places = [c / length for c, length in zip((pair.cx_px, pair.cy_px), size_px, strict=True)]
@@ -216,40 +234,11 @@ def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
     return _Mounted(pair, T_FLU_CAM @ T_cam0_left, facts if is_aside else ())
 
 
-def _rows(layout: _Layout) -> tuple[int, int]:
-    """Return the rows of calib.txt of both cameras."""
-    return (2, 3) if layout.left.name == "image_2" else (0, 1)
-
-
-def _projections(file: Path, wanted: list[str]) -> tuple[Array, Array]:
-    """Return two projections (3, 4) from calib.txt, whose rows may or may not be named P0, P1, ..."""
-    if not file.exists():
-        raise DataError(f"{file}: is missing; put the calib.txt of this sequence there, with the rows P0: to P3:")
-    rows: dict[str, Array] = {}
-    for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
-        name, colon, rest = line.partition(":")
-        columns = (rest if colon else line).split()
-        try:
-            values = np.array([float(word) for word in columns])
-        except ValueError as error:
-            raise DataError(
-                f"{file}: line {number}: {error}; KITTI odometry's calib.txt has P0: to P3:, twelve numbers each"
-            ) from error
-        if values.size == 12:
-            rows[name.strip() if colon else f"P{len(rows)}"] = values.reshape(3, 4)
-    missing = [name for name in wanted if name not in rows]
-    if missing:
-        raise DataError(
-            f"{file}: missing {', '.join(missing)}, twelve numbers each; it has {', '.join(rows) or 'none'}"
-        )
-    return rows[wanted[0]], rows[wanted[1]]
-
-
 def _listed_by_number(layout: _Layout) -> Listed:
     stamps = _times(layout)[0]
     listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
     if not listed.pairs:
-        numbers = _numbers(layout)
+        numbers = sorted(numbered(layout.left))
         if not numbers:
             name = images_in(layout.left)[0].name
             raise DataError(f"{layout.left}: {name} has no number; name the images of an instant alike, as 000000.png")
@@ -267,26 +256,13 @@ def _times(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:
     if not is_regular(file):
         period_ns = round(_PERIOD_S * NS_PER_S)
         return period_ns * np.arange(_count(layout)), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
-    lines = read_text_input(file, "times.txt is text").splitlines()
-    seconds = [_seconds(file, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
-    return stamps_ns(file, "stamp", np.array(seconds, dtype=np.float64)), ()
-
-
-def _seconds(file: Path, number: int, line: str) -> float:
-    try:
-        return float(line)
-    except ValueError as error:
-        raise DataError(f"{file}: line {number} is {line.strip()!r}; expected one number a line, in seconds") from error
-
-
-def _numbers(layout: _Layout) -> list[int]:
-    """Return the numbers of the left images, in order."""
-    return sorted(numbered(layout.left))
+    rows = read_rows(file, "times.txt has one number a line, in seconds")
+    return stamps_ns(file, "stamp", rows.numbers(1, "one number a line, in seconds")[:, 0]), ()
 
 
 def _count(layout: _Layout) -> int:
     """Return how many images the sequence has, by the last number, for some may be missing."""
-    return max(_numbers(layout), default=-1) + 1
+    return max(numbered(layout.left), default=-1) + 1
 
 
 def _assumed_motion(layout: _Layout, t_ns: IntArray) -> _Moved:
@@ -331,12 +307,12 @@ _IMU_NOISE = ImuNoise(
 _CAMERAS, _VELO, _IMU = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
 _LARGEST_ANGLE_RAD = 2.0 * np.pi
 _VALUES = 30
-# Where in a packet stand: latitude, longitude (deg), altitude (m); roll, pitch, yaw (rad); north, east, up (m/s).
-_PLACE, _ANGLES, _NORTH_EAST_UP = slice(0, 3), slice(3, 6), [6, 7, 10]
+# Where in a packet stand: latitude, longitude (deg), altitude (m); roll, pitch, yaw (rad); east, north, up (m/s).
+_PLACE, _ANGLES, _EAST_NORTH_UP = slice(0, 3), slice(3, 6), [7, 6, 10]
 # Of the body: specific force (m/s^2) and rates (rad/s).
 _ACCEL, _RATES = slice(11, 14), slice(17, 20)
 _EARTH_RADIUS_M = 6378137.0
-_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
+_STAMP = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?")
 
 
 def _listed_by_stamps(layout: _Layout) -> Listed:
@@ -359,23 +335,24 @@ def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
     if packets is None:
         how = "no oxts: no motion input, all estimators assume smooth motion"
         return _Moved(NoSamples(frames_t_ns), unmeasured_motion(), None, (how,))
-    check_one_clock(layout.root, frames_t_ns, packets.t_ns, "the oxts packets")
-    alone = (f"{packets.alone} oxts packets lack their file or their stamp and are left out",) if packets.alone else ()
-    t_ns, first = np.unique(packets.t_ns, return_index=True)
-    truth = Truth(t_ns, packets.T_world_imu[first], packets.v_world[first], independent=False)
-    rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(packets.t_ns))))
+    t_ns, values, alone = packets
+    check_one_clock(layout.root, frames_t_ns, t_ns, "the oxts packets")
+    facts = (f"{alone} oxts packets lack their file or their stamp and are left out",) if alone else ()
+    # The world is east, north, up from the first place; the body forward, left, up.
+    R_world_imu, v_world, w_radps = _attitudes(values[:, _ANGLES]), values[:, _EAST_NORTH_UP], values[:, _RATES]
+    stamps, first = np.unique(t_ns, return_index=True)
+    truth = Truth(stamps, se3(R_world_imu, _positions(values[:, _PLACE]))[first], v_world[first], independent=False)
+    rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(t_ns))))
     if rate_hz >= _IMU_FROM_HZ:
         how = f"the oxts packets, {rate_hz:.0f} a second, are read as an IMU"
-        samples = ImuSamples(packets.t_ns, packets.accel_mps2, packets.w_radps)
-        return _Moved(samples, _IMU_NOISE, truth, (how, *alone))
+        return _Moved(ImuSamples(t_ns, values[:, _ACCEL], w_radps), _IMU_NOISE, truth, (how, *facts))
     how = f"the oxts packets, {rate_hz:.0f} a second, are too few for an IMU and read as body twists"
-    v_mps, w_radps = packets.v_body_mps, packets.w_radps
-    noise = twist_noise(packets.t_ns, v_mps, w_radps)
-    return _Moved(TwistSamples(packets.t_ns, v_mps, w_radps), noise, truth, (how, *alone))
+    v_mps = np.einsum("nji,nj->ni", R_world_imu, v_world)
+    noise = twist_noise(t_ns, v_mps, w_radps)
+    return _Moved(TwistSamples(t_ns, v_mps, w_radps), noise, truth, (how, *facts))
 
 
-@dataclass(frozen=True, eq=False)
-class _Day:
+class _Day(NamedTuple):
     """The three files of a drive's day: all cameras, the laser scanner in camera 0, and the IMU in the scanner."""
 
     cameras: Fields
@@ -384,28 +361,12 @@ class _Day:
 
 
 def _day_of(root: Path) -> _Day:
-    """Read the three files of a drive's day, in its folder or the one above it.
-
-    Raises DataError where one is missing or no text.
-    """
     folder = next((f for f in (root, root.parent) if is_regular(f / _CAMERAS)), root.parent)
-    return _Day(*(_calibration(folder / name) for name in (_CAMERAS, _VELO, _IMU)))
-
-
-def _calibration(file: Path) -> Fields:
-    """Read a file of names and numbers; entries that are no numbers, such as dates, are left out."""
-    if not file.exists():
-        raise DataError(
-            f"{file}: is missing; the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} "
-            "into the folder of the day or of the drive"
-        )
-    arrays: dict[str, np.ndarray] = {}
-    for line in read_text_input(file, "KITTI's calibration is text").splitlines():
-        key, colon, rest = line.partition(":")
-        with suppress(ValueError):
-            if colon:
-                arrays[key.strip()] = np.array([float(word) for word in rest.split()])
-    return Fields(file, arrays)
+    where = (
+        f"the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} into the folder of the "
+        "day or of the drive"
+    )
+    return _Day(*(_calibration(folder / name, where) for name in (_CAMERAS, _VELO, _IMU)))
 
 
 def _of_the_day(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
@@ -463,31 +424,10 @@ def _rigid_motion(fields: Fields, suffix: str = "") -> Array:
     return rigid(fields.path, f"R{suffix}", se3(rotation, fields.constant(f"T{suffix}", 3)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Packets:
-    """Packets (S,) in the order of their files: poses (S, 4, 4), velocities, specific force and rates (S, 3).
+def _read_packets(folder: Path) -> tuple[IntArray, Array, int] | None:
+    """Return the stamps (S,) ns of packets, their values (S, 30), and how many lack their file or their stamp.
 
-    The world is east, north, up from the first place; the body forward, left, up. ``alone`` is how many packets have a
-    file and no stamp, or a stamp and no file.
-    """
-
-    t_ns: IntArray
-    T_world_imu: Array
-    v_world: Array
-    accel_mps2: Array
-    w_radps: Array
-    alone: int
-
-    @property
-    def v_body_mps(self) -> Array:
-        """Return the velocities (S, 3) in the body's axes."""
-        return np.asarray(np.einsum("nji,nj->ni", self.T_world_imu[:, :3, :3], self.v_world))
-
-
-def _read_packets(folder: Path) -> _Packets | None:
-    """Read the packets that have a stamp; None where there is no such folder.
-
-    Raises DataError, naming the file, where one does not hold thirty finite numbers.
+    They are in the order of their files; None where there is no such folder.
     """
     if not folder.is_dir():
         return None
@@ -496,43 +436,26 @@ def _read_packets(folder: Path) -> _Packets | None:
     numbers = sorted(files.keys() & stamps.keys())
     if len(numbers) < 2:
         raise DataError(f"{folder}: {len(numbers)} packets with a stamp; copy oxts/data and oxts/timestamps.txt again")
-    rows = np.stack([_packet(files[number]) for number in numbers])
-    north, east, up = rows[:, _NORTH_EAST_UP].T
-    return _Packets(
-        np.array([stamps[number] for number in numbers], dtype=np.int64),
-        se3(_attitudes(rows[:, _ANGLES]), _positions(rows[:, _PLACE])),
-        np.stack([east, north, up], axis=1),
-        rows[:, _ACCEL],
-        rows[:, _RATES],
-        len(files.keys() ^ stamps.keys()),
-    )
+    t_ns = np.array([stamps[number] for number in numbers], dtype=np.int64)
+    return t_ns, np.stack([_packet(files[number]) for number in numbers]), len(files.keys() ^ stamps.keys())
 
 
 def _read_stamps(file: Path) -> dict[int, int]:
-    """Return the stamp (ns) of each row number of a timestamps.txt; blank rows, as unsynced drives have, have none.
-
-    Raises DataError, naming the line, where one is no date and time.
-    """
+    """Return the stamp (ns) of each row number of a timestamps.txt; blank rows, as unsynced drives have, have none."""
     stamps = {}
     for row, line in enumerate(read_text_input(file, "expected a date and time in each line").splitlines()):
-        if not line.strip():
+        text = line.strip().replace(" ", "T")
+        if not text:
             continue
         try:
-            stamps[row] = _stamp_ns(line.strip())
+            stamps[row] = int(np.datetime64(text if _STAMP.fullmatch(text) else "no stamp", "ns").astype(np.int64))
         except ValueError as error:
             raise DataError(
-                f"{file}: line {row + 1} is no date and time; write it as in 2011-09-26 13:02:25.96"
+                f"{file}: line {row + 1} is no date and time; write it as 2011-09-26 13:02:25.96"
             ) from error
     if not stamps:
         raise DataError(f"{file}: holds no stamps; copy it again")
     return stamps
-
-
-def _stamp_ns(stamp_text: str) -> int:
-    """Return the nanoseconds since 1970 of a date and time; raises ValueError where it is none."""
-    if not _STAMP.fullmatch(stamp_text):
-        raise ValueError(stamp_text)
-    return int(np.datetime64(stamp_text.replace(" ", "T"), "ns").astype(np.int64))
 
 
 def _packet(file: Path) -> Array:
