@@ -184,10 +184,10 @@ def wrong_frame(arrays: dict[str, Any]) -> None:
 
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no arrays": (lambda f: (f / "recording.npz").unlink(), "No such file"),
-    "text cut short": (lambda f: (f / "recording.json").write_text('{"schema": "vislam'), "not JSON"),
-    "text is a list": (lambda f: (f / "recording.json").write_text("[]"), "schema is None"),
+    "text cut short": (lambda f: (f / "recording.json").write_text('{"schema": "vislam'), "cannot be read as JSON"),
+    "text is a list": (lambda f: (f / "recording.json").write_text("[]"), "has not the schema"),
     "later schema": (edit_text(lambda t: t.update(schema="vislam.recording/9")), "vislam.recording/9"),
-    "no rig": (edit_text(lambda t: t.pop("rig")), "rig is missing"),
+    "no rig": (edit_text(lambda t: t.pop("rig")), "lacks `?rig"),
     "focal length beyond any": (edit_text(lambda t: t["rig"].update(fx_px=10**400)), "does not fit"),
     "extrinsic is 3x3": (edit_text(lambda t: t["rig"].update(T_imu_cam=np.eye(3).tolist())), "T_imu_cam"),
     "unknown motion": (edit_text(lambda t: t["motion"].update(kind="gps")), "gps"),
@@ -212,7 +212,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "observation of no frame": (edit_arrays(wrong_frame), "is of frame 99"),
     "facts that are no text": (
         edit_text(lambda t: t["provenance"].update(facts=[3])),
-        "provenance contains a value that is not text",
+        "provenance.facts.0.: expected string",
     ),
     "imaginary part": (edit_arrays(lambda a: a.update(motion_values=a["motion_values"] * 1j)), "holds complex128"),
     "start without a covariance": (edit_arrays(lambda a: a.update(prior_cov=-a["prior_cov"])), "not positive definite"),
