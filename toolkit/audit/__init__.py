@@ -6,8 +6,8 @@
 ``tracks.no_disparity``, the smallest, and ``tracks.stale_frames`` and ``conventions.mixed_axes``, which repair.
 
 The kinds share ``intervals`` (both motions from frame to frame), ``one_step`` (residuals of the tracks),
-``alignment`` (a regression of the camera's translation), ``self_calibration`` (an adjustment whose equations are in
-``bundle``), ``clocks`` and ``robust`` (statistics).
+``alignment`` (a regression of the camera's translation), ``self_calibration`` (an adjustment), ``clocks`` and
+``robust`` (statistics).
 
 Faults report values that are impossible, so that NumPy's warnings about them are not shown.
 """

@@ -16,7 +16,6 @@ from toolkit.audit.alignment import (
     share_of_way,
     turn_by_rotations,
 )
-from toolkit.audit.bundle import BASELINE, GYRO_BIAS, LATE, RIGHT_ROLL, RIGHT_SHIFT, TURN
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
     LEAST_INTERVALS,
@@ -28,7 +27,17 @@ from toolkit.audit.intervals import (
 )
 from toolkit.audit.one_step import errors_are_independent, own_one_step_px
 from toolkit.audit.robust import Scalar, median_error, slope
-from toolkit.audit.self_calibration import RIGHT_SIGMAS, SelfCalibration, self_calibration
+from toolkit.audit.self_calibration import (
+    BASELINE,
+    GYRO_BIAS,
+    LATE,
+    RIGHT_ROLL,
+    RIGHT_SHIFT,
+    RIGHT_SIGMAS,
+    TURN,
+    SelfCalibration,
+    self_calibration,
+)
 from toolkit.geometry import Array, BoolArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import MotionKind, Prior, StereoRig, is_measured
@@ -38,7 +47,7 @@ from toolkit.sequence import Sequence
 
 
 class Judged(NamedTuple):
-    """A parameter of the self-calibration that is judged: its rows of `bundle`, and what to check where it is wrong.
+    """A parameter of the self-calibration that is judged: its rows, and what to check where it is wrong.
 
     ``limits`` are those of sound recordings, beyond the standard errors, and ``hidden`` the sizes from which on an
     error that would not show is reported as ``unseen``, both by the kind of motion; without a limit it is not judged.

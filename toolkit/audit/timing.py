@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.bundle import CHANGE, LATE
 from toolkit.audit.clocks import LAG, camera_offset, change_of_offset, is_stamped_at_frames, least_change_s
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import LEAST_INTERVALS, Intervals, is_comparable, stated_densities, usual_step_s
 from toolkit.audit.robust import LEAST_SPREAD_V, Scalar, cauchy, mean_in_sigmas, slope
-from toolkit.audit.self_calibration import self_calibration
+from toolkit.audit.self_calibration import CHANGE, LATE, self_calibration
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
