@@ -48,14 +48,11 @@ def disagreement(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     """Report tracks that do not follow the measured motion after all repairs."""
     found = evidence.agreement
     findings = [*_direction(intervals), *_ratios(evidence.sequence, intervals)]
-    if found.residual_px > found.limit_px or found.own_px > found.limit_px or findings:
-        findings.append(
-            f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion "
-            f"(median; noise explains {found.limit_px:.2f} px at most) and {found.own_px:.2f} px against the camera "
-            "motion that fits them best"
-        )
-    if not findings:
+    if not (found.residual_px > found.limit_px or found.own_px > found.limit_px or findings):
         return None
+    residuals = f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion"
+    explained = f"(median; noise explains {found.limit_px:.2f} px at most)"
+    findings.append(f"{residuals} {explained} and {found.own_px:.2f} px against the camera motion that fits them best")
     treatment = "T_imu_cam, the intrinsics, the baseline or the samples are wrong: check them"
     if found.own_px > found.limit_px:
         treatment = "the intrinsics or the tracks themselves are wrong: check K and the pixels"
@@ -167,12 +164,12 @@ def conflict(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | 
         f"{span.begin_s:.0f}-{span.end_s:.0f} s (by {span.size:.2g} {deviation.unit} of {deviation.what})"
         for deviation, span in sorted(found, key=lambda one: one[1].begin_s)
     )
-    spans_ns = (np.rint(np.array(span[:2]) * NS_PER_S).astype(int) + int(sequence.frames_t_ns[0]) for _, span in found)
+    spans_ns = np.rint(np.array([span[:2] for _, span in found]) * NS_PER_S).astype(int) + sequence.frames_t_ns[0]
     return Symptom.warning(
-        count=len(found),
-        detail=f"vision and {samples} disagree at {where}",
-        treatment="moving objects or wrong samples: do not rely on any estimate from there on",
-        spans_ns=tuple((int(begin), int(end)) for begin, end in spans_ns),
+        f"vision and {samples} disagree at {where}",
+        "moving objects or wrong samples: do not rely on any estimate from there on",
+        len(found),
+        tuple((int(begin), int(end)) for begin, end in spans_ns),
     )
 
 
@@ -185,11 +182,17 @@ def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ..
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     t_s = 0.5 * (frame_s[intervals.interval] + frame_s[intervals.interval + 1])
     w_radps = intervals.w_radps - intervals.bias_radps
-    rotation = _of_medians("rate of rotation", "rad/s", t_s, w_radps - intervals.w_seen_radps)
+
+    def of_medians(what: str, unit: str, value: Array) -> Deviation:
+        # Changes between intervals, which lasting deviations do not raise, show the scatter.
+        scatter = MAD_TO_SIGMA * np.median(np.abs(np.diff(value, axis=0)), axis=0) / np.sqrt(2.0)
+        return Deviation(what, unit, t_s, value, MEDIAN_TO_MEAN_ERROR * scatter, telescopes=False)
+
+    rotation = of_medians("rate of rotation", "rad/s", w_radps - intervals.w_seen_radps)
     if intervals.v_mps is None:
         return rotation, _specific_force(sequence, evidence.camera_motion, evidence.force_beside_camera)
     v_mps = intervals.v_mps + np.cross(w_radps, intervals.T_imu_cam[:3, 3]) - intervals.v_seen_mps
-    return rotation, _of_medians("velocity", "m/s", t_s, v_mps)
+    return rotation, of_medians("velocity", "m/s", v_mps)
 
 
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
@@ -201,16 +204,21 @@ def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
     """
     if deviation.t_s.size < LEAST_IN_STRETCH:
         return []
-    stretches = _stretches(deviation)
-    if not stretches.centre_s.size:
+    centre_s, mean, noise = _stretches(deviation)
+    if not centre_s.size:
         return []
-    noise = stretches.noise
-    if np.ptp(stretches.centre_s) > LEAST_STRETCHES * STRETCH_S:
+    if np.ptp(centre_s) > LEAST_STRETCHES * STRETCH_S:
         # A fault that begins in the middle and lasts to the end must not raise the usual scatter.
-        first, second = (_scatter_of_means(half) for half in np.array_split(stretches.mean, 2))
+        first, second = (_scatter_of_means(half) for half in np.array_split(mean, 2))
         noise = np.maximum(noise, np.minimum(first, second))
-    improbable = np.linalg.norm(stretches.mean / noise, axis=1) > sigmas
-    return _spans(stretches, np.asarray(improbable & (np.linalg.norm(stretches.mean, axis=1) > least)))
+    size, spans = np.linalg.norm(mean, axis=1), list[Span]()
+    for row in np.flatnonzero((np.linalg.norm(mean / noise, axis=1) > sigmas) & (size > least)).tolist():
+        # A stretch stands for its middle half; those that overlap are joined.
+        span = Span(float(centre_s[row]) - 0.25 * STRETCH_S, float(centre_s[row]) + 0.25 * STRETCH_S, float(size[row]))
+        if spans and span.begin_s <= spans[-1].end_s:
+            span = Span(spans[-1].begin_s, span.end_s, max(spans.pop().size, span.size))
+        spans.append(span)
+    return spans
 
 
 def _scatter_of_means(mean: Array) -> Array:
@@ -219,16 +227,11 @@ def _scatter_of_means(mean: Array) -> Array:
     return np.asarray(np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
 
 
-class _Stretches(NamedTuple):
-    """Centres (m,) s of the stretches, the means (m, 3) of a deviation in them and the noise (m, 3) of those."""
+def _stretches(deviation: Deviation) -> tuple[Array, Array, Array]:
+    """Average a deviation over every stretch that begins with one of its intervals and is whole.
 
-    centre_s: Array
-    mean: Array
-    noise: Array
-
-
-def _stretches(deviation: Deviation) -> _Stretches:
-    """Average a deviation over every stretch that begins with one of its intervals and is whole."""
+    Return the centres (m,) s of the stretches, the means (m, 3) in them and the noise (m, 3) of those.
+    """
     t_s, value = deviation.t_s, deviation.value
     begin = np.flatnonzero(t_s + STRETCH_S <= t_s[-1:] + 1e-9)
     end = np.searchsorted(t_s, t_s[begin] + STRETCH_S)
@@ -243,30 +246,7 @@ def _stretches(deviation: Deviation) -> _Stretches:
     average = partial(np.mean, axis=0) if deviation.telescopes else median
     mean = np.array([average(of_one) for of_one in of_stretches]).reshape(-1, 3)
     noise = deviation.noise / (count if deviation.telescopes else np.sqrt(count))
-    return _Stretches(0.5 * (t_s[begin] + t_s[end - 1]), mean, noise)
-
-
-def _spans(stretches: _Stretches, deviates: BoolArray) -> list[Span]:
-    """Join stretches that deviate and overlap; each stands for its middle half, from a quarter to three quarters."""
-    spans: list[Span] = []
-    size = np.linalg.norm(stretches.mean, axis=1)
-    for row in np.flatnonzero(deviates).tolist():
-        centre_s, here = float(stretches.centre_s[row]), float(size[row])
-        span = Span(centre_s - 0.25 * STRETCH_S, centre_s + 0.25 * STRETCH_S, here)
-        if spans and span.begin_s <= spans[-1].end_s:
-            span = Span(spans[-1].begin_s, span.end_s, max(spans.pop().size, here))
-        spans.append(span)
-    return spans
-
-
-def _of_medians(what: str, unit: str, t_s: Array, value: Array) -> Deviation:
-    return Deviation(what, unit, t_s, value, MEDIAN_TO_MEAN_ERROR * _scatter(value), telescopes=False)
-
-
-def _scatter(value: Array) -> Array:
-    """Return the standard deviation (3,) from changes between intervals, which lasting deviations do not raise."""
-    change = np.abs(np.diff(value, axis=0))
-    return np.asarray(MAD_TO_SIGMA * np.median(change, axis=0) / np.sqrt(2.0))
+    return 0.5 * (t_s[begin] + t_s[end - 1]), mean, noise
 
 
 def _specific_force(sequence: Sequence, camera: CameraMotion, found: ForceBesideCamera) -> Deviation:
@@ -341,27 +321,18 @@ def scale_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     level = LEVEL / (STRETCHES + 1 - 2 * LEAST_STRETCHES_ASIDE)
     sigmas = float(stdtrit(STRETCHES - 2, 1.0 - 0.5 * level))
     least = max(SYSTEMATIC, sigmas * step.error)
+    hidden = least + abs(step.value)
     if abs(step.value) < least:
-        return _hidden_step(step, least + abs(step.value))
+        wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as in drives without faults"
+        unseen = f"the odometry's scale changes {wanders}: a step by less than {100.0 * hidden:.0f} % would not show"
+        return Undecided(unseen) if hidden >= LARGEST_HIDDEN_STEP else None
     frame = intervals.interval[fast][np.argmax(np.arange(len(ratio)) * STRETCHES // len(ratio) == after)]
     at_s = (evidence.sequence.frames_t_ns[frame] - evidence.sequence.frames_t_ns[0]) / NS_PER_S
+    size = f"{100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} %"
     return Symptom.warning(
-        detail=(
-            f"from about {at_s:.0f} s on the odometry's speed relative to the camera's is "
-            f"{100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} % "
-            f"{'higher' if step.value > 0.0 else 'lower'} than before"
-        ),
-        treatment="wheels, their scale or depths have changed: no constant scale corrects the recording",
-    )
-
-
-def _hidden_step(step: Scalar, hidden: float) -> Undecided | None:
-    """Return the size of a step that variations of the scale may hide, where it is larger than LARGEST_HIDDEN_STEP."""
-    if hidden < LARGEST_HIDDEN_STEP:
-        return None
-    wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as in drives without faults"
-    return Undecided(
-        f"the odometry's scale changes {wanders}: a step by less than {100.0 * hidden:.0f} % would not show"
+        f"from about {at_s:.0f} s on the odometry's speed relative to the camera's is {size} "
+        f"{'higher' if step.value > 0.0 else 'lower'} than before",
+        "wheels, their scale or depths have changed: no constant scale corrects the recording",
     )
 
 
@@ -405,9 +376,12 @@ def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     middle_ns, v_mps = evidence.force_beside_camera.middle_ns, evidence.force_beside_camera.gravity_mps
     t_s, known = (middle_ns - sequence.frames_t_ns[0]) / NS_PER_S, evidence.camera_motion.known
-    steps = {share: _gravity_step(t_s, v_mps, known, share * sequence.duration_s) for share in CUTS}
-    found = {share: step for share, step in steps.items() if step is not None}
-    gravity = float(np.linalg.norm(sequence.gravity_world))
+    gravity, found = float(np.linalg.norm(sequence.gravity_world)), dict[float, Scalar]()
+    for share in CUTS:
+        sides = t_s < share * sequence.duration_s, t_s >= share * sequence.duration_s
+        before, after = (_gravity(t_s, v_mps, known & side) for side in sides)
+        if before is not None and after is not None:
+            found[share] = Scalar(after.value - before.value, float(np.hypot(before.error, after.error)))
     if not found:
         return Undecided("too few intervals whose camera motion is known, to estimate gravity before and after")
     share, step = max(found.items(), key=lambda one: abs(one[1].value) / one[1].error)
@@ -419,20 +393,10 @@ def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
         unseen = Undecided(f"a change by less than {hidden:.0%} of the gravity that it reads would not show")
         return None if hidden < LARGEST_HIDDEN_GRAVITY else unseen
     return Symptom.warning(
-        detail=(
-            f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
-            f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before"
-        ),
-        treatment="its range or its scale have changed, or it was knocked: no constant bias describes the recording",
+        f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
+        f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before",
+        "its range or its scale have changed, or it was knocked: no constant bias describes the recording",
     )
-
-
-def _gravity_step(t_s: Array, fallen: Array, known: BoolArray, at_s: float) -> Scalar | None:
-    """Return how much more gravity (m/s^2) is read after a time than before it; None where one of both is not known."""
-    before, after = _gravity(t_s, fallen, known & (t_s < at_s)), _gravity(t_s, fallen, known & (t_s >= at_s))
-    if before is None or after is None:
-        return None
-    return Scalar(after.value - before.value, float(np.hypot(before.error, after.error)))
 
 
 def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
@@ -506,23 +470,14 @@ def image_jump(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
         return Undecided(
             f"the camera jumps at {', '.join(places)}, and its velocity does not show whether the change is permanent"
         )
-    return Symptom.warning(
-        count=len(stay),
-        detail=f"the image jumps, and not the vehicle, at {', '.join(places)}",
-        treatment="the camera was knocked or the image was cropped anew: cut the recording there",
-    )
+    treatment = "the camera was knocked or the image was cropped anew: cut the recording there"
+    return Symptom.warning(f"the image jumps, and not the vehicle, at {', '.join(places)}", treatment, len(stay))
 
 
 def _stays(intervals: Intervals, k: int, turn_rad: Array) -> bool:
     """Say whether the camera's velocity is rotated by that angle after interval ``k``; True with an IMU."""
     if intervals.v_mps is None:
         return True
-    share = _share_that_stays(intervals, k, turn_rad)
-    return share is not None and max(SHARE[0], STAYS_SIGMAS * share.error) < share.value < SHARE[1]
-
-
-def _share_that_stays(intervals: Intervals, k: int, turn_rad: Array) -> Scalar | None:
-    """Return the share of a rotation by which the camera's velocity is rotated after interval k and not before."""
     deviation = intervals.v_measured_mps - intervals.v_seen_mps
     expected = np.cross(turn_rad, intervals.v_seen_mps)  # if the camera is rotated by it against its extrinsic
     size = np.sum(expected**2, axis=1)
@@ -530,6 +485,6 @@ def _share_that_stays(intervals: Intervals, k: int, turn_rad: Array) -> Scalar |
     shares = np.sum(deviation * expected, axis=1) / np.maximum(size, 1e-12)
     one, other = shares[before, None], shares[after, None]
     if min(len(one), len(other)) < LEAST_AROUND:
-        return None
+        return False
     error = float(np.hypot(median_error(one)[0], median_error(other)[0]))
-    return Scalar(float(np.median(other) - np.median(one)), error)
+    return max(SHARE[0], STAYS_SIGMAS * error) < float(np.median(other) - np.median(one)) < SHARE[1]

@@ -9,7 +9,6 @@ from toolkit.audit.alignment import (
     MOST_SIGMAS,
     SYSTEMATIC_RAD,
     Position,
-    Turn,
     VelocityFit,
     is_there,
     metres,
@@ -38,7 +37,7 @@ from toolkit.audit.self_calibration import (
     SelfCalibration,
     self_calibration,
 )
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import MotionKind, Prior, StereoRig, is_measured
 from toolkit.models.camera_motion import CameraMotion, camera_motion
@@ -206,7 +205,10 @@ def intrinsics(evidence: Evidence) -> Symptom | None:
         return None
     low, high = np.quantile(uv_px[:, [0, 2]], RANGE, axis=0)
     if np.abs([low, high]).max() < NORMALISED and sequence.rig.fx_px > NORMALISED:
-        return _normalised(sequence.rig, low, high)
+        u, v = (f"{a:.2g} to {b:.2g}" for a, b in zip(low, high, strict=True))
+        pixels = f"not pixels of fx_px = {sequence.rig.fx_px:g}: normalised image coordinates"
+        why = "write fx_px u + cx_px and fy_px v + cy_px for them"
+        return Symptom(1, f"the sightings, u {u} and v {v}, are {pixels}", why, remedy=None, spoils_vision=True)
     faults = _suspects(sequence.rig, low, high)
     if not faults:
         return None
@@ -218,28 +220,12 @@ def intrinsics(evidence: Evidence) -> Symptom | None:
     other_px = _own_px(tried, camera_motion(tried))
     if not given_px * (1.0 - LEAST_GAIN) > other_px:
         return None
-    return Symptom(
-        count=len(faults),
-        detail=(
-            f"{'; '.join(summary for _, summary in faults)}: the tracks' residuals against the best-fitting camera "
-            f"motion are {given_px:.2f} px, and {other_px:.2f} px with typical values"
-        ),
-        treatment="the true values are not in the data: correct K, or the pixels",
-        remedy=None,
-        spoils_vision=True,
+    residuals = (
+        f"the tracks' residuals against the best-fitting camera motion are {given_px:.2f} px, and {other_px:.2f} px"
     )
-
-
-def _normalised(rig: StereoRig, low: Array, high: Array) -> Symptom:
-    """Report sightings in normalised image coordinates, x / z and y / z of a point, instead of pixels."""
-    u, v = (f"{a:.2g} to {b:.2g}" for a, b in zip(low, high, strict=True))
-    return Symptom(
-        count=1,
-        detail=f"the sightings, u {u} and v {v}, are not pixels of fx_px = {rig.fx_px:g}: normalised image coordinates",
-        treatment="write fx_px u + cx_px and fy_px v + cy_px for them",
-        remedy=None,
-        spoils_vision=True,
-    )
+    detail = f"{'; '.join(summary for _, summary in faults)}: {residuals} with typical values"
+    why = "the true values are not in the data: correct K, or the pixels"
+    return Symptom(len(faults), detail, why, remedy=None, spoils_vision=True)
 
 
 def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, Any], str]]:
@@ -271,13 +257,9 @@ def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None
     factor = float(np.sqrt(ratio[0] * ratio[1]))
     if ratio.max() > ALIKE * ratio.min() or 1.0 / USUAL < factor < USUAL:
         return None
-    names = ("fx_px", "fy_px", "cx_px", "cy_px")
-    summary = (
-        f"K with (cx_px, cy_px) = ({rig.cx_px:.0f}, {rig.cy_px:.0f}) looks like that of images of {1.0 / factor:.2g}"
-    )
-    return {
-        name: factor * getattr(rig, name) for name in names
-    }, f"{summary} times the size of those the sightings are in"
+    K = {name: factor * getattr(rig, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    size = f"that of images of {1.0 / factor:.2g} times the size of those the sightings are in"
+    return K, f"K with (cx_px, cy_px) = ({rig.cx_px:.0f}, {rig.cy_px:.0f}) looks like {size}"
 
 
 def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
@@ -301,14 +283,6 @@ BIAS_SIGMAS = 4.0
 UNKNOWN_SIGMA_RADPS = 0.02
 
 
-class _Reading(NamedTuple):
-    """The bias of a gyro (3,) rad/s, its standard error with the systematic one, and how it was estimated."""
-
-    bias_radps: Array
-    error_radps: Array
-    source: str
-
-
 def gyro_bias(evidence: Evidence) -> Symptom | Undecided | None:
     """Report a constant bias of the gyro; it is left to the estimators, unless the recording's prior excludes it.
 
@@ -317,60 +291,30 @@ def gyro_bias(evidence: Evidence) -> Symptom | Undecided | None:
     excludes the bias diverges, so the covariance of such a prior is widened. With odometry and without a prior,
     estimators start from zero; a bias that is too large for that is subtracted.
     """
-    reading = _standstill(evidence.sequence) or _fitted_bias(evidence) or _against_camera(evidence)
-    if reading is None:
+    if (reading := _bias_read(evidence)) is None:
         return evidence.blind
     bias_radps, error_radps, source = reading
-    prior = evidence.sequence.prior
-    denied = np.zeros(3, dtype=bool) if prior is None else _denied(prior, bias_radps, error_radps)
-    biased = (np.abs(bias_radps) > BIAS_SIGMAS * error_radps) | denied
-    if not biased.any():
+    sequence, motion, prior = evidence.sequence, evidence.sequence.motion, evidence.sequence.prior
+    expected_radps, sigma_radps = np.zeros(3), np.full(3, UNKNOWN_SIGMA_RADPS)
+    if prior is not None:
+        expected_radps, sigma_radps = prior.bias[3:], np.sqrt(np.diag(prior.cov)[-3:])
+    excluded = np.abs(bias_radps - expected_radps) > BIAS_SIGMAS * np.hypot(sigma_radps, error_radps)
+    biased = np.abs(bias_radps) > BIAS_SIGMAS * error_radps
+    count = int((biased | excluded).sum()) if prior is not None else int(biased.sum())
+    if not count:
         return None
     values = ", ".join(f"{b:z.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
     detail = f"the gyro reads ({values}) rad/s too much about x, y, z ({source})"
-    if prior is None and _is_too_much(evidence.sequence, bias_radps, error_radps):
-        return Symptom(
-            count=int(biased.sum()),
-            detail=f"{detail}, more than expected by estimators that start without a bias",
-            treatment="it is subtracted",
-            remedy=_taken_off(evidence.sequence, bias_radps),
-        )
-    if prior is None or not denied.any():
-        return Symptom.information(
-            count=int(biased.sum()),
-            detail=detail,
-            treatment="left to the estimators, which estimate a gyro bias",
-        )
-    stated = ", ".join(f"{b:z.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
-    return Symptom(
-        count=int(biased.sum()),
-        detail=f"{detail}, and the prior has ({stated})",
-        treatment="the prior's covariance of it is widened by the difference",
-        remedy=replace(evidence.sequence, prior=_widened(prior, bias_radps, error_radps)),
-    )
-
-
-def _denied(prior: Prior, bias_radps: Array, error_radps: Array) -> BoolArray:
-    """Say for which axes (3,) a prior excludes the bias, beyond chance."""
-    apart = np.abs(bias_radps - prior.bias[3:])
-    return np.asarray(apart > BIAS_SIGMAS * np.hypot(_sigma_radps(prior), error_radps))
-
-
-def _is_too_much(sequence: Sequence, bias_radps: Array, error_radps: Array) -> bool:
-    """Say whether odometry has a bias that estimators do not expect, beyond chance."""
-    least_radps = BIAS_SIGMAS * np.hypot(UNKNOWN_SIGMA_RADPS, error_radps)
-    return sequence.motion_kind == "twist" and bool((np.abs(bias_radps) > least_radps).any())
-
-
-def _taken_off(sequence: Sequence, bias_radps: Array) -> Sequence:
-    motion = sequence.motion
-    assert isinstance(motion, TwistSamples)
-    return replace(sequence, motion=replace(motion, w_radps=motion.w_radps - bias_radps))
-
-
-def _sigma_radps(prior: Prior) -> Array:
-    """Return the standard deviations (3,) rad/s of the gyro's bias in a prior."""
-    return np.sqrt(np.diag(prior.cov)[-3:])
+    if prior is None and isinstance(motion, TwistSamples) and excluded.any():
+        detail += ", more than expected by estimators that start without a bias"
+        remedy = replace(sequence, motion=replace(motion, w_radps=motion.w_radps - bias_radps))
+        return Symptom(count, detail, "it is subtracted", remedy)
+    if prior is None or not excluded.any():
+        return Symptom.information(count, detail, "left to the estimators, which estimate a gyro bias")
+    stated = ", ".join(f"{b:z.4f} +- {s:.4f}" for b, s in zip(expected_radps, sigma_radps, strict=True))
+    detail += f", and the prior has ({stated})"
+    treatment = "the prior's covariance of it is widened by the difference"
+    return Symptom(count, detail, treatment, replace(sequence, prior=_widened(prior, bias_radps, error_radps)))
 
 
 def _widened(prior: Prior, bias_radps: Array, error_radps: Array) -> Prior:
@@ -380,36 +324,25 @@ def _widened(prior: Prior, bias_radps: Array, error_radps: Array) -> Prior:
     return replace(prior, cov=cov, source=f"{prior.source}; its gyro bias widened by the audit")
 
 
-def _standstill(sequence: Sequence) -> _Reading | None:
-    motion = sequence.motion
-    if not isinstance(motion, TwistSamples):
-        return None
-    stands = (np.linalg.norm(motion.v_mps, axis=1) < STANDING_MPS) & np.isfinite(motion.w_radps).all(axis=1)
-    if stands.sum() < LEAST_STANDING:
-        return None
-    return _median(motion.w_radps[stands], SYSTEMATIC_STANDING, f"{stands.sum()} samples at standstill")
-
-
-def _median(residual_radps: Array, systematic_radps: float, source: str) -> _Reading:
-    """Return the median of readings (M, 3) that should be zero."""
-    error_radps = np.hypot(median_error(residual_radps), systematic_radps)
-    return _Reading(np.median(residual_radps, axis=0), error_radps, source)
-
-
-def _fitted_bias(evidence: Evidence) -> _Reading | None:
-    found = evidence.self_calibration
-    if found is None:
-        return None
-    error_radps = np.hypot(found.error[GYRO_BIAS], SYSTEMATIC_FIT)
-    return _Reading(found.value[GYRO_BIAS], error_radps, "the bias for which tracks and IMU agree")
-
-
-def _against_camera(evidence: Evidence) -> _Reading | None:
-    intervals = evidence.intervals
+def _bias_read(evidence: Evidence) -> tuple[Array, Array, str] | None:
+    """Return the bias of the gyro (3,) rad/s, its standard error with the systematic one, and how it was estimated."""
+    motion, intervals, fitted = evidence.sequence.motion, evidence.intervals, evidence.self_calibration
+    if isinstance(motion, TwistSamples):
+        stands = (np.linalg.norm(motion.v_mps, axis=1) < STANDING_MPS) & np.isfinite(motion.w_radps).all(axis=1)
+        if stands.sum() >= LEAST_STANDING:
+            return *_median(motion.w_radps[stands], SYSTEMATIC_STANDING), f"{stands.sum()} samples at standstill"
+    if fitted is not None:
+        error_radps = np.hypot(fitted.error[GYRO_BIAS], SYSTEMATIC_FIT)
+        return fitted.value[GYRO_BIAS], error_radps, "the bias for which tracks and IMU agree"
     if intervals is None:
         return None
     source = f"against the camera's rotation over {len(intervals.interval)} intervals"
-    return _median(intervals.w_radps - intervals.w_seen_radps, SYSTEMATIC_CAMERA, source)
+    return *_median(intervals.w_radps - intervals.w_seen_radps, SYSTEMATIC_CAMERA), source
+
+
+def _median(residual_radps: Array, systematic_radps: float) -> tuple[Array, Array]:
+    """Return the median (3,) of readings (M, 3) that should be zero, and its standard error."""
+    return np.median(residual_radps, axis=0), np.hypot(median_error(residual_radps), systematic_radps)
 
 
 # A scale is reported beyond this many standard errors, by a jackknife, and this share. Beyond five standard errors,
@@ -421,13 +354,6 @@ GYRO_SCALE_SIGMAS, GYRO_SCALE_SYSTEMATIC = 5.0, 0.05
 LEAST_IN_COMMON = 0.8
 
 
-class _Bounds(NamedTuple):
-    """Bounds of the scale of an axis: the slope of its rates on the camera's, and the inverse of the opposite slope."""
-
-    least: float
-    most: float
-
-
 @beside_camera
 def gyro_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the axes of the gyro whose rates are a multiple of the camera's: a channel with a wrong scale.
@@ -437,7 +363,8 @@ def gyro_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
     1, or both below, noise does not explain it.
     """
     off, doubtful = list[str](), list[str]()
-    for axis, (measured, seen) in zip("xyz", _rates(intervals), strict=True):
+    both = (rates - np.median(rates, axis=0) for rates in (intervals.w_radps, intervals.w_seen_radps))
+    for axis, measured, seen in zip("xyz", *(rates.T for rates in both), strict=True):
         found = _sensitivity(measured, seen)
         if found is None:
             continue
@@ -446,31 +373,21 @@ def gyro_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
             excess = f"{found.value:.3f} +- {found.error:.3f} times as fast as the camera about {axis}"
             (off if beyond > GYRO_SCALE_SYSTEMATIC else doubtful).append(excess)
     if off:
-        return Symptom.warning(
-            count=len(off),
-            detail=f"the gyro turns {', '.join(off)}",
-            treatment="check the scale of each of its axes; no estimator estimates it",
-        )
+        treatment = "check the scale of each of its axes; no estimator estimates it"
+        return Symptom.warning(f"the gyro turns {', '.join(off)}", treatment, len(off))
     if doubtful:
         within = f"by less than {100.0 * GYRO_SCALE_SYSTEMATIC:g} % beyond chance, which drifting tracks can cause"
         return Undecided(f"the gyro turns {', '.join(doubtful)}, {within}")
     return None
 
 
-def _rates(intervals: Intervals) -> list[tuple[Array, Array]]:
-    """Return the gyro's and the camera's rates of rotation (M,) about each axis of the IMU, less their medians."""
-    both = [rates - np.median(rates, axis=0) for rates in (intervals.w_radps, intervals.w_seen_radps)]
-    return [(both[0][:, k], both[1][:, k]) for k in range(3)]
-
-
 def _sensitivity(measured: Array, seen: Array) -> Scalar | None:
     """Return the bound nearer to 1, with its standard error; None where the bounds enclose 1 or are far apart."""
-    bounds = _Bounds(_slope(measured, seen), _inverse_slope(measured, seen))
-    if not bounds.least > LEAST_IN_COMMON * bounds.most > 0.0 or bounds.least <= 1.0 <= bounds.most:
+    least, most = _slope(measured, seen), _inverse_slope(measured, seen)
+    if not least > LEAST_IN_COMMON * most > 0.0 or least <= 1.0 <= most:
         return None
-    if bounds.least > 1.0:
-        return Scalar(bounds.least, jackknife_error(_slope, measured, seen))
-    return Scalar(bounds.most, jackknife_error(_inverse_slope, measured, seen))
+    nearer = _slope if least > 1.0 else _inverse_slope
+    return Scalar(nearer(measured, seen), jackknife_error(nearer, measured, seen))
 
 
 def _slope(response: Array, regressor: Array) -> float:
@@ -518,15 +435,10 @@ def lever_arm(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided |
         return Undecided(hidden) if far else None
     axes = np.flatnonzero(off if off.any() else decidable).tolist()
     axes_m = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
+    place = f"from {metres(T_imu_cam[:3, 3])}, its position in T_imu_cam{slip}"
+    summary = f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} {place}"
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
-    return Symptom.warning(
-        count=len(axes),
-        detail=(
-            f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} from "
-            f"{metres(T_imu_cam[:3, 3])}, its position in T_imu_cam{slip}"
-        ),
-        treatment=f"check the translation of T_imu_cam{other_point}",
-    )
+    return Symptom.warning(summary, f"check the translation of T_imu_cam{other_point}", len(axes))
 
 
 def _slip(found: Position, T_imu_cam: Array) -> str:
@@ -568,21 +480,17 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     followed over a second distinguish most errors (`self_calibration`). With odometry, whose slip lasts as long,
     the rotation from frame to frame is judged as well.
     """
-    calibration = _calibration(evidence, intervals)
-    wrongs, rotation = list(calibration.wrongs), rotation_ratio(intervals)
+    wrongs, unseen = _calibration(evidence, intervals)
+    rotation, force = rotation_ratio(intervals), force_ratio(evidence.sequence)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation, SYSTEMATIC_RATE[evidence.sequence.motion_kind]):
         summary = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
         wrongs.append(Wrong(summary, "the scale of the gyro and the focal length"))
-    force = force_ratio(evidence.sequence)
-    if (
-        force is not None
-        and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO
-        and _is_off(force, SYSTEMATIC_FORCE)
-    ):
+    near = force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO
+    if force is not None and near and _is_off(force, SYSTEMATIC_FORCE):
         summary = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
         wrongs.append(Wrong(summary, "the scale and the bias of the accelerometer"))
     if not wrongs:
-        return None if calibration.hidden is None else Undecided(calibration.hidden)
+        return Undecided(unseen) if unseen else None
     return Symptom.warning(
         count=len(wrongs),
         detail="; ".join(one.summary for one in wrongs),
@@ -590,52 +498,42 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     )
 
 
-class _Calibration(NamedTuple):
-    """What is wrong, and in words which errors would not be found (None where these are small)."""
+def _calibration(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str]:
+    """Return what the self-calibration finds wrong, and in words which errors would not be found.
 
-    wrongs: list[Wrong]
-    hidden: str | None
-
-
-def _calibration(evidence: Evidence, intervals: Intervals) -> _Calibration:
-    """Judge by the self-calibration; with odometry, and where there is none, also by the motion from frame to frame."""
-    sequence = evidence.sequence
-    kind, found = sequence.motion_kind, evidence.self_calibration
-    if found is not None and kind == "imu":
-        unseen = filter(None, (doubtful(found, sequence.rig, kind), hidden(found, kind)))
-        return _Calibration(wrong(found, sequence.rig, kind), "; ".join(unseen) or None)
+    With odometry, and where there is no self-calibration, the motion from frame to frame is judged as well.
+    """
+    sequence, kind, found = evidence.sequence, evidence.sequence.motion_kind, evidence.self_calibration
     if kind == "twist":
         found = self_calibration(sequence, evidence.camera_motion, intervals)
-    looks = _by_turn(evidence, intervals)
     fitted = [] if found is None else wrong(found, sequence.rig, kind)
-    unfit = f"the intrinsics: {_unfitted(kind)}" if found is None else hidden(found, kind)
-    return _Calibration(fitted or looks.wrongs, "; ".join(filter(None, (looks.hidden, unfit))) or None)
+    unseen = f"the intrinsics: {_unfitted(kind)}" if found is None else hidden(found, kind)
+    if found is not None and kind == "imu":
+        return fitted, "; ".join(filter(None, (doubtful(found, sequence.rig, kind), unseen)))
+    turned, unturned = _by_turn(evidence, intervals)
+    return fitted or turned, "; ".join(filter(None, (unturned, unseen)))
 
 
-def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
+def _by_turn(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str]:
     """Judge the rotation of the camera by the motion from frame to frame, which does not determine the intrinsics."""
-    rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
-    by_velocities = evidence.velocity_fit
+    rig, kind, by_velocities = evidence.sequence.rig, evidence.sequence.motion_kind, evidence.velocity_fit
     turn = turn_by_rotations(intervals) if by_velocities is None else by_velocities.turn
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
-    if not (np.abs(turn.rad) > least_rad).any():
-        return _Calibration([], _undecided(float(least_rad.min()), kind == "twist"))
-    angle, error = turn.angle
-    summary = (
-        f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
-        f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
-    )
-    return _Calibration([Wrong(summary, "the extrinsic and the principal point")], None)
-
-
-def _undecided(least_rad: float, by_velocity: bool) -> str | None:
-    if least_rad < LARGEST_RAD:
-        return None
-    cause = "wheel slip that lasts for seconds is as large" if by_velocity else "too little change of rotation"
-    hidden = (
-        "any rotation of it" if not np.isfinite(least_rad) else f"a rotation of it by less than {least_rad:.2f} rad"
-    )
-    return f"the camera's orientation: {hidden} would not show, for {cause}"
+    least = float(least_rad.min())
+    if (np.abs(turn.rad) > least_rad).any():
+        angle, error = turn.angle
+        summary = (
+            f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
+            f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
+        )
+        return [Wrong(summary, "the extrinsic and the principal point")], ""
+    if least < LARGEST_RAD:
+        return [], ""
+    unseen = f"a rotation of it by less than {least:.2f} rad" if np.isfinite(least) else "any rotation of it"
+    cause = "too little change of rotation"
+    if kind == "twist":
+        cause = "wheel slip that lasts for seconds is as large"
+    return [], f"the camera's orientation: {unseen} would not show, for {cause}"
 
 
 def _is_off(ratio: Scalar, systematic: float) -> bool:
@@ -717,42 +615,22 @@ def steady_difference(evidence: Evidence) -> Symptom | None:
     found = evidence.velocity_fit
     if found is None:
         return None
-    differences = [one for one in (_scale(evidence, found), _direction(evidence, found.turn)) if one is not None]
+    (angle, error), differences = found.turn.angle, list[str]()
+    beyond = abs(found.scale.value) - found.scale_by_chance
+    beyond_rad = float((np.abs(found.turn.rad) - found.turn.by_chance_rad).max())
+    independent = errors_are_independent(evidence.step_correlation)
+    least, least_rad = (0.0, 0.0) if independent else (SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD)
+    if found.scale.error <= LARGEST_SCALE_ERROR and least < beyond < SYSTEMATIC_SCALE["twist"]:
+        differences.append(_steps(found.scale, "odometry"))
+    if least_rad < beyond_rad < SYSTEMATIC_RAD["twist"]:
+        off = f"the camera moves at an angle of {angle:.3f} +- {error:.3f} rad to the velocities"
+        equivalent = f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"
+        differences.append(f"{off}, equivalent to {equivalent}")
     if not differences:
         return None
     return Symptom.information(
-        count=len(differences),
-        detail=f"vision and odometry differ during the whole recording: {'; '.join(differences)}",
-        treatment=(
-            "possible causes are a wrong focal length, baseline, principal point or wheel scale, or slip and pitch, "
-            "which cause as much in recordings of cars without faults; by default estimators model none of these"
-        ),
+        len(differences),
+        f"vision and odometry differ during the whole recording: {'; '.join(differences)}",
+        "possible causes are a wrong focal length, baseline, principal point or wheel scale, or slip and pitch, "
+        "which cause as much in recordings of cars without faults; by default estimators model none of these",
     )
-
-
-def _scale(evidence: Evidence, found: VelocityFit) -> str | None:
-    scale, error = found.scale
-    beyond = abs(scale) - found.scale_by_chance
-    if error > LARGEST_SCALE_ERROR or not 0.0 < beyond < SYSTEMATIC_SCALE["twist"]:
-        return None
-    if not _exceeds_track_drift(evidence, beyond, SCALE_BY_TRACK_DRIFT):
-        return None
-    return _steps(found.scale, "odometry")
-
-
-def _direction(evidence: Evidence, turn: Turn) -> str | None:
-    beyond_rad = float((np.abs(turn.rad) - turn.by_chance_rad).max())
-    if not 0.0 < beyond_rad < SYSTEMATIC_RAD["twist"]:
-        return None
-    if not _exceeds_track_drift(evidence, beyond_rad, TURN_BY_TRACK_DRIFT_RAD):
-        return None
-    angle, error = turn.angle
-    return (
-        f"the camera moves at an angle of {angle:.3f} +- {error:.3f} rad to the velocities, equivalent to "
-        f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"
-    )
-
-
-def _exceeds_track_drift(evidence: Evidence, beyond: float, by_track_drift: float) -> bool:
-    """Say whether tracks that drift cannot cause the excess: it is larger, or the errors are independent."""
-    return beyond > by_track_drift or errors_are_independent(evidence.step_correlation)
