@@ -72,31 +72,23 @@ def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
     decides. A clock that goes back by more than a step shows in its stamps (`time_order`).
     """
     sequence = evidence.sequence
-    steps = list(_steps_alike(sequence))
+    steps, at_s = list(_steps_alike(sequence)), (sequence.frames_t_ns - sequence.frames_t_ns[:1]) / NS_PER_S
     jumps = [(step, step.gone) for step in steps if step.gone is not None and step.is_jump]
     if not jumps:
-        open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
+        open_s = [f"{step.by_s:+.3g} s at {at_s[step.frame]:.1f} s" for step in steps if step.gone is None]
         summary = f"the stamps of frames and samples jump together by {', '.join(open_s)}"
-        return (
-            Undecided(f"{summary}: the tracks do not determine whether time passed or a clock was set")
-            if open_s
-            else None
-        )
+        why = f"{summary}: the tracks do not determine whether time passed or a clock was set"
+        return Undecided(why) if open_s else None
     usual_s = usual_step_s(sequence.frames_t_ns)
     jumps_text = [
-        f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
+        f"by {step.by_s:+.3g} s at {at_s[step.frame]:.1f} s (by the tracks "
         f"{usual_s * gone.value:.3f} +- {usual_s * gone.error:.3f} s passed)"
         for step, gone in jumps
     ]
     frames, samples = (np.array(rows) for rows in zip(*((step.frame, step.sample) for step, _ in jumps), strict=True))
-    parts = _part_of(sequence.frames_t_ns, frames), _part_of(sequence.motion.t_ns, samples)
-    remedy = _longest_part(sequence, *parts)
+    remedy = _longest_part(sequence, _part_of(sequence.frames_t_ns, frames), _part_of(sequence.motion.t_ns, samples))
     detail = f"the clock of frames and samples is set {', '.join(jumps_text)}"
     return Symptom(len(jumps), detail, _kept(remedy, sequence), remedy)
-
-
-def _at_s(sequence: Sequence, step: _Step) -> float:
-    return float(sequence.frames_t_ns[step.frame] - sequence.frames_t_ns[0]) / NS_PER_S
 
 
 def _steps_alike(sequence: Sequence) -> Iterator[_Step]:
@@ -125,51 +117,32 @@ def _steps_alike(sequence: Sequence) -> Iterator[_Step]:
 
 
 def _gone(sequence: Sequence, frame: int, stamped: float) -> Scalar | None:
-    """Return how many usual steps the camera moves or rotates after a frame, if that decides the question."""
-    for steps in _steps_gone(sequence, frame):
-        error = float(np.hypot(steps.error, SYSTEMATIC))
-        decided = abs(steps.value - 1.0) < WITHIN * error or abs(steps.value - stamped) < WITHIN * error
-        if decided and abs(stamped - 1.0) > APART * error:
-            return Scalar(steps.value, error)
-    return None
+    """Return how many usual steps the camera moves, or else rotates, after a frame, by lines through those around it.
 
-
-def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
-    """Yield how far the camera moves, and how far it rotates, after a frame, in units of the intervals around it.
-
-    Nothing is yielded where the camera stands, hardly rotates, or its motion is not known.
+    None where the camera stands and hardly rotates, where its motion is not known, or where that decides nothing.
     """
     kept = np.arange(max(frame - AROUND, 0), min(frame + AROUND + 2, sequence.frame_count))
     camera = camera_motion(replace(sequence.with_frames(kept), frames_t_ns=NS_PER_S * np.arange(kept.size)))
     here = int(np.flatnonzero(kept == frame)[0])
-    if not camera.known[here]:
-        return
-    for moved, least in ((camera.v_mps, LEAST_M), (camera.w_radps, LEAST_RAD)):
-        beside = np.flatnonzero(camera.known & (np.arange(camera.known.size) != here))
-        size = np.linalg.norm(moved, axis=1)
-        if beside.size < FEWEST_AROUND or np.median(size[beside]) < least or _is_noise(moved, beside, here):
-            continue
-        yield _ratio(size, beside, here)
-
-
-def _is_noise(moved: Array, beside: IntArray, here: int) -> bool:
-    """Say whether motions (n, 3) around the one at ``here`` have no common direction, as noise at standstill.
-
-    That is so where the line through them, at ``here``, is within APART standard errors of zero.
-    """
+    beside = np.flatnonzero(camera.known & (np.arange(camera.known.size) != here))
+    if not camera.known[here] or beside.size < FEWEST_AROUND:
+        return None
     line = np.stack([np.ones(beside.size), beside - here], axis=1)
-    found, *_ = np.linalg.lstsq(line, moved[beside])
-    variance = float(np.sum((moved[beside] - line @ found) ** 2)) / (beside.size - 2)
-    error = np.sqrt(variance * np.linalg.inv(line.T @ line)[0, 0])
-    return bool(np.linalg.norm(found[0]) < APART * error)
-
-
-def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:
-    """Return the size (n,) at one interval over the line through those around it, with its standard error."""
-    line = np.polynomial.Polynomial.fit(beside - here, size[beside], 1)
-    expected = float(line(0.0))
-    scatter = float(np.sqrt(np.sum((size[beside] - line(beside - here)) ** 2) / (beside.size - 2)))
-    return Scalar(size[here] / expected, scatter / expected * float(np.sqrt(1.0 + 1.0 / beside.size)))
+    for moved, least in ((camera.v_mps, LEAST_M), (camera.w_radps, LEAST_RAD)):
+        rows = np.column_stack([moved, np.linalg.norm(moved, axis=1)])
+        found, *_ = np.linalg.lstsq(line, rows[beside])
+        squares = np.sum((rows[beside] - line @ found) ** 2, axis=0) / (beside.size - 2)
+        # At a standstill motions are noise, without a common direction.
+        noise = np.sqrt(np.sum(squares[:3]) * np.linalg.inv(line.T @ line)[0, 0])
+        if np.median(rows[beside, 3]) < least or np.linalg.norm(found[0, :3]) < APART * noise:
+            continue
+        usual = float(found[0, 3])
+        error = float(np.hypot(np.sqrt(squares[3]) / usual * np.sqrt(1.0 + 1.0 / beside.size), SYSTEMATIC))
+        steps = float(rows[here, 3]) / usual
+        decided = abs(steps - 1.0) < WITHIN * error or abs(steps - stamped) < WITHIN * error
+        if decided and abs(stamped - 1.0) > APART * error:
+            return Scalar(steps, error)
+    return None
 
 
 # A forward step of this many usual ones means that earlier stamps were out of order; after a jump, all steps are
@@ -199,7 +172,11 @@ def time_order(evidence: Evidence) -> Symptom | None:
     runs_back = any((step_ns <= 0).mean() > MOST_LATE for step_ns in steps_ns)
     jumps = [_jumps(t_ns) for t_ns in streams]
     if any(rows.size for rows in jumps) and not runs_back:
-        longest_s = max(_jump_s(t_ns, row) for t_ns, rows in zip(streams, jumps, strict=True) for row in rows)
+        # From the expected next stamp back to the actual one.
+        lengths_ns = (
+            np.median(np.abs(step)) - step[rows] for step, rows in zip(map(np.diff, streams), jumps, strict=True)
+        )
+        longest_s = float(np.concatenate(list(lengths_ns)).max()) / NS_PER_S
         detail += f": the clock jumps back by {longest_s:.2f} s and goes on from there"
         remedy = _sorted(_longest_part(sequence, *map(_part_of, streams, jumps)))
         return Symptom(count, detail, _kept(remedy, sequence), remedy)
@@ -211,7 +188,6 @@ def time_order(evidence: Evidence) -> Symptom | None:
 
 
 def _sorted(sequence: Sequence) -> Sequence:
-    """Return the sequence with stamps in order, without repeats and invalid ones."""
     if _late(sequence.frames_t_ns):
         sequence = sequence.with_frames(_in_order(sequence.frames_t_ns))
     if _late(sequence.motion.t_ns):
@@ -230,12 +206,6 @@ def _jumps(t_ns: IntArray) -> IntArray:
     usual_ns = float(np.median(np.abs(step_ns)))
     backwards = np.flatnonzero(step_ns < 0)
     return np.array([row for row in backwards.tolist() if _goes_on(t_ns, row, usual_ns)], dtype=np.int64)
-
-
-def _jump_s(t_ns: IntArray, row: int) -> float:
-    """Return the length (s) of a jump after a row, from the expected next stamp back to the actual one."""
-    step_ns = np.diff(t_ns)
-    return float(np.median(np.abs(step_ns)) - step_ns[row]) / NS_PER_S
 
 
 def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
@@ -296,24 +266,17 @@ def outside_motion(evidence: Evidence) -> Symptom | None:
     count = int(np.sum(~covered))
     if count == 0:
         return None
+    outside = f"{count} of {sequence.frame_count} frames lie outside"
     if sequence.frame_count - count < LEAST_FRAMES:
         frames_s, motion_s = (
             f"{(t.min() - motion_t_ns.min()) / NS_PER_S:.3f} to {(t.max() - motion_t_ns.min()) / NS_PER_S:.3f} s"
             for t in (frames_t_ns, motion_t_ns)
         )
-        return Symptom(
-            count=count,
-            detail=f"counted from the first motion sample, the samples are at {motion_s} and the frames at {frames_s}: "
-            f"{count} of {sequence.frame_count} frames lie outside",
-            treatment="no motion is left: stamp both by one clock, in one unit",
-            remedy=None,
-        )
-    return Symptom(
-        count=count,
-        detail=f"{count} of {sequence.frame_count} frames lie outside the time of the motion samples",
-        treatment="cut off",
-        remedy=sequence.with_frames(np.flatnonzero(covered)),
-    )
+        detail = f"counted from the first motion sample, the samples are at {motion_s} and the frames at {frames_s}"
+        why = "no motion is left: stamp both by one clock, in one unit"
+        return Symptom(count, f"{detail}: {outside}", why, remedy=None)
+    remedy = sequence.with_frames(np.flatnonzero(covered))
+    return Symptom(count, f"{outside} the time of the motion samples", "cut off", remedy)
 
 
 # Shorter gaps (s) in the motion samples, such as a dropped sample of a fast IMU, are interpolated (`motion_gap`).
@@ -331,7 +294,17 @@ def time_gap(evidence: Evidence) -> Symptom | None:
     holes = _holes(t_ns, MOTION_GAP_S)
     # Gaps outside the time of the frames do not matter.
     inside = (t_ns[holes + 1] > frames_t_ns[:1]) & (t_ns[holes] < frames_t_ns[-1:])
-    return _motion_symptom(sequence, holes[inside]) if inside.any() else _frames_symptom(sequence)
+    if inside.any():
+        return _motion_symptom(sequence, holes[inside])
+    holes = _holes(frames_t_ns, 0.0)
+    if not holes.size:
+        return None
+    detail = f"{holes.size} hole(s) in the frames, the longest of {_longest_s(frames_t_ns, holes):.2f} s"
+    return Symptom.information(holes.size, detail, "the motion samples bridge them")
+
+
+def _longest_s(t_ns: IntArray, holes: IntArray) -> float:
+    return float(np.diff(t_ns)[holes].max()) / NS_PER_S
 
 
 def _holes(t_ns: IntArray, least_s: float) -> IntArray:
@@ -343,30 +316,14 @@ def _holes(t_ns: IntArray, least_s: float) -> IntArray:
 
 def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
     t_ns = sequence.motion.t_ns
-    longest_s = float((t_ns[holes + 1] - t_ns[holes]).max()) / NS_PER_S
+    detail = f"{holes.size} hole(s) in the motion samples, the longest of {_longest_s(t_ns, holes):.2f} s"
     # A frame at the edge of a gap belongs to the adjacent stretch.
     stretch = np.searchsorted(t_ns[holes + 1], sequence.frames_t_ns, side="right")
     in_hole = np.searchsorted(t_ns[holes], sequence.frames_t_ns, side="left") > stretch
     sizes = np.bincount(stretch[~in_hole], minlength=1)
     kept = np.flatnonzero(~in_hole & (stretch == np.argmax(sizes)))
-    return Symptom(
-        count=holes.size,
-        detail=f"{holes.size} hole(s) in the motion samples, the longest of {longest_s:.2f} s",
-        treatment=f"the longest stretch without one is kept: {kept.size} of {sequence.frame_count} frames",
-        remedy=sequence.with_frames(kept),
-    )
-
-
-def _frames_symptom(sequence: Sequence) -> Symptom | None:
-    holes = _holes(sequence.frames_t_ns, 0.0)
-    if holes.size == 0:
-        return None
-    longest_s = float(np.diff(sequence.frames_t_ns)[holes].max()) / NS_PER_S
-    return Symptom.information(
-        count=holes.size,
-        detail=f"{holes.size} hole(s) in the frames, the longest of {longest_s:.2f} s",
-        treatment="the motion samples bridge them",
-    )
+    treatment = f"the longest stretch without one is kept: {kept.size} of {sequence.frame_count} frames"
+    return Symptom(holes.size, detail, treatment, sequence.with_frames(kept))
 
 
 # A vehicle turns and stops within this time (s). Samples with a longer step, and with this many frames in one step, do
@@ -382,22 +339,15 @@ def sparse_motion(evidence: Evidence) -> Symptom | None:
     step_s, frame_s = usual_step_s(sequence.motion.t_ns), usual_step_s(sequence.frames_t_ns)
     if step_s <= GAP_RATIO * frame_s:
         return None
-    detail = f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s"
-    if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
-        return Symptom(
-            count=int(sequence.motion.t_ns.size),
-            detail=detail,
-            treatment="too few to be used, as where their stamps are in another unit than the frames': check both",
-            remedy=None,
-            spoils_vision=True,
-        )
-    return Symptom.warning(
-        count=int(sequence.motion.t_ns.size),
-        detail=detail,
-        treatment=(
-            "between two samples the motion is interpolated linearly, with an error that no stated noise includes"
-        ),
+    detail, count = (
+        f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s",
+        sequence.motion.t_ns.size,
     )
+    if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
+        why = "too few to be used, as where their stamps are in another unit than the frames': check both"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
+    why = "between two samples the motion is interpolated linearly, with an error that no stated noise includes"
+    return Symptom.warning(detail, why, count)
 
 
 # Least number of measured stretches that are interpolated. With fewer, the variance of the samples is taken as the
@@ -420,16 +370,13 @@ def motion_gap(evidence: Evidence) -> Symptom | None:
     if not rows.size:
         return None
     scale = np.stack([_noise_scale(sequence, round((t_ns[row + 1] - t_ns[row]) / usual_ns), usual_ns) for row in rows])
-    longest_s = float((t_ns[rows + 1] - t_ns[rows]).max()) / NS_PER_S
     linear, angular = scale.max(axis=0)
     return Symptom(
-        count=rows.size,
-        detail=f"{rows.size} gap(s) in the motion samples, the longest of {longest_s:.3g} s",
-        treatment=(
-            f"bridged by linear interpolation, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times "
-            "the noise there, to cover the error that the same interpolation has over measured stretches"
-        ),
-        remedy=replace(
+        rows.size,
+        f"{rows.size} gap(s) in the motion samples, the longest of {_longest_s(t_ns, rows):.3g} s",
+        f"bridged by linear interpolation, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times "
+        "the noise there, to cover the error that the same interpolation has over measured stretches",
+        replace(
             sequence,
             motion=_filled(sequence.motion, rows, usual_ns),
             bridges=_with(sequence.bridges, Bridges(t_ns[rows], t_ns[rows + 1], scale)),
@@ -526,12 +473,9 @@ def uneven_stamps(evidence: Evidence) -> Symptom | None:
         return None
     typical_ms = 1e3 * float(np.median(np.abs(off_s)))
     return Symptom.warning(
-        detail=(
-            f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the "
-            f"camera's motion shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should "
-            "show all"
-        ),
-        treatment="images are taken at more even intervals than stamped: stamp them when they are exposed",
+        f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the camera's motion "
+        f"shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should show all",
+        "images are taken at more even intervals than stamped: stamp them when they are exposed",
     )
 
 
@@ -545,9 +489,7 @@ def _even_steps_s(step_s: Array) -> Array:
 
 
 def _followed(rates: Array, step_s: Array, even_s: Array, known: BoolArray) -> Scalar | None:
-    """Return the share of the variation of the steps that the camera's motion follows, from its rates (K - 1, 6).
-
-    ``even_s`` (K - 1,) are the steps without variation.
+    """Return the share of the variation of the steps about even ones that the camera's rates (K - 1, 6) follow.
 
     None where the motion is known in too few intervals and those around them.
     """
@@ -595,14 +537,12 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     nearest = min(LAG, key=lambda pairing: abs(LAG[pairing] - lag.value))
     if nearest == present or abs(lag.value - LAG[present]) < LAG_SIGMAS * lag.error:
         return None
+    seen = f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval after its start"
     return Symptom(
-        count=1,
-        detail=(
-            f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval after its "
-            f'start: they belong to its "{nearest}", and are stated to belong to its "{present}"'
-        ),
-        treatment=f'an interval is paired with the sample of its "{nearest}"',
-        remedy=replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
+        1,
+        f'{seen}: they belong to its "{nearest}", and are stated to belong to its "{present}"',
+        f'an interval is paired with the sample of its "{nearest}"',
+        replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
     )
 
 
@@ -630,6 +570,7 @@ LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
 # step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within this many
 # standard errors.
 CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
+ONE_CLOCK = "a clock drifts or was set: stamp both by one clock, or cut the recording there"
 
 
 @beside_camera
@@ -651,16 +592,13 @@ def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided
     surely_s = largest_s * (1.0 if at_frames else LARGEST_BEYOND)
     if abs(beyond_s) < max(least_s, OFFSET_SIGMAS * found.error) or found.error > surely_s:
         return _as_often(sequence, Scalar(offset_s, found.error)) or _unseen_offset(found, largest_s, is_twist)
-    seen = (
-        f"the camera turns as the gyro does when the frames' stamps are shifted by {1e3 * offset_s:.1f} +- "
-        f"{1e3 * found.error:.1f} ms"
-    )
+    by = f"{1e3 * offset_s:.1f} +- {1e3 * found.error:.1f} ms"
+    seen = f"the camera turns as the gyro does when the frames' stamps are shifted by {by}"
     detail = f"{seen}: frames are stamped {'late' if offset_s < 0.0 else 'early'}"
     change = change_of_offset(sequence, intervals)
     if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
         parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms more in the second half than in the first"
-        why = "a clock drifts or was set: stamp both by one clock, or cut the recording there"
-        return Symptom.warning(f"{detail}, but by {parted}", why)
+        return Symptom.warning(f"{detail}, but by {parted}", ONE_CLOCK)
     remedy = _shifted(sequence, offset_s)
     if (worse := _velocities_against(evidence, remedy, offset_s)) > AGAINST_SHIFT:
         fit_worse = f"the velocities fit worse, by {worse:.1f} standard errors: the gyro alone is shifted"
@@ -678,10 +616,8 @@ def _unseen_offset(found: Scalar, largest_s: float, is_twist: bool) -> Undecided
         return None
     late = "late" if found.value < 0.0 else "early"
     seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
-    return Undecided(
-        f"frames look as if stamped {late} by {seen}, and there is too little change of rotation to distinguish that "
-        "from chance"
-    )
+    why = "there is too little change of rotation to distinguish that from chance"
+    return Undecided(f"frames look as if stamped {late} by {seen}, and {why}")
 
 
 def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) -> float:
@@ -722,16 +658,14 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     if not near:
         return None
     shifts, sigmas = " or ".join(f"{1e3 * shift:+.0f}" for shift in near), abs(offset.value) / offset.error
-    from_zero = "which is consistent with zero as well"
-    if sigmas > NEAR_SIGMAS:
-        from_zero = f"{sigmas:.1f} standard errors from zero"
+    from_zero = (
+        f"{sigmas:.1f} standard errors from zero" if sigmas > NEAR_SIGMAS else "which is consistent with zero as well"
+    )
     return Symptom.warning(
-        detail=(
-            f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the "
-            f"camera's clock were to be shifted by {shifts} ms; by the tracks the offset is "
-            f"{1e3 * offset.value:+.0f} +- {1e3 * offset.error:.0f} ms, {from_zero}"
-        ),
-        treatment="if frames and twists were taken together, give them the same stamps",
+        f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the camera's clock "
+        f"were to be shifted by {shifts} ms; by the tracks the offset is {1e3 * offset.value:+.0f} +- "
+        f"{1e3 * offset.error:.0f} ms, {from_zero}",
+        "if frames and twists were taken together, give them the same stamps",
     )
 
 
@@ -752,11 +686,9 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
     if not isinstance(sequence.motion, TwistSamples):
         return 0.0, LEAST_OFFSET_S
     step_s = usual_step_s(sequence.motion.t_ns)
-    least_s = (
-        LEAST_TWIST_INTERVALS * step_s
-        if is_stamped_at_frames(sequence)
-        else max(LEAST_OFFSET_S, LEAST_OFF_FRAMES * step_s)
-    )
+    least_s = max(LEAST_OFFSET_S, LEAST_OFF_FRAMES * step_s)
+    if is_stamped_at_frames(sequence):
+        least_s = LEAST_TWIST_INTERVALS * step_s
     return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
 
 
@@ -790,13 +722,8 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
         return Undecided(f"too little change of rotation: {known}")
     if abs(change_s) < least_s:
         return None
-    return Symptom.warning(
-        detail=(
-            f"the offset of frames and motion samples changes by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from "
-            "the first half of the recording to the second"
-        ),
-        treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
-    )
+    by = f"{1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from the first half of the recording to the second"
+    return Symptom.warning(f"the offset of frames and motion samples changes by {by}", ONE_CLOCK)
 
 
 def _fitted_change(evidence: Evidence, intervals: Intervals) -> Scalar | None:
