@@ -173,10 +173,8 @@ def time_order(evidence: Evidence) -> Symptom | None:
     jumps = [_jumps(t_ns) for t_ns in streams]
     if any(rows.size for rows in jumps) and not runs_back:
         # From the expected next stamp back to the actual one.
-        lengths_ns = (
-            np.median(np.abs(step)) - step[rows] for step, rows in zip(map(np.diff, streams), jumps, strict=True)
-        )
-        longest_s = float(np.concatenate(list(lengths_ns)).max()) / NS_PER_S
+        both = zip(map(np.diff, streams), jumps, strict=True)
+        longest_s = max(float(np.median(np.abs(step)) - step[row]) for step, rows in both for row in rows) / NS_PER_S
         detail += f": the clock jumps back by {longest_s:.2f} s and goes on from there"
         remedy = _sorted(_longest_part(sequence, *map(_part_of, streams, jumps)))
         return Symptom(count, detail, _kept(remedy, sequence), remedy)
@@ -339,10 +337,8 @@ def sparse_motion(evidence: Evidence) -> Symptom | None:
     step_s, frame_s = usual_step_s(sequence.motion.t_ns), usual_step_s(sequence.frames_t_ns)
     if step_s <= GAP_RATIO * frame_s:
         return None
-    detail, count = (
-        f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s",
-        sequence.motion.t_ns.size,
-    )
+    count = sequence.motion.t_ns.size
+    detail = f"motion samples come every {step_s:.3g} s and frames every {frame_s:.3g} s"
     if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
         why = "too few to be used, as where their stamps are in another unit than the frames': check both"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
@@ -473,8 +469,8 @@ def uneven_stamps(evidence: Evidence) -> Symptom | None:
         return None
     typical_ms = 1e3 * float(np.median(np.abs(off_s)))
     return Symptom.warning(
-        f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the camera's motion "
-        f"shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should show all",
+        f"the intervals of the frames differ from the usual one by {typical_ms:.2g} ms (median), and the camera's "
+        f"motion shows {found.value:.2f} +- {found.error:.2f} of these differences, where it should show all",
         "images are taken at more even intervals than stamped: stamp them when they are exposed",
     )
 
@@ -658,12 +654,12 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     if not near:
         return None
     shifts, sigmas = " or ".join(f"{1e3 * shift:+.0f}" for shift in near), abs(offset.value) / offset.error
-    from_zero = (
-        f"{sigmas:.1f} standard errors from zero" if sigmas > NEAR_SIGMAS else "which is consistent with zero as well"
-    )
+    from_zero = "which is consistent with zero as well"
+    if sigmas > NEAR_SIGMAS:
+        from_zero = f"{sigmas:.1f} standard errors from zero"
     return Symptom.warning(
-        f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the camera's clock "
-        f"were to be shifted by {shifts} ms; by the tracks the offset is {1e3 * offset.value:+.0f} +- "
+        f"twists have the rate of the frames, and each frame is {1e3 * late_s:.0f} ms after one, as if the camera's "
+        f"clock were to be shifted by {shifts} ms; by the tracks the offset is {1e3 * offset.value:+.0f} +- "
         f"{1e3 * offset.error:.0f} ms, {from_zero}",
         "if frames and twists were taken together, give them the same stamps",
     )
