@@ -56,7 +56,6 @@ FAULTS: dict[Check, str] = {
     tracks.thin_vision: "too few tracks to determine the camera's motion, for half a second or more",
     tracks.track_scatter: "tracks that scatter more than the stated noise explains (mismatches), or far less",
     conventions.mixed_axes: "motion samples and camera extrinsic in different axes, or an inverted extrinsic",
-    tracks.correlated_tracks: "tracks whose sightings have correlated errors",
     timing.motion_gap: "short gaps in the motion samples",
     conventions.extrinsic_translation: "an extrinsic whose translation is that of its inverse",
     timing.twist_lag: "twist samples that describe another interval than the one they are paired with",

@@ -89,11 +89,8 @@ def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
         return None
     if isinstance(sequence.motion, TwistSamples) and is_stamped_at_frames(sequence):
         return found
-    return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
-
-
-def _slope(instrument: Array, change: Array, residual: Array) -> float:
-    return slope(instrument, change, residual).value
+    error = jackknife_error(lambda *rows: slope(*rows).value, instrument, change, residual)
+    return Scalar(found.value, SCATTER * error)
 
 
 def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolArray]:
@@ -212,13 +209,6 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
     return TruthClock(offset, rate, 0.5 * sequence.duration_s)
 
 
-class _Linearised(NamedTuple):
-    """The camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate (m, 3, 2)."""
-
-    unexplained: Array
-    jacobian: Array
-
-
 def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar | None:
     """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
 
@@ -241,17 +231,18 @@ def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar
         step_s = usual_step_s(as_gyro.frames_t_ns)
         if abs(found[1]) * 0.5 * as_gyro.duration_s >= step_s:
             both = [_linearised(as_gyro, seen, one, np.arange(count)) for one in (found, np.array([offset_s, 0.0]))]
-            left, without = (np.inf if one is None else float(np.sum(spread(one.unexplained) ** 2)) for one in both)
+            left, without = (np.inf if one is None else float(np.sum(spread(one[0]) ** 2)) for one in both)
             if not left < MOST_UNEXPLAINED * without:
                 return None
-        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
+        return Scalar(float(found[1]), SCATTER * jackknife_error(lambda *rows: float(_solved(*rows)[1]), *at))
     except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
         return None
 
 
-def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray) -> _Linearised | None:
-    """Return the equations of the rows that the truth covers; None where these are too few.
+def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray) -> tuple[Array, Array] | None:
+    """Return the camera's rates of rotation less the truth's (m, 3) rad/s, and their Jacobian (m, 3, 2) in the rows.
 
+    It is by offset and rate; None where the truth covers too few of the rows.
     A fast clock lowers all rates of rotation, as a wrong focal length does, so this effect is not used for the rate.
     """
     t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion.t_ns, as_gyro.motion.values[:, 3:])
@@ -270,7 +261,7 @@ def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray
     slope = (after - before) / (2.0 * apart_s)
     middle_s = 0.5 * (since_s[:-1] + since_s[1:])[seen.interval[used]]
     unexplained = seen.w_seen_radps[used] - (1.0 + found[1]) * now
-    return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
+    return unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2)
 
 
 def _solved(unexplained: Array, jacobian: Array) -> Array:
@@ -283,7 +274,3 @@ def _solved(unexplained: Array, jacobian: Array) -> Array:
         found = np.linalg.solve(weighted @ x, weighted @ y)
         weight = 1.0 / (1.0 + (y - x @ found) ** 2 / CAUCHY_SIGMAS**2)
     return np.asarray(found)
-
-
-def _rate(unexplained: Array, jacobian: Array) -> float:
-    return float(_solved(unexplained, jacobian)[1])

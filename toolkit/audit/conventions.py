@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from toolkit.audit.one_step import median_one_step_px, one_step_px_by_interval
 from toolkit.audit.robust import LEAST_SPREAD_V, LEAST_SPREAD_W, Ranking, Scalar, cauchy, ranked, slope
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
 from toolkit.measurements import NS_PER_S
-from toolkit.sequence import EXTRINSIC_UNCERTAIN, Sequence
+from toolkit.sequence import EXTRINSIC_UNCERTAIN
 
 # A mirror image of the scene reverses the turns about two axes and the motion along the third.
 MIRRORED = "; mirrored images have the same effect"
@@ -79,7 +78,8 @@ def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
         return Undecided(f"the tracks fit every reading of the extrinsic equally, best {first} and {as_good[0]}")
     doubt = "".join(f"; {name} explains the motion equally well ({behind[name]:.1f} sigma)" for name in as_good)
     for name in others:
-        same_way = _turned_rad(readings[first], readings[name]) < SAME_READING_RAD
+        apart = readings[first][:3, :3].T @ readings[name][:3, :3]
+        same_way = np.linalg.norm(so3_log(apart)) < SAME_READING_RAD
         if not (same_way or name in as_good):
             continue
         share = _share(evidence.intervals, readings[first], readings[name])
@@ -88,18 +88,14 @@ def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
             doubt += f"; during rotation the camera's velocity is {way}"
             first = name if share.value > 0.5 else first
         elif same_way:
-            doubt += (
-                f"; {name} has the same orientation, and there is too little rotation to determine the camera's "
-                "position"
-            )
+            unknown = "there is too little rotation to determine the camera's position"
+            doubt += f"; {name} has the same orientation, and {unknown}"
     each_px = ", ".join(f"{median_one_step_px(sequence, camera, T):.2f} px {name}" for name, T in readings.items())
-    return Symptom(
-        count=1,
-        detail=f"one-step reprojection is {each_px}{doubt}",
-        treatment=f"the extrinsic is read {first}",
-        remedy=_read_as(sequence, readings[first], first),
-        harmful=first != next(iter(readings)),
-    )
+    detail, treatment = f"one-step reprojection is {each_px}{doubt}", f"the extrinsic is read {first}"
+    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_UNCERTAIN)
+    provenance = replace(sequence.provenance, facts=(*facts, treatment))
+    remedy = replace(sequence, rig=replace(sequence.rig, T_imu_cam=readings[first]), provenance=provenance)
+    return Symptom(1, detail, treatment, remedy, harmful=first != next(iter(readings)))
 
 
 def _four_readings(T_imu_cam: Array) -> dict[str, Array]:
@@ -125,23 +121,8 @@ def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scal
     readings = [intervals._replace(T_imu_cam=T) for T in (T_imu_first, T_imu_other)]
     one, other = (read.v_seen_mps - np.cross(read.w_seen_radps, read.T_imu_cam[:3, 3]) for read in readings)
     in_turns = -np.cross(intervals.w_radps, T_imu_other[:3, 3] - T_imu_first[:3, 3])
-    share = slope(*(_centred(values) for values in (in_turns, other - one, intervals.v_mps - one)))
+    share = slope(*(x - np.median(x, axis=0) for x in (in_turns, other - one, intervals.v_mps - one)))
     return share if share.error < LARGEST_ERROR else None
-
-
-def _centred(values: Array) -> Array:
-    return np.asarray(values - np.median(values, axis=0))
-
-
-def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
-    return float(np.linalg.norm(so3_log(T_imu_first[:3, :3].T @ T_imu_other[:3, :3])))
-
-
-def _read_as(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:
-    """Return the sequence with this extrinsic, and without the fact that its convention is in doubt."""
-    facts = (fact for fact in sequence.provenance.facts if fact != EXTRINSIC_UNCERTAIN)
-    provenance = replace(sequence.provenance, facts=(*facts, f"the extrinsic is read {reading}"))
-    return replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam), provenance=provenance)
 
 
 # Two readings look the same way if their cameras differ by less than this angle.
@@ -193,59 +174,43 @@ def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided 
         return None
     if better < AGAINST_GIVEN:
         return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
-    taken, doubt = _settled(evidence, intervals, [readings[k] for k in twins])
+    alike = [readings[k] for k in twins]
+    place_m, doubt = _placed(evidence, intervals, alike[_ranked(intervals, alike).best])
+    placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in alike]
+    taken = placed[_ranked(intervals, placed).best]
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
-    return Symptom(
-        count=1,
-        detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} corrected{doubt}",
-        treatment=taken.done if certain else f"{readings[second].name} explains it as well: choose one",
-        remedy=remedy if certain else None,
-        spoils_vision=not certain,
-    )
+    both = given, taken.T_imu_cam
+    given_px, now_px = (median_one_step_px(evidence.sequence, evidence.camera_motion, T) for T in both)
+    residuals = f"median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px corrected"
+    treatment = taken.done if certain else f"{readings[second].name} explains it as well: choose one"
+    detail = f"{taken.cause}: {residuals}{doubt}"
+    return Symptom(1, detail, treatment, remedy if certain else None, spoils_vision=not certain)
 
 
 def _exchanged(alone: str) -> Symptom:
+    wrong = f"channels are exchanged or have the wrong sign: correct them{MIRRORED}"
     if alone == _OWN:
-        return Symptom(
-            count=1,
-            detail="the gyro agrees with the camera and the velocities do not, so no rotation of both corrects them",
-            treatment=f"the velocities' channels are exchanged or have the wrong sign: correct them{MIRRORED}",
-            remedy=None,
-        )
-    return Symptom(
-        count=1,
-        detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, so no rotation corrects all",
-        treatment=f"channels of the samples are exchanged or have the wrong sign: correct them{MIRRORED}",
-        remedy=None,
-        spoils_vision=True,
-    )
+        detail = "the gyro agrees with the camera and the velocities do not, so no rotation of both corrects them"
+        return Symptom(1, detail, f"the velocities' {wrong}", remedy=None)
+    detail = f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, so no rotation corrects all"
+    return Symptom(1, detail, f"the samples' {wrong}", remedy=None, spoils_vision=True)
 
 
 def _readings(given: Array) -> list[ExtrinsicConvention]:
     """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
-    place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in right_handed_axes()[1:]]
-    as_given = ExtrinsicConvention(given, _OWN, "", "", place_m)
-    return [as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given)]
-
-
-def _of_body(given: Array, turn: Array) -> ExtrinsicConvention:
-    axes = axes_named(turn[:3, :3])
-    cause = f"the motion samples' axes are the extrinsic's {axes}"
-    return ExtrinsicConvention(turn @ given, axes, cause, "the extrinsic is rotated to the samples' axes", given[:3, 3])
-
-
-def _of_camera(given: Array, turn: Array) -> ExtrinsicConvention:
-    axes = axes_named(turn[:3, :3].T)
-    cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
-    done = "the camera's rotation is corrected, its position is kept"
-    return ExtrinsicConvention(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
-
-
-def _inverse(given: Array) -> ExtrinsicConvention:
-    T_imu_cam, cause = se3_inverse(given), "T_imu_cam is inverted, from the IMU to the camera"
-    return ExtrinsicConvention(
-        T_imu_cam, "the inverse of the extrinsic", cause, "the extrinsic is inverted", T_imu_cam[:3, 3]
-    )
+    place_m, turns, inverse = given[:3, 3], right_handed_axes()[1:], se3_inverse(given)
+    found = [ExtrinsicConvention(given, _OWN, "", "", place_m)]
+    for turn in turns:
+        axes, done = axes_named(turn), "the extrinsic is rotated to the samples' axes"
+        cause, T_imu_cam = f"the motion samples' axes are the extrinsic's {axes}", se3(turn, np.zeros(3)) @ given
+        found.append(ExtrinsicConvention(T_imu_cam, axes, cause, done, place_m))
+    for turn in turns:
+        axes, done = axes_named(turn.T), "the camera's rotation is corrected, its position is kept"
+        cause, T_imu_cam = f"the camera's axes are the extrinsic's {axes}", given @ se3(turn, np.zeros(3))
+        elsewhere_m = T_imu_cam[:3, :3] @ given[:3, :3].T @ place_m
+        found.append(ExtrinsicConvention(T_imu_cam, f"the camera's {axes}", cause, done, elsewhere_m))
+    name, cause = "the inverse of the extrinsic", "T_imu_cam is inverted, from the IMU to the camera"
+    return [*found, ExtrinsicConvention(inverse, name, cause, "the extrinsic is inverted", inverse[:3, 3])]
 
 
 def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:
@@ -258,15 +223,6 @@ def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:
     apart_rad = np.linalg.norm(R_imu_cam - R_imu_cam[one], axis=(1, 2)) / np.sqrt(2.0)  # of small angles
     alone = (0, len(readings) - 1)
     return [k for k in range(len(readings)) if k == one or (apart_rad[k] < SAME_WAY_RAD and not {k, one} & {*alone})]
-
-
-def _settled(
-    evidence: Evidence, intervals: Intervals, twins: list[ExtrinsicConvention]
-) -> tuple[ExtrinsicConvention, str]:
-    """Return the best of readings that look the same way, at the position that turns show, and any doubt in words."""
-    place_m, doubt = _placed(evidence, intervals, twins[_ranked(intervals, twins).best])
-    placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in twins]
-    return placed[_ranked(intervals, placed).best], doubt
 
 
 def _placed(evidence: Evidence, intervals: Intervals, reading: ExtrinsicConvention) -> tuple[Array, str]:
@@ -305,13 +261,6 @@ def _ranked(intervals: Intervals, readings: list[ExtrinsicConvention]) -> Rankin
     return ranked(costs)
 
 
-def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
-    """Return the change of the one-step stereo reprojection as text."""
-    sequence, camera = evidence.sequence, evidence.camera_motion
-    given_px, now_px = (median_one_step_px(sequence, camera, T) for T in (sequence.rig.T_imu_cam, T_imu_cam))
-    return f"median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px"
-
-
 @beside_camera
 def extrinsic_translation(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Compare the extrinsic's translation with that of its inverse; take the latter where it is far more likely.
@@ -331,23 +280,14 @@ def extrinsic_translation(evidence: Evidence, intervals: Intervals) -> Symptom |
     share = way_gone(intervals, evidence.velocity_fit.position, candidate - given)
     if is_excluded(share):
         return None
-    where = (
-        f"by the tracks during rotation it is {share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m) to"
-    )
+    way = f"{share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m)"
+    where, other = f"by the tracks during rotation it is {way} to", metres(candidate)
     if not is_there(share):
-        summary = (
-            f"the camera is at {metres(given)}, or at {metres(candidate)} if that is the translation of the inverse"
-        )
+        summary = f"the camera is at {metres(given)}, or at {other} if that is the translation of the inverse"
         return Undecided(f"{summary}: {where} there, and there is too little rotation to decide")
-    return Symptom(
-        count=1,
-        detail=(
-            f"the camera at {metres(given)} in the IMU frame is the translation of the inverse: {where} "
-            f"{metres(candidate)}"
-        ),
-        treatment="the camera's position is set to it",
-        remedy=replace(evidence.sequence, rig=replace(rig, T_imu_cam=se3(rotation, candidate))),
-    )
+    detail = f"the camera at {metres(given)} in the IMU frame is the translation of the inverse: {where} {other}"
+    remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=se3(rotation, candidate)))
+    return Symptom(1, detail, "the camera's position is set to it", remedy)
 
 
 # Durations (s). Over a stride the camera's velocity changes by more than its noise; over a window the gyro drifts
@@ -398,12 +338,10 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     if best == 0 or behind[0] < AGAINST_GIVEN_ORDER or best_mps2 > MOST_LEFT * given_mps2:
         return None
     return Symptom(
-        count=1,
-        detail=(
-            f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: the residual against the camera's "
-            f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 in that order (median)"
-        ),
-        treatment=f"its channels are exchanged or have the wrong sign: correct them{MIRRORED}",
+        1,
+        f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: the residual against the camera's "
+        f"change of velocity is {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 in that order (median)",
+        f"its channels are exchanged or have the wrong sign: correct them{MIRRORED}",
         remedy=None,
         spoils_vision=True,
     )

@@ -1,6 +1,6 @@
 """Faults of the motion samples alone, or beside the sizes of motion and gravity: values, columns, units, noise."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -72,17 +72,16 @@ def not_finite(evidence: Evidence) -> Symptom | None:
     if bad_samples and not samples.any():
         why = "no motion sample is left: check the program that wrote them"
         return Symptom(bad_sightings + bad_samples, detail, why, remedy=None, spoils_vision=True)
-    remedy = sequence
-    if bad_sightings:
-        remedy = replace(remedy, observations=sequence.observations.select(sightings))
-    if bad_samples:
-        remedy = remedy.with_samples(samples)
-    return Symptom(
-        count=bad_sightings + bad_samples,
-        detail=detail,
-        treatment="dropped; the neighbouring motion samples bridge the interval",
-        remedy=remedy,
-    )
+    return Symptom(bad_sightings + bad_samples, detail, DROPPED, _with_rows(sequence, sightings, samples))
+
+
+DROPPED = "dropped; the neighbouring motion samples bridge the interval"
+
+
+def _with_rows(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> Sequence:
+    """Return the sequence with some of its sightings (N,) and motion samples (S,)."""
+    kept = sequence if sightings.all() else replace(sequence, observations=sequence.observations.select(sightings))
+    return kept if samples.all() else kept.with_samples(samples)
 
 
 def _empty(values: Array, names: tuple[str, ...]) -> list[str]:
@@ -123,20 +122,10 @@ def implausible(evidence: Evidence) -> Symptom | None:
     samples = _implausible_samples(sequence)
     if not (sightings.any() or samples.any()):
         return None
-    remedy = sequence
-    if sightings.any():
-        remedy = replace(remedy, observations=sequence.observations.select(~sightings))
-    if samples.any():
-        remedy = remedy.with_samples(~samples)
-    return Symptom(
-        count=int(sightings.sum() + samples.sum()),
-        detail=(
-            f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) are beyond the range of any sensor, "
-            f"up to {_largest(sequence, sightings, samples):.3g}"
-        ),
-        treatment="dropped; the neighbouring motion samples bridge the interval",
-        remedy=remedy,
-    )
+    bad = np.concatenate([sequence.observations.uv_px[sightings].ravel(), sequence.motion.values[samples].ravel()])
+    beyond = f"are beyond the range of any sensor, up to {np.abs(bad).max():.3g}"
+    detail = f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) {beyond}"
+    return Symptom(int(sightings.sum() + samples.sum()), detail, DROPPED, _with_rows(sequence, ~sightings, ~samples))
 
 
 def _implausible_samples(sequence: Sequence) -> BoolArray:
@@ -183,11 +172,6 @@ def _alone(step: Array, least: Array) -> BoolArray:
     quiet = beside < ALONE * np.minimum(size[1:-2], size[2:-1])
     alone[2:-2] = (_there_and_back(step, least)[1:-1] & quiet).any(axis=1)
     return alone if alone.sum() <= max(FEWEST_ALONE, MOST_ALONE * alone.size) else np.zeros_like(alone)
-
-
-def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> float:
-    bad: tuple[Array, ...] = (sequence.observations.uv_px[sightings], sequence.motion.values[samples])
-    return max(float(np.abs(values).max(initial=0.0)) for values in bad)
 
 
 # Least number and duration (s) of equal samples in a row: beyond chance, and beyond a sensor that is read more often
@@ -283,10 +267,9 @@ def _never_moves(evidence: Evidence) -> Symptom | None:
     camera, values = evidence.camera_motion, evidence.sequence.motion.values
     if not len(values) or camera.known.sum() < LEAST_RUN:
         return None
-    moved, findings = (camera.v_mps, camera.w_radps), list[str]()
-    for sensor, seen, least, moves in zip(
-        SENSORS["twist"], moved, (CAMERA_STANDING_MPS, STRAIGHT_RADPS), ("moves", "turns"), strict=True
-    ):
+    findings = list[str]()
+    limits = (camera.v_mps, CAMERA_STANDING_MPS, "moves"), (camera.w_radps, STRAIGHT_RADPS, "turns")
+    for sensor, (seen, least, moves) in zip(SENSORS["twist"], limits, strict=True):
         usual = float(np.median(np.linalg.norm(seen[camera.known], axis=1)))
         if not values[:, sensor.columns].any() and usual > least:
             camera_moves = f"the camera {moves} at {usual:.2g} {sensor.unit}"
@@ -331,11 +314,8 @@ def saturated_samples(evidence: Evidence) -> Symptom | None:
                 findings.append(f"{sensor.name} {axis} at {at} ({at_end.sum()} samples)")
     if not findings:
         return None
-    return Symptom.warning(
-        count=int(rows.sum()),
-        detail=f"samples accumulate at the end of a range: {', '.join(findings)}",
-        treatment="values beyond it are lost: use a sensor of a larger range",
-    )
+    detail = f"samples accumulate at the end of a range: {', '.join(findings)}"
+    return Symptom.warning(detail, "values beyond it are lost: use a sensor of a larger range", int(rows.sum()))
 
 
 def _at_range_end(column: Array) -> BoolArray:
@@ -411,20 +391,28 @@ def overstated_noise(evidence: Evidence) -> Symptom | None:
     if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)):
         return None
     finite = np.isfinite(motion.values).all(axis=1)
-    t_ns, values = motion.t_ns[finite], motion.values[finite]
-    if t_ns.size < LEAST_SAMPLES or (np.diff(t_ns) <= 0).any():
+    t_s, values = (motion.t_ns[finite] - motion.t_ns[finite][:1]) / NS_PER_S, motion.values[finite]
+    if t_s.size < LEAST_SAMPLES or (np.diff(t_s) <= 0).any():
         return None
-    findings = list(_refuted(t_ns / NS_PER_S - t_ns[0] / NS_PER_S, values, noise))
-    if not findings:
-        return None
-    return Symptom.warning(
-        count=len(findings),
-        detail="; ".join(findings),
-        treatment=(
-            "estimators given this noise hardly use the IMU: check it (imu0/sensor.yaml, imu.yaml); it is a "
-            "density, the standard deviation at one sample a second"
-        ),
+    step_s, lag_s, found = float(np.median(np.diff(t_s))), 0.25 * float(t_s[-1]), list[str]()
+    begin = np.flatnonzero(t_s <= t_s[-1] - lag_s)
+    end = np.minimum(np.searchsorted(t_s, t_s[begin] + lag_s), t_s.size - 1)
+    for name, (_, _, columns, unit) in zip(("accel", "gyro"), SENSORS["imu"], strict=True):
+        stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s)
+        white = float(white_sigma(values[:, columns]).max())
+        if stated > MOST_WHITE * white > 0.0:
+            measured = f"measured are {white:.2g} +- {white / np.sqrt(len(values)):.1g}"
+            found.append(f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and {measured}")
+        stated = getattr(noise, f"{name}_random_walk") * np.sqrt(lag_s)
+        moved = float(np.sqrt(np.mean((values[end, columns] - values[begin, columns]) ** 2)))  # motion included
+        if stated > MOST_WALK * moved > 0.0:
+            drift = f"they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are {moved:.3g}"
+            found.append(f"by {name}_random_walk {drift}")
+    treatment = (
+        "estimators given this noise hardly use the IMU: check it (imu0/sensor.yaml, imu.yaml); it is a density, the "
+        "standard deviation at one sample a second"
     )
+    return Symptom.warning("; ".join(found), treatment, len(found)) if found else None
 
 
 # Limit of the samples' own scatter over the stated one. Rotors shake an accelerometer 15 times as much as stated, in
@@ -449,41 +437,10 @@ def understated_noise(evidence: Evidence) -> Symptom | None:
         measured = float(np.quantile([white_sigma(part).min() for part in parts], QUIETEST))
         stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s) if step_s > 0.0 else np.inf
         if measured > MOST_BEYOND_STATED * stated:
-            summary = (
-                f"by {name}_noise_density samples scatter by {stated:.2g} {unit}, and where they are quietest they"
-            )
-            found.append(f"{summary} do by {measured:.2g}, {measured / stated:.0f} times as much")
-    if not found:
-        return None
-    treatment = (
-        "estimators given this noise trust the IMU too much: state the densities of the sensor in motion, in SI and "
-        "not in g and degrees"
-    )
-    return Symptom.warning("; ".join(found), treatment, count=len(found))
-
-
-def _refuted(t_s: Array, values: Array, noise: ImuNoise) -> Iterator[str]:
-    """Yield a description of each stated density that samples (S, 6) at times (S,) contradict, with both figures."""
-    step_s = float(np.median(np.diff(t_s)))
-    lag_s = 0.25 * float(t_s[-1] - t_s[0])
-    for name, (_, _, columns, unit) in zip(("accel", "gyro"), SENSORS["imu"], strict=True):
-        stated = getattr(noise, f"{name}_noise_density") / np.sqrt(step_s)
-        found = float(white_sigma(values[:, columns]).max())
-        if stated > MOST_WHITE * found and found > 0.0:
-            measured = f"measured are {found:.2g} +- {found / np.sqrt(len(values)):.1g}"
-            yield f"by {name}_noise_density samples scatter by {stated:.3g} {unit}, and {measured}"
-        stated = getattr(noise, f"{name}_random_walk") * np.sqrt(lag_s)
-        found = _moved(t_s, values[:, columns], lag_s)
-        if stated > MOST_WALK * found > 0.0:
-            drift = f"they drift by {stated:.3g} {unit} in {lag_s:.3g} s, and measured are {found:.3g}"
-            yield f"by {name}_random_walk {drift}"
-
-
-def _moved(t_s: Array, values: Array, lag_s: float) -> float:
-    """Return the change of samples (S, 3) within a time, motion included: the root mean square over all axes."""
-    begin = np.flatnonzero(t_s <= t_s[-1] - lag_s)
-    end = np.minimum(np.searchsorted(t_s, t_s[begin] + lag_s), t_s.size - 1)
-    return float(np.sqrt(np.mean((values[end] - values[begin]) ** 2)))
+            quietest = f"where they are quietest they do by {measured:.2g}, {measured / stated:.0f} times as much"
+            found.append(f"by {name}_noise_density samples scatter by {stated:.2g} {unit}, and {quietest}")
+    treatment = "estimators given this noise trust the IMU too much: state the densities of the sensor in motion, in SI"
+    return Symptom.warning("; ".join(found), f"{treatment} and not in g and degrees", len(found)) if found else None
 
 
 # As given a size is wrong by more than the first factor; exchanged, both are right within the second, as in sound
@@ -494,42 +451,27 @@ _OTHER_WAY = [3, 4, 5, 0, 1, 2]
 
 def exchanged_samples(evidence: Evidence) -> Symptom | None:
     """Exchange linear and angular columns where this alone makes both agree with camera and gravity."""
-    sequence = evidence.sequence
-    if evidence.intervals is None or not _sizes_are_off(evidence):
+    sequence, intervals = evidence.sequence, evidence.intervals
+    size = _linear_ratio(evidence)
+    if intervals is None or size is None or 1.0 / LEAST_FACTOR < size.value < LEAST_FACTOR:
         return None
-    exchanged = _with_columns(sequence, lambda columns: columns[..., _OTHER_WAY])
-    if not _fits(evidence.after(exchanged)):
+    exchanged = evidence.after(_with_columns(sequence, lambda columns: columns[..., _OTHER_WAY]))
+    size = _linear_ratio(exchanged)
+    if exchanged.intervals is None or not (size is None or 1.0 / MOST_FACTOR < size.value < MOST_FACTOR):
         return None
-    names = ("velocities", "rates of rotation")
-    if sequence.motion_kind == "imu":
-        names = ("accelerations", "rates of rotation")
-    return Symptom(
-        count=len(sequence.motion.values),
-        detail=f"{names[0]} and {names[1]} are exchanged: {_sizes(sequence)}, which are plausible the other way round",
-        treatment="exchanged back",
-        remedy=exchanged,
-    )
-
-
-def _sizes_are_off(evidence: Evidence) -> bool:
-    speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
-    ratio = speed if force is None else force
-    return ratio is not None and not 1.0 / LEAST_FACTOR < ratio.value < LEAST_FACTOR
-
-
-def _fits(evidence: Evidence) -> bool:
-    if evidence.intervals is None:
-        return False
-    sizes = (speed_ratio(evidence.intervals), force_ratio(evidence.sequence))
-    fit = all(1.0 / MOST_FACTOR < size.value < MOST_FACTOR for size in sizes if size is not None)
-    return fit and rotation_ratio(evidence.intervals).value < MOST_FACTOR  # the camera's noise lowers this one
-
-
-def _sizes(sequence: Sequence) -> str:
-    """Return the median sizes of linear and angular columns as text."""
+    if not rotation_ratio(exchanged.intervals).value < MOST_FACTOR:  # the camera's noise lowers this one
+        return None
+    linear, angular = SENSORS[sequence.motion_kind]
     first, second = (float(np.median(np.linalg.norm(half, axis=1))) for half in np.split(sequence.motion.values, 2, 1))
-    unit = "m/s^2" if sequence.motion_kind == "imu" else "m/s"
-    return f"{first:.2g} {unit} and {second:.2g} rad/s (medians)"
+    sizes = f"{first:.2g} {linear.unit} and {second:.2g} {angular.unit} (medians)"
+    detail = f"{linear.plural} and {angular.plural} are exchanged: {sizes}, which are plausible the other way round"
+    return Symptom(len(sequence.motion.values), detail, "exchanged back", exchanged.sequence)
+
+
+def _linear_ratio(evidence: Evidence) -> Scalar | None:
+    """Return the ratio of specific force to gravity, or else of the samples' speed to the camera's."""
+    force = force_ratio(evidence.sequence)
+    return speed_ratio(evidence.intervals) if force is None else force
 
 
 # A specific force whose median is below this share of gravity lacks it. One in g has a size that hardly changes over a
@@ -540,19 +482,13 @@ LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE, MOST_BIAS = 0.5, 0.25, 0.5, 0.06
 
 def gravity_removed(evidence: Evidence) -> Symptom | None:
     """Report an accelerometer whose driver took gravity out of what it measures: the motion's acceleration is left."""
-    ratio = force_ratio(evidence.sequence)
-    if ratio is None or not _lacks_gravity(evidence.sequence):
+    sequence, ratio = evidence.sequence, force_ratio(evidence.sequence)
+    if ratio is None or not _lacks_gravity(sequence):
         return None
-    size = (
-        f"{ratio.value:.2g} times gravity (median), which changes by {_range_of_force(evidence.sequence):.0%} of that"
-    )
-    return Symptom(
-        1,
-        f"the accelerometer reads {size}: gravity was taken out of it",
-        "record the specific force, which is gravity at rest: the raw topic of the sensor, not a linear acceleration",
-        remedy=None,
-        spoils_vision=True,
-    )
+    size = f"{ratio.value:.2g} times gravity (median), which changes by {_range_of_force(sequence):.0%} of that"
+    why = "record the specific force, which is gravity at rest: the raw topic of the sensor, not a linear acceleration"
+    detail = f"the accelerometer reads {size}: gravity was taken out of it"
+    return Symptom(1, detail, why, remedy=None, spoils_vision=True)
 
 
 def _lacks_gravity(sequence: Sequence) -> bool:
@@ -608,12 +544,10 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
     unit's factor names the unit. One that speeds and rates have in common is that of the stamps, because the
     camera's motion is divided by time. Baseline and extrinsic are judged by lengths that no rig has.
     """
-    found: list[_WrongUnit] = []
-    now = evidence
-    stamps = _stamps(evidence) or _frame_rate(evidence)
+    now, stamps = evidence, _stamps(evidence) or _frame_rate(evidence)
+    found = [] if stamps is None else [stamps]
     of_samples = (partial(_of_samples, quantity=quantity) for quantity in _QUANTITIES)
     measures: tuple[Callable[[Evidence], _WrongUnit | None], ...] = (_baseline, _lever_arm, *of_samples, _truth)
-    found += [] if stamps is None else [stamps]
     for measure in measures if stamps is None else ():
         wrong = measure(now)
         if wrong is not None:
@@ -622,13 +556,9 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
     if not found:
         return evidence.blind if evidence.intervals is None else None
     certain = all(wrong.remedy is not None for wrong in found)
-    return Symptom(
-        count=len(found),
-        detail="; ".join(wrong.summary for wrong in found),
-        treatment="converted to SI" if certain else "no single unit fits all of it: correct the recording",
-        remedy=now.sequence if certain else None,
-        spoils_vision=True,
-    )
+    treatment = "converted to SI" if certain else "no single unit fits all of it: correct the recording"
+    detail = "; ".join(wrong.summary for wrong in found)
+    return Symptom(len(found), detail, treatment, now.sequence if certain else None, spoils_vision=True)
 
 
 def _stamps(evidence: Evidence) -> _WrongUnit | None:
@@ -642,24 +572,20 @@ def _stamps(evidence: Evidence) -> _WrongUnit | None:
         return None
     if min(abs(np.log(ratio.value)) for ratio in (speed, rotation)) < np.log(LEAST_OF_STAMPS):
         return None
-    return _WrongUnit(
-        f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and their rate of rotation {rotation.value:.3g} "
-        f"+- {rotation.error:.1g} times the camera's: the stamps run {speed.value:.3g} times as fast as "
-        "time, so they are not in seconds",
-        None,
-    )
+    rates = f"their rate of rotation {rotation.value:.3g} +- {rotation.error:.1g} times the camera's"
+    fast = f"the stamps run {speed.value:.3g} times as fast as time, so they are not in seconds"
+    return _WrongUnit(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and {rates}: {fast}", None)
 
 
 def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
     """Report stamps whose steps between frames are not those of a vehicle's camera."""
-    if evidence.sequence.frame_count < 2 or evidence.intervals is None:
+    if evidence.intervals is None:
         return None
     step_s = usual_step_s(evidence.sequence.frames_t_ns)
     if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
         return None
-    return _WrongUnit(
-        f"by the stamps frames come every {step_s:.2g} s, which no camera does: they are not in seconds", None
-    )
+    summary = f"by the stamps frames come every {step_s:.2g} s, which no camera does: they are not in seconds"
+    return _WrongUnit(summary, None)
 
 
 def _baseline(evidence: Evidence) -> _WrongUnit | None:

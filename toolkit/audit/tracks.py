@@ -2,13 +2,14 @@
 
 import itertools
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import LEAST_INTERVALS, interval_means, is_comparable
-from toolkit.audit.one_step import CORRELATION_SIGMAS, MOST_CORRELATION, errors_are_independent
+from toolkit.audit.one_step import errors_are_independent
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S, is_left_only
@@ -24,12 +25,9 @@ def no_sightings(evidence: Evidence) -> Symptom | None:
     sequence = evidence.sequence
     if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
         return None
-    return Symptom(
-        count=sequence.frame_count,
-        detail=f"none of {sequence.frame_count} frames has a stereo sighting",
-        treatment="only dead reckoning can be compared: check the tracker that made the recording",
-        remedy=None,
-    )
+    detail = f"none of {sequence.frame_count} frames has a stereo sighting"
+    why = "only dead reckoning can be compared: check the tracker that made the recording"
+    return Symptom(sequence.frame_count, detail, why, remedy=None)
 
 
 def unknown_rows(evidence: Evidence) -> Undecided | None:
@@ -53,23 +51,16 @@ def returning_tracks(evidence: Evidence) -> Symptom | None:
     """
     observations = evidence.sequence.observations
     order = observations.by_track
-    same_track = np.diff(observations.track_id[order]) == 0
     absent = np.diff(observations.frame[order]) - 1
-    returns = np.zeros(len(observations), dtype=bool)
-    returns[order[1:]] = same_track & (absent > 0)
-    count = int(returns.sum())
-    if count == 0:
+    returns = (np.diff(observations.track_id[order]) == 0) & (absent > 0)
+    if not (count := int(returns.sum())):
         return None
-    gaps = absent[same_track & (absent > 0)]
-    return Symptom(
-        count=count,
-        detail=f"{count} return(s) of a track after an absence of {gaps.min()} to {gaps.max()} frames",
-        treatment="the track ends before its absence and a new one starts after it",
-        remedy=replace(
-            evidence.sequence,
-            observations=Observations.sorted(observations.frame, observations.split(returns), observations.uv_px),
-        ),
-    )
+    gaps = absent[returns]
+    detail = f"{count} return(s) of a track after an absence of {gaps.min()} to {gaps.max()} frames"
+    treatment = "the track ends before its absence and a new one starts after it"
+    new = observations.split(np.isin(np.arange(len(observations)), order[1:][returns]))
+    split = Observations.sorted(observations.frame, new, observations.uv_px)
+    return Symptom(count, detail, treatment, replace(evidence.sequence, observations=split))
 
 
 # Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale
@@ -102,14 +93,12 @@ def stale_frames(evidence: Evidence) -> Symptom | None:
         return None
     repeated = np.zeros(len(sequence.observations), dtype=bool)
     repeated[pairs.after] = stale[pairs.interval] & (step_px == 0.0)
+    exactly = f"exactly while the vehicle moves ({repeated.sum()} sightings)"
     return Symptom(
-        count=count,
-        detail=(
-            f"{count} of {sequence.frame_count} frames repeat the pixels of the frame before them exactly while the "
-            f"vehicle moves ({repeated.sum()} sightings)"
-        ),
-        treatment="every repeated track ends there, the repeats are dropped, and a new track starts at the next frame",
-        remedy=_cut_tracks(sequence, repeated),
+        count,
+        f"{count} of {sequence.frame_count} frames repeat the pixels of the frame before them {exactly}",
+        "every repeated track ends there, the repeats are dropped, and a new track starts at the next frame",
+        _cut_tracks(sequence, repeated),
     )
 
 
@@ -186,14 +175,10 @@ def coarse_pixels(evidence: Evidence) -> Symptom | None:
     if step_px is None:
         return None
     rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
-    return Symptom(
-        count=len(seen_px),
-        detail=f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL",
-        treatment="write them with all the digits that the tracker has; depths of far points suffer most",
-        remedy=None,
-        harmful=False,
-        warns=bool(rounding_px > MOST_ROUNDING * stated_px),
-    )
+    detail = f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL"
+    treatment = "write them with all the digits that the tracker has; depths of far points suffer most"
+    found = Symptom.information(len(seen_px), detail, treatment)
+    return replace(found, warns=bool(rounding_px > MOST_ROUNDING * stated_px))
 
 
 def _step_px(uv_px: Array) -> tuple[float | None, str]:
@@ -285,50 +270,29 @@ def _filled_right(sequence: Sequence) -> Symptom | None:
         return None
     without = uv_px.copy()
     without[filled, 1] = np.nan
-    return Symptom(
-        count=count,
-        detail=f"{count} of {len(uv_px)} sightings have a uR of {filler:g} at {places} values of uL: no right image",
-        treatment="taken as sightings by the left image alone; leave uR empty where there is none",
-        remedy=replace(sequence, observations=replace(observations, uv_px=without)),
-        harmful=False,
-    )
+    detail = f"{count} of {len(uv_px)} sightings have a uR of {filler:g} at {places} values of uL: no right image"
+    treatment = "taken as sightings by the left image alone; leave uR empty where there is none"
+    remedy = replace(sequence, observations=replace(observations, uv_px=without))
+    return Symptom(count, detail, treatment, remedy, harmful=False)
 
 
 def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
     """Report sightings without disparity: missing ones written as zeros, or one image in the columns of both."""
-    observations = sequence.observations
-    uv_px = observations.uv_px
-    filler, missing = _filler(uv_px)
-    same = uv_px[:, 0] == uv_px[:, 1]
-    of_all = f"of {len(observations)} sightings"
-    if missing.sum() > 0.5 * suspect.sum():
-        count = int(missing.sum())
-        return Symptom(
-            count=count,
-            detail=f"{count} {of_all} are {filler:g} in every coordinate: missing ones, written as {filler:g}",
-            treatment="dropped; write -1 for them in a course file, and leave their rows out of a table",
-            remedy=replace(sequence, observations=observations.select(~missing)),
-            harmful=False,
-        )
-    if same.sum() > 0.5 * suspect.sum():
-        return Symptom(
-            count=int(same.sum()),
-            detail=f"{int(same.sum())} {of_all} have a uR that equals uL: one camera's columns stand for both",
-            treatment="without the right image there is no depth: correct the file, or leave uR empty",
-            remedy=None,
-            spoils_vision=True,
-        )
+    observations, uv_px = sequence.observations, sequence.observations.uv_px
+    same, of_all = uv_px[:, 0] == uv_px[:, 1], f"of {len(observations)} sightings"
+    values, counts = np.unique(uv_px[(uv_px == uv_px[:, :1]).all(axis=1), 0], return_counts=True)
+    filler = float(values[np.argmax(counts)]) if values.size else np.nan
+    missing = (uv_px == filler).all(axis=1)
+    if (count := int(missing.sum())) > 0.5 * suspect.sum():
+        detail = f"{count} {of_all} are {filler:g} in every coordinate: missing ones, written as {filler:g}"
+        treatment = "dropped; write -1 for them in a course file, and leave their rows out of a table"
+        remedy = replace(sequence, observations=observations.select(~missing))
+        return Symptom(count, detail, treatment, remedy, harmful=False)
+    if (count := int(same.sum())) > 0.5 * suspect.sum():
+        detail = f"{count} {of_all} have a uR that equals uL: one camera's columns stand for both"
+        why = "without the right image there is no depth: correct the file, or leave uR empty"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
     return None
-
-
-def _filler(uv_px: Array) -> tuple[float, BoolArray]:
-    """Return the most frequent value among sightings (N, 3) with equal coordinates, and which of them (N,) have it."""
-    alike = (uv_px == uv_px[:, :1]).all(axis=1)
-    if not alike.any():
-        return np.nan, alike
-    values, counts = np.unique(uv_px[alike, 0], return_counts=True)
-    filler = float(values[np.argmax(counts)])
-    return filler, np.asarray(alike & (uv_px[:, 0] == filler))
 
 
 def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
@@ -384,14 +348,12 @@ def doubled_disparity(evidence: Evidence) -> Symptom | None:
         return None
     tracks = begun.track_id[np.isin(begun.frame, bad_frames) & (begun.first_ratio > LEAST_RATIO)]
     where = f"frame {bad_frames[0]}" if len(bad_frames) == 1 else f"{len(bad_frames)} frames"
+    doubles = "doubles from their first sighting to the second and stays so"
     return Symptom(
-        count=tracks.size,
-        detail=(
-            f"the disparity of {tracks.size} tracks, of nearly all detected in {where}, doubles from their first "
-            "sighting to the second and stays so"
-        ),
-        treatment="halved in every sighting but the first",
-        remedy=replace(evidence.sequence, observations=_halved(observations, tracks)),
+        tracks.size,
+        f"the disparity of {tracks.size} tracks, of nearly all detected in {where}, {doubles}",
+        "halved in every sighting but the first",
+        replace(evidence.sequence, observations=_halved(observations, tracks)),
     )
 
 
@@ -409,9 +371,8 @@ class _Beginnings(NamedTuple):
 
     def select(self, rows: BoolArray) -> "_Beginnings":
         """Return the tracks of a mask (T,)."""
-        return _Beginnings(
-            self.track_id[rows], self.frame[rows], self.first_px[rows], self.first_ratio[rows], self.second_ratio[rows]
-        )
+        numbers, (first_px, *ratios) = self[:2], (values[rows] for values in self[2:])
+        return _Beginnings(numbers[0][rows], numbers[1][rows], first_px, *ratios)
 
 
 def _beginnings(observations: Observations) -> _Beginnings:
@@ -467,32 +428,21 @@ def no_disparity(evidence: Evidence) -> Symptom | None:
     """Count the sightings with uL - uR <= 0 and drop them; their tracks continue."""
     observations = evidence.sequence.observations
     bad = disparity_px(observations.uv_px) <= 0.0
-    count = int(bad.sum())
-    if count == 0:
+    if not (count := int(bad.sum())):
         return None
-    return Symptom(
-        count=count,
-        detail=f"{count} of {len(observations)} sightings have a disparity <= 0 ({count / len(observations):.2%})",
-        treatment="dropped",
-        remedy=replace(evidence.sequence, observations=observations.select(~bad)),
-    )
+    detail = f"{count} of {len(observations)} sightings have a disparity <= 0 ({count / len(observations):.2%})"
+    return Symptom(count, detail, "dropped", replace(evidence.sequence, observations=observations.select(~bad)))
 
 
 def left_only(evidence: Evidence) -> Symptom | None:
     """Count the sightings without the right image; warn where there are no others: no point has a depth."""
     uv_px = evidence.sequence.observations.uv_px
-    count = int(is_left_only(uv_px).sum())
-    if count == 0:
+    if not (count := int(is_left_only(uv_px).sum())):
         return None
-    none_else = count == len(uv_px)
-    return Symptom(
-        count=count,
-        detail=f"{count} of {len(uv_px)} sightings ({count / len(uv_px):.0%}) lack the right image",
-        treatment="without any disparity, depths depend on the motion alone" if none_else else "used for uL and v",
-        remedy=None,
-        harmful=False,
-        warns=none_else,
-    )
+    detail = f"{count} of {len(uv_px)} sightings ({count / len(uv_px):.0%}) lack the right image"
+    if count == len(uv_px):
+        return Symptom.warning(detail, "without any disparity, depths depend on the motion alone", count)
+    return Symptom.information(count, detail, "used for uL and v")
 
 
 # Least length (s) of a span: every estimator bridges shorter ones by the motion samples.
@@ -514,13 +464,11 @@ def thin_vision(evidence: Evidence) -> Symptom | None:
     share = sum(end - begin for begin, end in spans) / known.size
     seen = len(sequence.observations) / sequence.frame_count
     return Symptom.warning(
-        count=len(spans),
-        detail=(
-            f"the tracks do not determine the camera's motion for {share:.0%} of the time, the longest at "
-            f"{frame_s[longest[0]]:.1f}-{frame_s[longest[1]]:.1f} s ({seen:.1f} sightings a frame over all)"
-        ),
-        treatment="there every estimate rests on the motion samples, or on a few tracks that may be wrong",
-        spans_ns=tuple((int(sequence.frames_t_ns[begin]), int(sequence.frames_t_ns[end])) for begin, end in spans),
+        f"the tracks do not determine the camera's motion for {share:.0%} of the time, the longest at "
+        f"{frame_s[longest[0]]:.1f}-{frame_s[longest[1]]:.1f} s ({seen:.1f} sightings a frame over all)",
+        "there every estimate rests on the motion samples, or on a few tracks that may be wrong",
+        len(spans),
+        tuple((int(sequence.frames_t_ns[begin]), int(sequence.frames_t_ns[end])) for begin, end in spans),
     )
 
 
@@ -564,8 +512,7 @@ def track_scatter(evidence: Evidence) -> Symptom | Undecided | None:
     of covariance J R J^T + R, where R is that of a sighting. If R is right, the squared Mahalanobis distances have
     the upper quartile of the chi-square distribution with three degrees of freedom, which a few gross errors do not
     change. Where R is assumed and too large, mismatches are found by their number. A scatter far below the stated
-    noise contradicts it too, with certainty only if errors are independent from frame to frame
-    (`correlated_tracks`).
+    noise contradicts it too, with certainty only if errors are independent from frame to frame.
     """
     if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return evidence.blind
@@ -627,14 +574,18 @@ def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
 
 def _tail(chi2: Array) -> Symptom | None:
     """Report too many gross distances (P,), or too many far ones where the median agrees with the noise."""
-    gross, error = _gross_share(chi2), jackknife_error(_gross_share, chi2)
+    gross, error = _share_beyond(chi2, GROSS_CHI2), jackknife_error(partial(_share_beyond, bound=GROSS_CHI2), chi2)
     if gross > MOST_GROSS + SCATTER_SIGMAS * error:
         return _mismatched(f"{gross:.1%} +- {error:.1%}", f"{np.sqrt(GROSS_CHI2):.0f} times what the noise explains")
-    far, error = _far_share(chi2), jackknife_error(_far_share, chi2)
+    far, error = _share_beyond(chi2, FAR_CHI2), jackknife_error(partial(_share_beyond, bound=FAR_CHI2), chi2)
     least, most = USUAL_SCATTER
     if least < _nearer_scatter(chi2) < most and far > MOST_FAR + FAR_SIGMAS * error:
         return _mismatched(f"{far:.1%} +- {error:.1%}", "the stated noise explains (0.1% do by chance)")
     return None
+
+
+def _share_beyond(chi2: Array, bound: float) -> float:
+    return float(np.mean(chi2 > bound))
 
 
 def _mismatched(share: str, than: str) -> Symptom:
@@ -652,38 +603,3 @@ def _scatter_ratio(chi2: Array) -> float:
 def _nearer_scatter(chi2: Array) -> float:
     """Return the same ratio by the median of the squared distances (P,)."""
     return float(np.sqrt(np.median(chi2) / CHI2_3_MEDIAN))
-
-
-def _gross_share(chi2: Array) -> float:
-    return float(np.mean(chi2 > GROSS_CHI2))
-
-
-def _far_share(chi2: Array) -> float:
-    return float(np.mean(chi2 > FAR_CHI2))
-
-
-def correlated_tracks(evidence: Evidence) -> Symptom | None:
-    """Report the correlation of neighbouring one-step residuals where errors are not independent.
-
-    If the errors of sightings are independent, the error of the second of three is in both residuals with opposite
-    signs, and their correlation is -1/2. If the errors are a random walk it is 0; a wrong depth gives residuals of
-    one sign.
-    """
-    if evidence.spoilt_by:
-        return None
-    if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
-        return None
-    found = evidence.step_correlation
-    if found is None:
-        return None
-    value, error = found
-    if value < MOST_CORRELATION + CORRELATION_SIGMAS * error:
-        return None
-    return Symptom.information(
-        count=1,
-        detail=(
-            f"the errors of a track's sightings are correlated: from one step to the next by {value:+.2f} "
-            f"+- {error:.2f}, where independent errors have -0.5"
-        ),
-        treatment="measured, so that tracks count for less (noise.track_weight); 'vislam card' shows the correlation",
-    )

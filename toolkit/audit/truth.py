@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.audit.alignment import metres
 from toolkit.audit.clocks import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import LEAST_INTERVALS, chained, interval_means, is_comparable, moved_by
@@ -117,13 +118,8 @@ def off_by(both: Array) -> WindowMedian:
 
 def longer(seen: Array, true: Array) -> tuple[WindowMedian, bool]:
     """Return the ratio of displacements (M, 3) along the true ones, and whether scaling removes the difference."""
-    scale = _ratio(seen, true)
+    scale = compared((seen * true).sum(axis=1) / (true**2).sum(axis=1))
     return scale, scale.value > 0.0 and off_by(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
-
-
-def _ratio(seen: Array, true: Array) -> WindowMedian:
-    """Return the ratio of displacements (M, 3) along the true ones."""
-    return compared((seen * true).sum(axis=1) / (true**2).sum(axis=1))
 
 
 # Least angle between both directions: sound recordings are within a degree, and 1 m/s^2 of mean acceleration that the
@@ -154,16 +150,12 @@ def gravity_direction(evidence: Evidence) -> Symptom | Undecided | None:
     axis = np.zeros(3)
     largest = int(np.argmax(np.abs(measured)))
     axis[largest] = np.sign(measured[largest])
-    measured_text, given_text = _rounded(measured), _rounded(given)
-    summary = f"by the samples gravity is {measured_text} m/s^2 in the truth's world, and gravity_world is {given_text}"
-    certain = _angle_deg(axis, measured) < NEAR_AXIS_DEG
+    stated = f"in the truth's world, and gravity_world is {metres(given)}"
+    summary = f"by the samples gravity is {metres(measured)} m/s^2 {stated}"
+    if not _angle_deg(axis, measured) < NEAR_AXIS_DEG:
+        return Symptom(1, summary, "no axis of the world is near: correct it", remedy=None)
     gravity_world = (size_mps2 if size_mps2 > 0.0 else STANDARD_MPS2) * axis
-    return Symptom(
-        count=1,
-        detail=summary,
-        treatment=f"it is set to {_rounded(gravity_world)}" if certain else "no axis of the world is near: correct it",
-        remedy=replace(sequence, gravity_world=gravity_world) if certain else None,
-    )
+    return Symptom(1, summary, f"it is set to {metres(gravity_world)}", replace(sequence, gravity_world=gravity_world))
 
 
 def _measured(sequence: Sequence, truth: Truth) -> Array | None:
@@ -193,10 +185,6 @@ def _angle_deg(a: Array, b: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
 
 
-def _rounded(vector: Array) -> str:
-    return "(" + ", ".join(f"{x:.2f}" for x in vector) + ")"
-
-
 # Where only a difference of the clocks larger than this (s), half a metre of a drive, would be found, the finding is
 # undecided.
 LARGEST_S = 0.05
@@ -213,25 +201,16 @@ def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
     clock = evidence.truth_clock
     if clock is None:
         return None
-    if clock.rate is None or not clock.runs_otherwise:
-        return _unseen(clock.unseen_s)
-    rate = clock.rate
-    return Symptom.warning(
-        detail=(
-            f"the camera turns as the truth does when time passes {1.0 + rate.value:.4f} +- {rate.error:.4f} times as "
-            "fast by the truth's stamps as by the frames'"
-        ),
-        treatment=(
-            "stamp both by one clock: position errors include the distance moved in the time by which they differ"
-        ),
-    )
-
-
-def _unseen(apart_s: float) -> Undecided | None:
-    if apart_s < LARGEST_S:
+    if clock.rate is not None and clock.runs_otherwise:
+        fast = f"{1.0 + clock.rate.value:.4f} +- {clock.rate.error:.4f} times as fast by the truth's stamps"
+        return Symptom.warning(
+            f"the camera turns as the truth does when time passes {fast} as by the frames'",
+            "stamp both by one clock: position errors include the distance moved in the time by which they differ",
+        )
+    if clock.unseen_s < LARGEST_S:
         return None
-    hidden = f"one that is off by less than {apart_s:.2g} s would not show"
-    if apart_s == float("inf"):
+    hidden = f"one that is off by less than {clock.unseen_s:.2g} s would not show"
+    if not np.isfinite(clock.unseen_s):
         hidden = "whether it is the frames' is unknown"
     return Undecided(f"too little change of rotation to determine the truth's clock: {hidden}")
 
@@ -332,11 +311,9 @@ def _doubtful(scale: WindowMedian) -> Undecided | None:
     """Return a scale that is beyond chance and within the limit of sound recordings, as undecided."""
     if abs(scale.value - 1.0) <= scale.by_chance:
         return None
-    return Undecided(
-        f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's, which is more than chance and "
-        "no more than in recordings without faults: the truth's unit, the baseline or the focal length may be off "
-        "by it"
-    )
+    within = "which is more than chance and no more than in recordings without faults"
+    off = "the truth's unit, the baseline or the focal length may be off by it"
+    return Undecided(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's, {within}: {off}")
 
 
 def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
@@ -379,11 +356,8 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
     for reading, remedy, T_world_imu in _readings(truth.T_world_imu):
         apart = _apart(windows(evidence.sequence, evidence.camera_motion, replace(truth, T_world_imu=T_world_imu)))
         if apart < given / TIMES_NEARER:
-            summary = (
-                f"the truth's motion agrees with the camera's only for a truth {reading}, with a difference of "
-                f"{apart:.1%}"
-            )
-            return Symptom.warning(f"{summary} in place of {given:.0%}", remedy)
+            only = f"only for a truth {reading}, with a difference of {apart:.1%} in place of {given:.0%}"
+            return Symptom.warning(f"the truth's motion agrees with the camera's {only}", remedy)
     return None
 
 
