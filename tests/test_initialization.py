@@ -11,8 +11,7 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError, EstimatorError
 from toolkit.geometry import Array, about_z, interpolate_poses, so3_exp, so3_log, yaw_of
-from toolkit.initialization import start_from_measurements, start_from_truth
-from toolkit.initialization.start import INFLATION
+from toolkit.initialization import INFLATION, start_from_measurements, start_from_truth
 from toolkit.measurements import Prior
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Sequence
@@ -278,7 +277,7 @@ def test_an_adjustment_without_a_sound_solution_is_reported_and_not_raised(monke
     def refuse(*_):
         raise EstimatorError("the window does not determine its states")
 
-    monkeypatch.setattr("toolkit.initialization.start.solve_window", refuse)
+    monkeypatch.setattr("toolkit.initialization.solve_window", refuse)
     sequence = replace(simulate(replace(FLIGHT, duration_s=3.0), 0), prior=None)
     prior = start_from_measurements(sequence)
     assert "no sound solution" in prior.source

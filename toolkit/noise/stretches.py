@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from toolkit.geometry import Array, IntArray
-from toolkit.initialization.first_guess import guess_with_imu
+from toolkit.initialization import guess_with_imu
 from toolkit.measurements import NS_PER_S, ImuMotion, MotionNoise, Packet, Prior, StereoRig
 from toolkit.models import stereo
 from toolkit.models.camera_motion import camera_motion
