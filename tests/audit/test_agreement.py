@@ -8,17 +8,15 @@ import pytest
 
 from tests.audit.conftest import LONGER_S, details, recording
 from toolkit.audit import audit
-from toolkit.audit.agreement import Deviation, accelerometer_change, sustained
+from toolkit.audit.agreement import Deviation, sustained
 from toolkit.audit.calibration import steady_difference
-from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.fault import Evidence
 from toolkit.simulation import SCENARIOS, faults
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_a_sound_recording_warns_of_nothing(scenario: str) -> None:
-    findings = audit(recording(scenario, 11, 8.0)).findings
-    assert not any(finding.warning or finding.blocking for finding in findings)
-    assert [finding.fault for finding in findings] == ["correlated-tracks"] * ("realistic" in scenario)
+    assert audit(recording(scenario, 11, 8.0)).findings == ()
 
 
 @pytest.mark.parametrize("seed", [0, 1])  # the two sides of the image
@@ -102,48 +100,6 @@ def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
     values = clean.motion.values.copy()
     values[60, 5] += 0.4
     assert "image-jump" not in details(audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))))
-
-
-@pytest.mark.parametrize(
-    ("scenario", "duration_s", "dose"),
-    [("drive-imu", 12.0, 1.06), ("flight", 8.0, 0.97), ("flight-realistic", 8.0, 1.06)],
-)
-def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
-    scenario: str, duration_s: float, dose: float
-) -> None:
-    sound = recording(scenario, 1, duration_s, varied=True)
-    assert not isinstance(accelerometer_change(Evidence(sound)), Symptom)
-    found = accelerometer_change(Evidence(faults.changed_speed(sound, dose, 1)))
-    assert isinstance(found, Symptom) and found.warns and not found.harmful
-    match = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
-    assert match is not None and match[4] == ("more" if dose > 1.0 else "less")
-    assert float(match[1]) == pytest.approx(0.5 * duration_s, abs=1.0)
-    # Half of what drifting tracks make of it, and three standard errors as they are rounded.
-    assert float(match[2]) == pytest.approx(9.81 * abs(dose - 1.0), abs=0.08 + 3.0 * float(match[3]) + 0.02)
-
-
-@pytest.mark.parametrize(
-    ("fault", "dose", "percent"),
-    [
-        (faults.wrong_focal_length, 1.02, 2.0),
-        (faults.linear_unit, 1.02, -2.0),
-    ],
-)
-def test_two_percent_of_scale_are_reported_with_their_error(fault: faults.Fault, dose: float, percent: float) -> None:
-    found = steady_difference(Evidence(fault(recording("drive", 41, 25.0), dose, 41)))
-    assert isinstance(found, Symptom) and not found.harmful
-    match = re.search(r"steps are ([\d.]+) \+- ([\d.]+) % (longer|shorter)", found.detail)
-    assert match is not None and match[3] == ("longer" if percent > 0.0 else "shorter")
-    # The tracks' noise makes vision's steps up to half a percent longer.
-    assert float(match[1]) == pytest.approx(abs(percent), abs=0.6)
-    assert float(match[2]) < 0.6
-
-
-def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction() -> None:
-    found = steady_difference(Evidence(faults.shifted_centre(recording("drive", 43, 25.0), 12.0, 43)))
-    assert isinstance(found, Symptom)
-    match = re.search(r"equivalent to (\d+) px of the principal point", found.detail)
-    assert match is not None and float(match[1]) == pytest.approx(12.0, abs=2.5)
 
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-realistic"])

@@ -4,22 +4,28 @@ A verdict is ``repaired`` (named, repaired, nothing blocks), ``blocks`` (named a
 to be repaired, nothing blocks) or ``undecided`` (not decidable, no fault found beside it but a warning).
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pytest
 
+from tests.audit.conftest import recording
 from toolkit.audit import Audit, audit
+from toolkit.audit.agreement import accelerometer_change, scale_change
+from toolkit.audit.calibration import gyro_scale, miscalibration, steady_difference
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.timing import clock_change
+from toolkit.audit.truth import truth_clock, truth_mismatch
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.report.comparison_text import audit_text
 from toolkit.sequence import Sequence
-from toolkit.simulation import SCENARIOS, faults, simulate
+from toolkit.simulation import faults
 
-DURATION_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
 TWIST, IMU, ALL = ("drive",), ("flight",), ("drive", "flight")
 
 
@@ -206,9 +212,8 @@ CASES = [
 ]
 
 
-@cache
 def clean(scenario: str) -> Sequence:
-    return simulate(replace(SCENARIOS[scenario], duration_s=DURATION_S[scenario]), 0)
+    return recording(scenario, 0)
 
 
 @cache
@@ -248,6 +253,74 @@ def test_nothing_is_blessed_that_blocks_or_was_not_checked(case: Case, scenario:
     blessed = "no fault is left that invalidates a result" in audit_text(outcome)
     assert blessed == (case.verdict == "repaired" and not outcome.undecided)
     assert ("not decidable: " in audit_text(outcome)) == bool(outcome.undecided)
+
+
+class Measured(NamedTuple):
+    """A fault whose size a check estimates: the groups of the pattern are the size and its standard error.
+
+    ``slack`` is the systematic error of the estimate, and the rounding of its figures.
+    """
+
+    check: Callable[[Evidence], Symptom | Undecided | None]
+    plant: Callable[..., Sequence]
+    dose: float
+    recording: tuple[Any, ...]
+    pattern: str
+    size: float
+    slack: float
+
+
+def late_truth(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    assert sequence.truth is not None
+    return replace(sequence, truth=replace(sequence.truth, t_ns=sequence.truth.t_ns + round(dose * NS_PER_S)))
+
+
+STEPS, ANGLE = r"steps are (\S+) \+- (\S+) % ", r"an angle of (\S+) \+- (\S+) rad"
+SPEED, GRAVITY = r"camera's is (\S+) \+- (\S+) % higher", r"gravity that is (\S+) \+- (\S+) m/s\^2 "
+TURNS, PARTS = r"turns (\S+) \+- (\S+) times as fast", r"changes by (\S+) \+- (\S+) ms"
+LATE, PACE = r"truth's stamps are shifted by (\S+) \+- (\S+) ms", r"time passes (\S+) \+- (\S+) times as fast"
+SCALE = r"steps are (\S+) \+- (\S+) times the truth's"
+MEASURED = [
+    # The tracks' noise makes vision's steps up to half a percent longer.
+    Measured(steady_difference, faults.wrong_focal_length, 1.02, ("drive", 41, 25.0), STEPS + "longer", 2.0, 0.6),
+    Measured(steady_difference, faults.linear_unit, 1.02, ("drive", 41, 25.0), STEPS + "shorter", 2.0, 0.6),
+    Measured(steady_difference, faults.shifted_centre, 12.0, ("drive", 43, 25.0), ANGLE, 12.0 / 720.0, 0.003),
+    Measured(scale_change, faults.changed_speed, 1.08, ("drive", 1), SPEED, 8.0, 0.0),
+    # Half of what drifting tracks make of it.
+    Measured(accelerometer_change, faults.changed_speed, 1.06, ("drive-imu", 1, 12.0, True), GRAVITY, 0.59, 0.1),
+    Measured(accelerometer_change, faults.changed_speed, 0.97, ("flight", 1, 8.0, True), GRAVITY + "less", 0.29, 0.1),
+    Measured(accelerometer_change, faults.changed_speed, 1.06, ("flight-realistic", 1, 8.0, True), GRAVITY, 0.59, 0.1),
+    # The noise of the camera's rotation lowers the ratio by up to 1.5 %.
+    Measured(miscalibration, faults.angular_unit, 1.1, ("flight", 61, 6.0, True), TURNS, 1.1, 0.015),
+    Measured(miscalibration, faults.angular_unit, 1.1, ("drive", 61, 12.0, True), TURNS, 1.1, 0.015),
+    # A bound is off by the noise of the rates beside their scatter, a percent at most here.
+    Measured(gyro_scale, faults.gyro_axis_scale, 0.85, ("drive", 51, 15.0, True), TURNS, 0.85, 0.01),
+    Measured(gyro_scale, faults.gyro_axis_scale, 1.2, ("drive-imu", 51, 12.0, True), TURNS, 1.2, 0.01),
+    Measured(gyro_scale, faults.gyro_axis_scale, 0.85, ("flight", 51, 12.0, True), TURNS, 0.85, 0.01),
+    Measured(clock_change, faults.camera_clock_step, 0.08, ("drive-imu", 102, 12.0), PARTS, -80.0, 2.5),
+    Measured(clock_change, faults.camera_clock_step, 0.08, ("flight", 102, 6.0), PARTS, -80.0, 2.5),
+    Measured(clock_change, faults.camera_clock_step, 0.025, ("flight-realistic", 102, 5.0), PARTS, -25.0, 2.5),
+    Measured(truth_mismatch, faults.baseline_unit, 0.8, ("drive", 0, 6.0), SCALE, 0.8, 0.024),
+    Measured(truth_mismatch, faults.baseline_unit, 2.0, ("flight", 0, 6.0), SCALE, 2.0, 0.06),
+    Measured(truth_mismatch, late_truth, 0.05, ("flight", 5, 12.0), LATE, -50.0, 2.0),
+    Measured(truth_mismatch, late_truth, 0.5, ("drive", 5, 12.0), LATE, -500.0, 2.0),
+    Measured(truth_mismatch, late_truth, 0.05, ("drive-imu", 5, 12.0), LATE, -50.0, 2.0),
+    Measured(truth_clock, faults.truth_clock_rate, 1.03, ("drive", 31, 12.0, True), PACE, 1.03, 0.0),
+    Measured(truth_clock, faults.truth_clock_rate, 0.95, ("drive-imu", 31, 12.0, True), PACE, 0.95, 0.0),
+    Measured(truth_clock, faults.truth_clock_rate, 1.015, ("flight", 31, 6.0, True), PACE, 1.015, 0.0),
+]
+
+
+@pytest.mark.parametrize("case", MEASURED, ids=lambda one: f"{one.plant.__name__}-{one.recording[0]}-{one.dose:g}")
+def test_a_fault_is_reported_with_its_size_and_error_and_the_sound_recording_is_not(case: Measured) -> None:
+    sound = recording(*case.recording)
+    assert not isinstance(case.check(Evidence(sound)), Symptom)
+    found = case.check(Evidence(case.plant(sound, case.dose, 1)))
+    assert isinstance(found, Symptom) and found.remedy is None and not found.harmful
+    match = re.search(case.pattern, found.detail)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(case.size, abs=4.0 * float(match[2]) + case.slack)
+    assert float(match[2]) < 0.2 * abs(case.size)
 
 
 @pytest.mark.parametrize("dose", [0.02, -0.02, 0.25])

@@ -91,15 +91,6 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
     assert found.value == pytest.approx(expected, abs=0.06)
 
 
-def test_tracks_with_a_walk_or_an_offset_of_their_own_are_reported_and_white_or_exact_ones_are_not() -> None:
-    exact = simulate(replace(SCENARIOS["flight"], duration_s=4.0, noise_scale=0.0), 3)
-    for sound in (recording("flight"), recording("drive"), exact):
-        assert "correlated-tracks" not in unrepaired(sound)
-    walks = faults.track_walk(recording("flight", 3, 4.0), 4.0, 3)
-    assert "where independent errors have -0.5" in unrepaired(walks)["correlated-tracks"]
-    assert "correlated-tracks" in unrepaired(faults.match_offset(recording("drive"), 3.0, 3))
-
-
 def scatter_of(sequence: Sequence) -> str | None:
     found = track_scatter(Evidence(sequence))
     assert found is None or (isinstance(found, Symptom) and found.warns)
@@ -129,7 +120,7 @@ def test_of_tracks_with_correlated_errors_only_a_noise_far_too_large_is_reported
 
 def test_mismatches_are_reported_and_a_few_are_not() -> None:
     sound = recording("drive", 7, 8.0)
-    assert set(unrepaired(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter", "correlated-tracks"}
+    assert set(unrepaired(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter"}
     assert unrepaired(faults.outlier_tracks(sound, 0.05, 7)) == {}
     overstated = faults.wrong_noise(sound, 2.0)
     assert "have residuals of more than" not in (scatter_of(overstated) or "")

@@ -1,6 +1,5 @@
 """A truth of another motion, unit or clock, and gravity elsewhere in its world: told where planted, nowhere else."""
 
-import re
 from dataclasses import replace
 from functools import cache
 
@@ -51,14 +50,6 @@ def test_a_truth_in_another_unit_is_named_and_not_taken_for_another_motion(metre
     assert f"times the truth's, as of one in {unit}" in found.detail
 
 
-@pytest.mark.parametrize(("scenario", "scale"), [("drive", 0.8), ("flight", 2.0)])
-def test_a_wrong_baseline_is_reported_with_its_size(scenario: str, scale: float) -> None:
-    found = truth_mismatch(Evidence(faults.baseline_unit(recording(scenario), scale)))
-    assert isinstance(found, Symptom) and found.warns
-    # what creeping and quantised disparities make of vision's scale on sound flights
-    assert float(found.detail.split("steps are ")[1].split()[0]) == pytest.approx(scale, rel=0.03)
-
-
 def test_a_truth_of_another_flight_is_reported() -> None:
     """Of the same hall, later: speeds and turns are alike in size, and not in direction."""
     flight, later = recording("flight"), truth_of(recording("flight", 0, 18.0))
@@ -67,18 +58,6 @@ def test_a_truth_of_another_flight_is_reported() -> None:
     found = with_truth(flight, Truth(stamps, later.T_world_imu[rows]))
     assert isinstance(found, Symptom)
     assert "the truth's motion is not the camera's" in found.detail
-
-
-@pytest.mark.parametrize(("scenario", "late_s"), [("flight", 0.05), ("drive", 0.5), ("drive-imu", 0.05)])
-def test_a_truth_by_another_clock_is_reported_with_its_offset(scenario: str, late_s: float) -> None:
-    sequence = recording(scenario, 5, 12.0)
-    truth = truth_of(sequence)
-    symptom = with_truth(sequence, replace(truth, t_ns=truth.t_ns + round(late_s * NS_PER_S)))
-    assert isinstance(symptom, Symptom) and symptom.warns
-    match = re.search(r"the truth's stamps are shifted by (\S+) \+- (\S+) ms", symptom.detail)
-    assert match is not None
-    # Printed in whole milliseconds, with an error of less than one as 0.
-    assert float(match[1]) == pytest.approx(-1e3 * late_s, abs=4.0 * float(match[2]) + 2.0)
 
 
 @pytest.mark.parametrize(
@@ -124,31 +103,6 @@ def test_a_truth_of_other_times_or_none_is_not_checked() -> None:
     assert with_truth(drive, None) is None
     elsewhen = replace(truth_of(drive), t_ns=truth_of(drive).t_ns + 1000 * NS_PER_S)
     assert isinstance(with_truth(drive, elsewhen), Undecided)
-
-
-@pytest.mark.parametrize(
-    ("scenario", "duration_s", "pace"),
-    [
-        ("drive", 12.0, 1.03),
-        ("drive-imu", 12.0, 0.95),
-        ("flight", 6.0, 1.015),
-        ("drive", 12.0, 1.0),
-        ("flight", 6.0, 1.0),
-    ],
-)
-def test_the_pace_of_the_truths_clock_is_reported(scenario: str, duration_s: float, pace: float) -> None:
-    evidence = Evidence(faults.truth_clock_rate(recording(scenario, 31, duration_s, True), pace))
-    symptom = truth_clock(evidence)
-    if pace == 1.0:
-        assert not isinstance(symptom, Symptom)
-        assert evidence.truth_clock is not None and evidence.truth_clock.rate is not None
-        assert abs(evidence.truth_clock.rate.value) < 4.0 * evidence.truth_clock.rate.error
-        return
-    assert isinstance(symptom, Symptom) and symptom.warns and symptom.remedy is None
-    match = re.search(r"time passes (\S+) \+- (\S+) times as fast", symptom.detail)
-    assert match is not None
-    assert float(match[1]) == pytest.approx(pace, abs=4.0 * float(match[2]))
-    assert float(match[2]) < 0.005  # measured 0.0010 to 0.0031
 
 
 def test_a_clock_is_reported_once_either_by_its_offset_or_by_its_pace() -> None:
