@@ -97,17 +97,6 @@ def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Co
     assert np.abs(errors.heading_deg).max() < 1e-9
 
 
-def test_one_slow_step_at_the_end_does_not_bend_the_running_median(comparison: Comparison) -> None:
-    steady = comparison.runs[0]
-    step_s = np.full(steady.timings.step_s.size, 1e-3)
-    step_s[[0, -1]] = 1.0
-    slow = replace(steady, timings=replace(steady.timings, step_s=step_s))
-    (drawn,) = over_time.draw_frame_times(compared(comparison.sequence, (slow,)))
-    dots, median = drawn.figure.axes[0].get_lines()
-    assert np.max(dots.get_ydata()) == pytest.approx(1e3)
-    assert np.max(median.get_ydata()) == pytest.approx(1.0)
-
-
 def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
     (drawn,) = over_time.draw_errors(comparison)
     curves = error_curves(comparison)
@@ -118,9 +107,7 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert "astray" in position.get_title(loc="right")
 
 
-@pytest.mark.parametrize(
-    "draw", [reprojection.draw, over_time.draw_frame_times, over_time.draw_errors, from_above.draw_all]
-)
+@pytest.mark.parametrize("draw", [reprojection.draw, over_time.draw_errors, from_above.draw_all])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)

@@ -33,6 +33,8 @@ def camera_frames(comparison: Comparison) -> tuple[tuple[CameraFrame, bytes], ..
     recording = None if comparison.over_seeds else _images(comparison)
     if recording is None:
         return ()
+    import cv2
+
     sequence = comparison.sequence
     shown = np.unique(np.linspace(0, sequence.frame_count - 1, _COUNT + 2)[1:-1].astype(np.int64))
     seen = np.isin(sequence.observations.frame, shown)
@@ -53,7 +55,8 @@ def camera_frames(comparison: Comparison) -> tuple[tuple[CameraFrame, bytes], ..
                 for row, of_all in errors_px.items()
             ),
         )
-        frames.append((frame, _jpeg(image)))
+        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        frames.append((frame, jpeg))
     return tuple(frames)
 
 
@@ -88,9 +91,3 @@ def _left_images(recording: ImageRecording, frames_t_ns: IntArray, shown: IntArr
     for (k, _), images in zip(there, read_pairs(recording, [pair for _, pair in there]), strict=True):
         if not isinstance(images, Unusable):
             yield k, images[0]
-
-
-def _jpeg(image: Image) -> bytes:
-    import cv2
-
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()

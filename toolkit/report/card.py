@@ -116,16 +116,13 @@ def _scale(card: Card) -> Iterator[str]:
 def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
     """Return the card as plain text: what it says, and the residuals along tracks as a table."""
     headings = (("lag",), ("column",), ("disparity",), ("row",))
-    rows = tuple((str(lag + 1), *map(_cell, each)) for lag, each in enumerate(card.correlation))
+    cells = [[f"{one:.2f}" if np.isfinite(one) else MISSING for one in each] for each in card.correlation]
+    rows = tuple((str(lag), *each) for lag, each in enumerate(cells, start=1))
     lines = [filled(sequence_line(sequence), width), ""]
     lines += [filled(line, width) for line in card_lines(card)]
     lines += ["", as_text(Table(headings, rows, labels=1)), ""]
     lines.append(filled("lag in frames: autocorrelation of the residuals along a track", width))
     return "\n".join(lines)
-
-
-def _cell(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else MISSING
 
 
 def card_record(card: Card) -> CardRecord:
@@ -142,7 +139,7 @@ def card_record(card: Card) -> CardRecord:
         correlated=card.correlated,
         track_weight=rounded(card.weight.value),
         track_weight_error=rounded(card.weight.error),
-        correlation=_lags(card.correlation),
+        correlation=tuple((number(a), number(b), number(c)) for a, b, c in card.correlation.tolist()),
         left_right_correlation=rounded(card.left_right),
         tails=rounded(card.tails),
         at_odds=rounded(card.at_odds),
@@ -155,7 +152,3 @@ def card_record(card: Card) -> CardRecord:
 def _three(values: Array) -> tuple[float, float, float]:
     first, second, third = map(rounded, values.tolist())
     return first, second, third
-
-
-def _lags(rows: Array) -> tuple[tuple[float | None, float | None, float | None], ...]:
-    return tuple((number(row[0]), number(row[1]), number(row[2])) for row in rows.tolist())

@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.experiment.comparison import Comparison
 from toolkit.metrics import Metric, known_metrics, metrics_called
-from toolkit.noise import MotionScale, TrackWeight
+from toolkit.noise import TrackWeight
 from toolkit.report.scores import path_length_m
 from toolkit.report.text import MISSING, Table, cell, heading, number, unit_of
 from toolkit.sequence import Sequence
@@ -163,19 +163,14 @@ def rules_line(comparison: Comparison) -> str:
     window = settings.window
     left_out = _left_out(sequence, window)
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
-    budget = sequence.track_budget
+    budget, of_all = sequence.track_budget, len(replace(sequence, track_budget=None).visible) / sequence.frame_count
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outlier_summary(settings.outliers)}"
-        f"{'' if budget is None else f'; at most {budget} of {_visible_a_frame(sequence):.0f} tracks a frame'}"
+        f"{'' if budget is None else f'; at most {budget} of {of_all:.0f} tracks a frame'}"
         f"{'' if settings.noise.bridge_gaps else '; gaps between tracks not bridged'}"
         f"{'; started from the truth' if settings.start == 'truth' else ''}"
     )
-
-
-def _visible_a_frame(sequence: Sequence) -> float:
-    """Return how many of its tracks estimators could be given, in the mean over the frames."""
-    return len(replace(sequence, track_budget=None).visible) / sequence.frame_count
 
 
 _MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
@@ -184,9 +179,11 @@ _MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
 def noise_line(comparison: Comparison) -> str:
     """Return the noise that every estimator assumed: of sightings and motion, as stated or as measured."""
     rig, settings, measured = comparison.sequence.rig, comparison.settings.noise, comparison.measured
-    tracks, motion = (
-        ("", "") if measured is None else (_tracks_measured(measured.tracks), _scale_measured(measured.motion))
-    )
+    tracks = motion = ""
+    if measured is not None:
+        tracks, scale = _tracks_measured(measured.tracks), measured.motion
+        times = f"{scale.value:.2g} +- {scale.error:.1g} times as noisy as stated"
+        motion = "as stated" if scale.value == 1.0 else times
     if settings.track_weight != "auto":
         tracks = f"each counted at {rig.track_weight:.2g} of its information, as set"
     if settings.motion_scale != "auto":
@@ -210,10 +207,6 @@ def _tracks_measured(weight: TrackWeight) -> str:
     if weight.value == 1.0:
         return f"each counted in full ({along}, but smaller than stated)"
     return f"each counted at {weight.value:.2g} +- {weight.error:.1g} of its information ({along})"
-
-
-def _scale_measured(scale: MotionScale) -> str:
-    return "as stated" if scale.value == 1.0 else f"{scale.value:.2g} +- {scale.error:.1g} times as noisy as stated"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:

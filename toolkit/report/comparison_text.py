@@ -7,7 +7,7 @@ import csv
 import io
 from collections.abc import Mapping
 
-from toolkit.audit import Audit, Finding
+from toolkit.audit import Audit
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.metrics import known_metrics
@@ -145,7 +145,7 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         *markdown_section("About this recording", comparison.sequence.provenance.facts),
         *markdown_section("Its tracks", () if comparison.card is None else card_lines(comparison.card)),
         "## Figures",
-        *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
+        *(f"![{in_markdown(said)}](figures/{name})\n\n*{in_markdown(said)}*" for name, said in captions.items()),
         "## How to read the table",
         _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE,
         _HOW_TO_READ,
@@ -153,10 +153,6 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         "`vislam report` with the path of this folder makes an interactive page of it.",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _figure(name: str, caption: str) -> str:
-    return f"![{caption}](figures/{name})\n\n*{caption}*"
 
 
 def audit_text(audited: Audit, width: Width = WIDTH) -> str:
@@ -173,7 +169,10 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
     lines += section("facts", audited.sequence.provenance.facts, width)
     if any(f.blocking for f in findings):
-        lines += ["", *_spoiling(findings)]
+        lines += [""]
+        for how in ("not repaired", "too much lost"):
+            names = ", ".join(f.fault for f in findings if outcome(f) == how)
+            lines += [f"{how}: {names}"] if names else []
     elif any(f.warning for f in findings):
         lines += [
             "",
@@ -182,9 +181,3 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     elif findings and not audited.undecided:
         lines += ["", "no fault is left that invalidates a result"]
     return "\n".join(lines)
-
-
-def _spoiling(findings: tuple[Finding, ...]) -> list[str]:
-    """Return a line for each way in which findings spoil a result, with their names."""
-    by_outcome = {how: [f.fault for f in findings if outcome(f) == how] for how in ("not repaired", "too much lost")}
-    return [f"{how}: {', '.join(names)}" for how, names in by_outcome.items() if names]

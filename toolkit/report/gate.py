@@ -105,6 +105,10 @@ def _values(verdict: Verdict) -> tuple[str, str]:
     return before, now
 
 
+def _metric(key: str) -> Metric | None:
+    return next((metric for metric in known_metrics() if metric.key == key), None)
+
+
 def _percent(value: float | None, sign: str = "") -> str:
     if value is None:
         return MISSING
@@ -144,10 +148,6 @@ def about(verdict: Verdict) -> str:
 def _of(verdict: Verdict) -> str:
     who = f"{verdict.estimator} {verdict.output}".strip()
     return f"{verdict.sequence}, {who}" if who else verdict.sequence
-
-
-def _metric(key: str) -> Metric | None:
-    return next((metric for metric in known_metrics() if metric.key == key), None)
 
 
 def note_lines(check: Check) -> Iterator[str]:
@@ -222,18 +222,14 @@ def gate_text(check: Check, width: Width = WIDTH, *, verbose: bool = False) -> s
 
 def gate_markdown(check: Check) -> str:
     """Return a check as Markdown fit for a pull request: what failed on top, everything folded below."""
-    mark = "✅" if check.passed else "❌"
-    parts = [f"## {mark} Accuracy gate", _sentence(headline(check))]
+    mark, line = "✅" if check.passed else "❌", headline(check)
+    parts = [f"## {mark} Accuracy gate", f"{line[0].upper()}{line[1:]}."]
     if check.failures:
         parts.append(as_markdown(failures_table(check)))
     parts.append("\n".join(f"- {line}" for line in note_lines(check)))
     everything = as_markdown(gate_table(check))
     parts.append(f"<details>\n<summary>All {len(check.verdicts)} comparisons</summary>\n\n{everything}\n\n</details>")
     return "\n\n".join(parts) + "\n"
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:] + "."
 
 
 def gate_junit(check: Check) -> str:

@@ -92,7 +92,9 @@ def _of_today(manifest: Json) -> Json:
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:
     """Return the manifest of a comparison: made by a command, that came to be asked for this."""
-    here = _run_here(comparison)
+    from_files = {run.estimator for run in comparison.runs if run.timings is None}
+    here = tuple(name for name in comparison.estimators if name not in from_files)
+    variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     versions = {name: installed_version(package) for name, package in _PACKAGES.items()}
     words = tuple(comparison.own_files.get(name, name) for name in here)
     request = msgspec.structs.replace(requested.request, sequences=(comparison.source,), estimators=words)
@@ -110,7 +112,7 @@ def manifest_document(comparison: Comparison, command: str, requested: Configura
         estimators=here,
         references=tuple(name for name in comparison.estimators if name not in here),
         seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),
-        threads=_threads(comparison),
+        threads={"cpus": usable_cpus(), "workers": comparison.workers, "per_worker": 1, **variables},
         cpu=_cpu_model(),
         os=platform.platform(),
     )
@@ -128,17 +130,6 @@ def made_here(command: str) -> dict[str, str]:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _run_here(comparison: Comparison) -> tuple[str, ...]:
-    """Return the estimators that were run here, and not read from files."""
-    others = {run.estimator for run in comparison.runs if run.timings is None}
-    return tuple(name for name in comparison.estimators if name not in others)
-
-
-def _threads(comparison: Comparison) -> dict[str, int | str | None]:
-    variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    return {"cpus": usable_cpus(), "workers": comparison.workers, "per_worker": 1, **variables}
 
 
 def recording_record(sequence: Sequence) -> RecordingRecord:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import msgspec
 
-from toolkit.errors import OutputError, one_line
 from toolkit.evaluation.against_baseline import TrajectoryBaselineRecord
 from toolkit.evaluation.document import EvaluationRecord
 from toolkit.files.documents import read, schema
@@ -71,27 +70,6 @@ def schema_files() -> dict[str, str]:
     return {f"{name}.json": json.dumps(schema(record), indent=2) + "\n" for name, record in RECORDS.items()}
 
 
-def write_schemas(directory: Path) -> None:
-    """Write every schema into a directory, in the place of earlier ones; it is made where it is missing.
-
-    Raises OutputError where it cannot be written.
-    """
-    for name, text in schema_files().items():
-        write_text(directory / name, text)
-
-
-def main(arguments: list[str]) -> int:
-    """Write the schemas into the directory that is named; return the exit status."""
-    if len(arguments) != 1:
-        print("usage: python -m toolkit.report.records DIR", file=sys.stderr)
-        return 2
-    try:
-        write_schemas(Path(arguments[0]))
-    except OutputError as error:
-        print(f"error: {one_line(str(error).partition(';')[0])}; name another directory", file=sys.stderr)
-        return error.exit_status
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    for name, text in schema_files().items():
+        write_text(Path(sys.argv[1]) / name, text)

@@ -158,7 +158,9 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
         captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.requested)
-        _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))
+        written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
+        manifest = msgspec.structs.replace(manifest, files=tuple(sorted([*written, MANIFEST])))
+        _write_text(directory / MANIFEST, to_text(manifest))
 
 
 def _written_figures(comparison: Comparison, folder: Path, made_by: MadeBy) -> dict[str, str]:
@@ -177,12 +179,6 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
     trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
     for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
         take_over(target / name, directory / name)
-
-
-def _files_in(directory: Path) -> tuple[str, ...]:
-    """Return the files of a run, and its manifest, by their relative paths."""
-    written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
-    return tuple(sorted([*written, MANIFEST]))
 
 
 def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
@@ -293,8 +289,11 @@ def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
     if not {(one.estimator, one.output) for one in report.maps} <= set(drawn):
         raise DataError(f"{directory / REPORT} has the map of a run it does not have; repeat the comparison")
     names = [report.truth, *(run.trajectory for run in report.runs)]
-    tracks = {name: _track(directory / name, report.start_ns) for name in names if name is not None}
-    landmarks = {one.landmarks: _landmarks(directory / one.landmarks) for one in report.maps}
+    tables = {name: _numbers(directory / name, _TUM_COLUMNS, None) for name in names if name is not None}
+    start_s = report.start_ns / NS_PER_S
+    tracks = {name: DrawnPath(table[:, 0] - start_s, table[:, 1:4]) for name, table in tables.items()}
+    points = {one.landmarks: _numbers(directory / one.landmarks, _LANDMARK_COLUMNS, ",", 1) for one in report.maps}
+    landmarks = {name: each[np.isfinite(each).all(axis=1), 1:] for name, each in points.items()}
     images = {frame.image: _inside(directory, frame.image) for frame in report.frames or ()}
     return RunFiles(directory, scores, report, manifest, tracks, landmarks, images)
 
@@ -323,16 +322,6 @@ def _check_same_runs(
     if [(run.estimator, run.output) for run in scored] != runs:
         raise DataError(f"{directory}: {REPORT} does not have the runs of {name}; repeat the comparison")
     return runs
-
-
-def _track(path: Path, start_ns: int) -> DrawnPath:
-    table = _numbers(path, _TUM_COLUMNS, None)
-    return DrawnPath(table[:, 0] - start_ns / NS_PER_S, table[:, 1:4])
-
-
-def _landmarks(path: Path) -> Array:
-    points = _numbers(path, _LANDMARK_COLUMNS, ",", header_lines=1)[:, 1:]
-    return points[np.isfinite(points).all(axis=1)]
 
 
 def _numbers(path: Path, columns: int, delimiter: str | None, header_lines: int = 0) -> Array:

@@ -50,7 +50,11 @@ def verdict(comparison: Comparison) -> str:
         return _of_few(comparison)
     runs = f"{len(comparison.seeds)} seeds" if comparison.over_seeds else "one run"
     best = contest_text(contest_record(contest), runs, contest.rows[0].mark)
-    sentences = (best, _limits(contest), _trust(comparison), _cost(contest), why_sentence(contest))
+    limits = "Withheld tracks show errors over a few frames, not the distance from the true path."
+    sentences = (
+        *(best, limits if contest.metric == HELD_OUT else ""),
+        *(_trust(comparison), _cost(contest), why_sentence(contest)),
+    )
     return " ".join(filter(None, sentences))
 
 
@@ -124,23 +128,12 @@ def contest_text(contest: ContestRecord, runs: str, mark: str) -> str:
 
 def why_sentence(contest: Contest) -> str:
     """Name the command that says why the first is better than the worst of the others; nothing where none can."""
-    able = [
-        row.estimator for row in (contest.rows[0], *(row for row, _ in contest.worse)) if row.estimator in _explained()
-    ]
+    explained = {name for name, entry in discover().items() if entry.ingredients()}  # that say what they have
+    rows = (contest.rows[0], *(row for row, _ in contest.worse))
+    able = [row.estimator for row in rows if row.estimator in explained]
     if len(able) < 2 or able[0] != contest.rows[0].estimator:
         return ""
     return f"Why: vislam explain with --from {able[-1]} --to {able[0]}."
-
-
-def _explained() -> frozenset[str]:
-    """Return the names of the estimators that say what they have."""
-    return frozenset(name for name, entry in discover().items() if entry.ingredients())
-
-
-def _limits(contest: Contest) -> str:
-    if contest.metric != HELD_OUT:
-        return ""
-    return "Withheld tracks show errors over a few frames, not the distance from the true path."
 
 
 def _trust(comparison: Comparison) -> str:

@@ -44,7 +44,6 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
     more = (
         reprojection.draw,
         bands.draw_nis,
-        over_time.draw_frame_times,
         from_above.draw_trajectories,
         over_time.draw_other_components,
         from_above.draw_each,

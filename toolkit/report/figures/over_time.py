@@ -1,4 +1,4 @@
-"""What changes over time: errors, errors by component with what is stated, the loss against the bound, time per frame.
+"""What changes over time: errors, errors by component with what is stated, the loss against the bound.
 
 Errors are against the truth; without truth they are the differences between estimators.
 """
@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.patches import Patch
-from matplotlib.ticker import NullFormatter
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
@@ -26,7 +25,6 @@ from toolkit.report.curves import (
     components,
     error_curves,
     reference_estimate,
-    running_median,
 )
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
@@ -41,7 +39,6 @@ _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
 # An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
-_MS = 1e3
 _BAND_ALPHA = 0.16
 _LEAST = 1e-3  # m, deg
 
@@ -81,7 +78,8 @@ def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     Where these differ by more than an order of magnitude it is logarithmic: else the best would be a line at zero.
     """
     largest = {row: float(np.nanmax(errors.position_m)) for row, errors in curves}
-    reach = 1.05 * max(_reach(largest), _LEAST_POSITION_M)
+    good = [size for row, size in largest.items() if row.status == "ok"] or largest.values()
+    reach = 1.05 * max(*good, _LEAST_POSITION_M)
     sizes = [size for row, errors in curves if row.status == "ok" and (size := rmse(errors.position_m)) > 0.0]
     if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and reach > 2.0 * _LEAST_POSITION_M:
         style.scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), reach)
@@ -99,11 +97,6 @@ def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -_LEAST_HEADING_DEG), -reach), min(max(high, _LEAST_HEADING_DEG), reach))
     _say_who_leaves(axes, largest, reach, "deg")
-
-
-def _reach(largest: dict[Row, float]) -> float:
-    """Return the largest error of the runs that are ok, or of all where none is."""
-    return max([size for row, size in largest.items() if row.status == "ok"] or largest.values())
 
 
 def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: str) -> None:
@@ -161,7 +154,8 @@ def _components_figure(comparison: Comparison, name: str, found: list[tuple[Row,
                 _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, colour, style.shown_as(row))
             _limit(axes, [one for _, one in found], block.start + i)
             style.label_axes(axes, "", "time [s]" if i == 2 else "", label.format(axis))
-    stated = "" if comparison.sequence.truth is None else _nees_text(comparison, name)
+    nees = [number(value) for row, _ in found if (value := row.value("nees_pose_mean")) is not None]
+    stated = f" (mean NEES {', '.join(nees)})" if nees and reference is None else ""
     style.add_title(figure, f"{comparison.name}: {name}{stated}")
     grid[0, 0].set_title(f"position {what}", fontsize=style.TITLE_PT, loc="left")
     grid[0, 1].set_title(f"rotation {what}", fontsize=style.TITLE_PT, loc="left")
@@ -169,12 +163,6 @@ def _components_figure(comparison: Comparison, name: str, found: list[tuple[Row,
     style.legend_below(figure, _entries(found, what.split(maxsplit=1)[0], colour))
     caption = _caption(name, reference.name if reference is not None else "", comparison.sequence.truth is not None)
     return NamedFigure(f"components_{plain_name(name)}", caption, figure)
-
-
-def _nees_text(comparison: Comparison, name: str) -> str:
-    values = [row.value("nees_pose_mean") for row in comparison.lines if row.estimator == name]
-    listed = ", ".join(number(value) for value in values if value is not None)
-    return f" (mean NEES {listed})" if listed else ""
 
 
 def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as: Output) -> None:
@@ -280,37 +268,3 @@ def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]])
 def _sigma(covs: Array, block: slice) -> Array:
     """Return the root (n,) of the trace of a block of covariances (n, d, d)."""
     return np.asarray(np.sqrt(np.trace(covs[:, block, block], axis1=1, axis2=2)))
-
-
-def draw_frame_times(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the time of each step by frame, on a logarithmic axis, with the finish in the legend."""
-    timed = [(run, run.timings) for run in comparison.runs if run.timings is not None and run.timings.step_s.size]
-    if not timed:
-        return
-    figure = style.new_figure(3.4)
-    axes = figure.add_subplot()
-    entries = []
-    for run, timings in timed:
-        step_ms = np.maximum(timings.step_s * _MS, 1e-4)
-        stroke = style.stroke_of(comparison, run.estimator, "final")
-        axes.plot(step_ms, ".", color=stroke["color"], markersize=2.5, alpha=0.35)
-        cpu_ms = _MS * timings.cpu_s / timings.step_s.size
-        label = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
-        if timings.finish_s > timings.step_s.sum():
-            label += f", end {timings.finish_s:.1f} s"
-        (median,) = axes.plot(running_median(step_ms), linewidth=style.width_of(comparison, run.estimator), **stroke)
-        entries.append(Entry(label, (median,)))
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least, so that jitter alone does not fill the axis
-    axes.set_ylim(low / widened, high * widened)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    style.label_axes(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
-    style.legend_below(figure, entries)
-    caption = (
-        "Wall-clock time of each step (dots) and its running median (lines). In the legend their mean, and the "
-        "processor time (CPU) a frame, the finish included: on a busy machine it alone is the estimator's. An "
-        "estimator that answers only at the end does its work there; that time is in the legend, too."
-    )
-    yield NamedFigure("frame_times", caption, figure)

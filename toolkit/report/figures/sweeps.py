@@ -116,7 +116,7 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
         line = [at for point, at in points.items() if point]
         axes.plot(*np.reshape(line, (-1, 2)).T, linewidth=1.0, alpha=0.6, **stroke)
         for point, at in points.items():
-            on_front = not any(_dominates(other, at) for other in everywhere)
+            on_front = not any(other != at and other[0] <= at[0] and other[1] <= at[1] for other in everywhere)
             face = stroke["color"] if on_front else "white"
             axes.plot(*at, marker="o", markersize=6.0 if on_front else 3.5, markerfacecolor=face, **stroke)
             word = shown_value(point[0][1]) if point else _word(axis)
@@ -151,7 +151,3 @@ def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, fl
 def _entries(sweep: Sweep) -> list[Entry]:
     strokes = {name: style.stroke_among(sweep.estimators, name) for name in sweep.estimators}
     return [Entry.of_line(name, stroke["color"], stroke["linestyle"]) for name, stroke in strokes.items()]
-
-
-def _dominates(other: tuple[float, float], one: tuple[float, float]) -> bool:
-    return other != one and other[0] <= one[0] and other[1] <= one[1]

@@ -137,7 +137,7 @@ def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
             "output": "both" if run.estimator in repeated else run.output,
             "good": run.status == "ok",
             "change": changes.get(run.estimator, ""),
-            "track": None if drawn.trajectory is None else _drawn(_aligned(files.tracks[drawn.trajectory], drawn)),
+            "track": None if drawn.trajectory is None else _drawn(files.tracks[drawn.trajectory], drawn),
             "errors": None if drawn.errors is None else thinned(asdict(drawn.errors), "position_m"),
             "nees": _nees(drawn.nees),
             "components": None if drawn.components is UNSET else _components(drawn.components),
@@ -158,18 +158,15 @@ def _rows_of(estimator: str, rows: list[Json]) -> list[str]:
     return [row["id"] for row in rows if row["estimator"] == estimator]
 
 
-def _aligned(track: DrawnPath, drawn: DrawnRun) -> DrawnPath:
-    return DrawnPath(track.t_s, _moved(track.positions, drawn))
-
-
 def _moved(points: Array, drawn: DrawnRun) -> Array:
     moved: Array = points @ np.array(drawn.rotation).T + np.array(drawn.translation_m)
     return moved
 
 
-def _drawn(track: DrawnPath) -> Json:
+def _drawn(track: DrawnPath, aligned_as: DrawnRun | None = None) -> Json:
     kept = evenly(track.t_s.size, _MOST_POSES)
-    return {"t_s": [round(t, 4) for t in track.t_s[kept].tolist()], **coordinates(track.positions[kept])}
+    points = track.positions[kept] if aligned_as is None else _moved(track.positions[kept], aligned_as)
+    return {"t_s": [round(t, 4) for t in track.t_s[kept].tolist()], **coordinates(points)}
 
 
 def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
@@ -343,9 +340,7 @@ def _as_array(values: Sequence[float | None]) -> Array:
 
 def coordinates(points: Array) -> dict[str, list[float | None]]:
     """Return points (N, 3) as lists of x, y and z to the millimetre, beyond 10 000 km with six digits."""
-    axes = zip("xyz", points.T.tolist(), strict=True)
-    return {axis: [_metres(value) for value in values] for axis, values in axes}
-
-
-def _metres(value: float) -> float | None:
-    return round(value, _MILLIMETRES) if abs(value) < _LARGE_M else documents.number(value)
+    return {
+        axis: [round(v, _MILLIMETRES) if abs(v) < _LARGE_M else documents.number(v) for v in values]
+        for axis, values in zip("xyz", points.T.tolist(), strict=True)
+    }
