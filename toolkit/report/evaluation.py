@@ -29,9 +29,9 @@ from toolkit.report.html import card, filled_page, source
 from toolkit.report.text import (
     MISSING,
     WIDTH,
-    Part,
     ShownUnit,
     Table,
+    TextPart,
     Width,
     as_latex,
     cell,
@@ -278,16 +278,16 @@ class _RemarkScope(NamedTuple):
 
 def _parts(
     evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), most: int | None = _MOST_FAILURES
-) -> Iterator[Part]:
+) -> Iterator[TextPart]:
     """Yield what is told of an evaluation: tables, then what is more than chance, what failed and what to know."""
-    yield Part("Leaderboard", leaderboard_table(evaluation, columns))
+    yield TextPart("Leaderboard", leaderboard_table(evaluation, columns))
     if len(evaluation.sequences) > 1:
-        yield Part(f"{evaluation.ranked_by.name}, median over the runs", sequences_table(evaluation))
+        yield TextPart(f"{evaluation.ranked_by.name}, median over the runs", sequences_table(evaluation))
     if (stated := uncertainty_table(evaluation)) is not None:
-        yield Part(_UNCERTAINTY, stated)
-    yield Part("Pairs", tuple(paired_lines(evaluation)))
-    yield Part("Fails", tuple(failure_lines(evaluation, most)))
-    yield Part("Notes", tuple(note_lines(evaluation)))
+        yield TextPart(_UNCERTAINTY, stated)
+    yield TextPart("Pairs", tuple(paired_lines(evaluation)))
+    yield TextPart("Fails", tuple(failure_lines(evaluation, most)))
+    yield TextPart("Notes", tuple(note_lines(evaluation)))
 
 
 def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:

@@ -79,14 +79,14 @@ def markdown_section(title: str, entries: Iterable[str]) -> Iterator[str]:
         yield "\n".join(lines)
 
 
-class Part(NamedTuple):
+class TextPart(NamedTuple):
     """A part of a text: a table or lines, under a title."""
 
     title: str
     body: "Table | tuple[str, ...]"
 
 
-def parts_as_text(parts: Iterable[Part], width: Width) -> Iterator[str]:
+def parts_as_text(parts: Iterable[TextPart], width: Width) -> Iterator[str]:
     """Yield the lines of parts: a table below its title, other lines beside it."""
     for title, body in parts:
         if isinstance(body, Table):
@@ -95,7 +95,7 @@ def parts_as_text(parts: Iterable[Part], width: Width) -> Iterator[str]:
             yield from section(title.lower(), body, width)
 
 
-def parts_as_markdown(parts: Iterable[Part]) -> Iterator[str]:
+def parts_as_markdown(parts: Iterable[TextPart]) -> Iterator[str]:
     """Yield the paragraphs of parts; nothing of one without lines."""
     for title, body in parts:
         if isinstance(body, Table):
