@@ -123,10 +123,7 @@ def _modules() -> tuple[FoundModule, ...]:
 
 @cache
 def _found() -> _Found:
-    """Import every module of this package and of the announced ones.
-
-    Raises ExtensionError where two have the same name, or one is neither a format nor has built-in sequences.
-    """
+    """Import every module of this package and of the announced ones."""
     modules: dict[str, ModuleType] = {}
     missing: dict[str, str] = {}
     for found in _modules():
@@ -145,7 +142,6 @@ def _found() -> _Found:
 
 
 def _check_built_ins_differ(modules: Mapping[str, ModuleType]) -> None:
-    """Raise ExtensionError where two modules offer a built-in sequence of the same name."""
     offered_by: dict[str, object] = {}
     for module in (module for module in modules.values() if isinstance(module, BuiltIns)):
         file = getattr(module, "__file__", module)
@@ -242,7 +238,6 @@ def check_built_in(source: str, frontend: Frontend) -> None:
 
 
 def _check_topics(source: str, reader: RecordingFormat | None, frontend: Frontend) -> None:
-    """Raise DataError where topics are named for a recording that is no bag."""
     if frontend.topics is not None and not isinstance(reader, HasTopics):
         raise DataError(f"{source}: it has no topics, a bag has; leave --topics out, or compare it by itself")
 
@@ -339,7 +334,6 @@ def _check_readable(path: Path, source: str) -> None:
 
 
 def _nearest_source(path: Path, source: str) -> str:
-    """Return the end of a message about a missing source: the nearest name in its folder, or a built-in name."""
     if _ADDRESS.match(str(source)):
         return "; it is an address: download it and name the file"
     if path.parent != Path():
@@ -360,7 +354,6 @@ def _some(names: list[str]) -> str:
 
 
 def _check_types(sequence: Sequence) -> None:
-    """Raise DataError where a part of a loaded sequence has a wrong type, or a table a wrong length."""
     whose = sequence.name if isinstance(sequence.name, str) else "a recording"
     parts = {"name": str, "rig": StereoRig, "observations": Observations, "provenance": Provenance}
     found = {part: (getattr(sequence, part), kind) for part, kind in parts.items()}

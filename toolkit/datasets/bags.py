@@ -116,7 +116,6 @@ def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress)
 
 
 def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
-    """Return why no pair of images can be used, and what to do."""
     if not listed.pairs:
         return (
             f"no image of {chosen.left.name} has one of {chosen.right.name} within 1 ms ({listed.stamps} left ones); a "
@@ -196,10 +195,6 @@ def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progres
 
 
 def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
-    """Return the samples of the IMU, or the twists where there is none, and what must be known of them.
-
-    Raises DataError where nothing measures the motion, or what was chosen does not measure all of it.
-    """
     imu, accel = source.chosen.imu, source.chosen.accel
     if imu is None:
         return _twists(source), ()
@@ -251,10 +246,7 @@ def _messages_of(source: Recorded, topic: Topic) -> Sequence[Message]:
 
 
 def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Array]:
-    """Return stamps (N,) and what an Imu measures (N, 3).
-
-    Raises DataError where it does not: a covariance of -1 says so, or all values are 0.
-    """
+    """Return stamps (N,) and what an Imu measures (N, 3)."""
     messages = _messages_of(source, topic)
     part = ros_values.VECTORS[topic.type][what == "acceleration"]
     values = ros_values.columns([message.value for message in messages], part)
@@ -299,7 +291,6 @@ def read_topic(path: Path, name: str | None, cov_convention: CovConvention | Non
 
 
 def _topic_of_poses(path: Path, topics: Sequence[Topic], name: str | None) -> Topic:
-    """Return the topic that is named, or the only one, of those with covariances first."""
     usable = [topic for topic in topics if topic.type in _OF_POSES and topic.count and not topic.unreadable]
     by_name = {topic.name: topic for topic in usable}
     if name in by_name:

@@ -176,14 +176,12 @@ def _turned_deg(fields: Fields) -> float:
 
 
 def _turned(fields: Fields) -> Iterator[str]:
-    """Yield that the cameras are not parallel, where they are not."""
     turned_deg = _turned_deg(fields)
     if turned_deg > np.rad2deg(_TURNED_RAD):
         yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
 def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple[str, ...]]:
-    """Return the sightings, and what to know of them."""
     sparse = sparse_array(parts.path, _FEATURES, features, (4, None, parts.t_ns.size), _NOT_SEEN)
     frame, track, corners_px, facts = corners_of(sparse)
     return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px)), facts

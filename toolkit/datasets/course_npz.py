@@ -84,13 +84,11 @@ def _rig(fields: Fields) -> StereoRig:
 
 
 def _check_alike(fields: Fields, one: str, of_one: Array, other: str, of_other: Array) -> None:
-    """Raise DataError where a file has both names of a quantity, and they say different things."""
     if not np.allclose(of_one, of_other, atol=_ALIKE, equal_nan=True):
         raise DataError(f"{fields.path}: it has both {one} and {other}, and they differ: delete the one that is wrong")
 
 
 def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> tuple[Observations, tuple[str, ...]]:
-    """Return the sightings, and what to know of them."""
     if "features" not in archive.keys:
         nothing = np.empty(0, dtype=np.int64)
         return Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,)

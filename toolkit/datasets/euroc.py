@@ -209,7 +209,6 @@ def _imu(layout: _Layout) -> ImuSamples:
 
 
 def _few_images(layout: _Layout) -> Iterator[str]:
-    """Yield why the images that a folder holds were not used, where it holds too few."""
     if layout.mav0 is None or not _has_images(layout.mav0):
         return
     share = _share_with_images(layout.mav0, layout.stamps)
@@ -253,7 +252,6 @@ def _filmed(
 
 
 def _no_pair_is_there(mav0: Path, named: Listed) -> str:
-    """Return what is wrong with tables none of whose images is there, and what to do."""
     if not named.pairs:
         return "no image of cam0 has one of cam1 by its name or its table; write cam0/data.csv and cam1/data.csv"
     first = named.pairs[0].left
@@ -307,11 +305,7 @@ class _RoomTracks:
 
 
 def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> _RoomTracks:
-    """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance.
-
-    The room belongs to the trajectory; the seed draws the chance ends of tracks, what is followed, and the
-    noise, each from a stream of its own. The same arguments give the same bits.
-    """
+    """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance."""
     tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
     points = _room_around(T_world_imu[:, :3, 3])
     tracks = sensors.follow(sensors.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
@@ -322,7 +316,6 @@ def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, 
 
 
 def _check_room(root: Path, positions: Array) -> None:
-    """Raise DataError where positions (K, 3) are spread wider than a room is."""
     if not _surface_m2(*_corners(positions)) < _MOST_SURFACE_M2:
         raise DataError(
             f"{root}: the truth spans {np.ptp(positions, axis=0).max():.3g} m, and tracks are simulated in a room; "

@@ -370,10 +370,7 @@ def _day_of(root: Path) -> _Day:
 
 
 def _of_the_day(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
-    """Return the pair of two cameras whose images have a size: the rectified one, or the sensor's.
-
-    Raises DataError where a value is missing or impossible, or images have neither size.
-    """
+    """Return the pair of two cameras whose images have a size: the rectified one, or the sensor's."""
     day, sides = _day_of(layout.root), tuple(camera.name.removeprefix("image_") for camera in _cameras(layout))
     names = [f"{what}_{side}" for side in sides for what in ("S", "K", "D", "R", "T", "S_rect", "P_rect")]
     day.cameras.require(*names, "R_rect_00")
@@ -419,16 +416,12 @@ def _size(cameras: Fields, key: str) -> tuple[int, int]:
 
 
 def _rigid_motion(fields: Fields, suffix: str = "") -> Array:
-    """Return the rigid motion (4, 4) of an R and a T."""
     rotation = fields.constant(f"R{suffix}", 9).reshape(3, 3)
     return rigid(fields.path, f"R{suffix}", se3(rotation, fields.constant(f"T{suffix}", 3)))
 
 
 def _read_packets(folder: Path) -> tuple[IntArray, Array, int] | None:
-    """Return the stamps (S,) ns of packets, their values (S, 30), and how many lack their file or their stamp.
-
-    They are in the order of their files; None where there is no such folder.
-    """
+    """Return the stamps (S,) ns of packets, their values (S, 30), and how many lack their file or their stamp."""
     if not folder.is_dir():
         return None
     stamps = _read_stamps(folder / "timestamps.txt")

@@ -95,7 +95,6 @@ def references(path: Path) -> dict[str, Trajectory]:
 
 
 def _tables(folder: Path) -> tuple[Path, Path]:
-    """Return the paths of the IMU and the feature table, or raise DataError listing every file that is missing."""
     imu, features = find_table(folder, _IMU), find_table(folder, _FEATURES)
     if imu is None or features is None or not (folder / _CALIBRATION).is_file():
         there = {_CALIBRATION: (folder / _CALIBRATION).is_file(), _IMU: imu, _FEATURES: features}

@@ -188,7 +188,6 @@ def _motion(
 
 
 def _imu(table: Columns) -> tuple[str, ...]:
-    """Return the columns of an IMU by the names they have here."""
     of_twist = set(table.names) >= set(TWIST)
     return IMU if of_twist else imu_columns(table.names) or IMU
 
@@ -220,7 +219,6 @@ def _twist_noise(place: Path, t_ns: IntArray, values: Array, noise: Mapping[str,
 
 
 def _calibration(rig: Table) -> tuple[Path, Mapping[str, Any]]:
-    """Return where a calibration is from, and its nested values."""
     place = Path(rig) if isinstance(rig, str | PathLike) else Path("rig")
     if isinstance(rig, Mapping):
         values: Mapping[str, Any] = rig

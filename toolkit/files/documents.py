@@ -167,13 +167,11 @@ def readable(why: msgspec.ValidationError, document: object, record: type[msgspe
 
 
 def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
-    """Return msgspec's message and its path; for a wrong key, the path of the object that it is in."""
     placed = _PLACED.fullmatch(str(why))
     return (placed["what"], placed["path"]) if placed else (str(why), "")
 
 
 def _plain(what: str) -> str:
-    """Return msgspec's words with JSON's names of the types."""
     named = re.sub(r"`([\w| ]+)`", lambda kinds: _kinds(kinds[1].split(" | ")), what)
     for theirs, ours in (("Object missing required field", "lacks"), (_NO_CHOICE, "cannot be")):
         named = named.replace(theirs, ours)

@@ -224,10 +224,7 @@ def opened(path: Path) -> Iterator[Bag]:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Return the one bag in a folder without metadata.yaml, or the parts of one that ROS 1 has split.
-
-    Raises DataError where there are several that are no such parts.
-    """
+    """Return the one bag in a folder without metadata.yaml, or the parts of one that ROS 1 has split."""
     bags = _files_alone(folder)
     of_ros1 = {kind_of(bag) for bag in bags} == {"ros1"}
     numbers = sorted(int(found[1]) for bag in bags if (found := _PART.search(bag.stem)))
@@ -255,7 +252,6 @@ def _reader(kind: Kind | None) -> Any:
 
 @cache
 def _store(of_ros1: bool) -> Any:
-    """Return the definitions of ROS's messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if of_ros1 else Stores.ROS2_HUMBLE)
@@ -379,7 +375,6 @@ def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Gi
 
 
 def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
-    """Return the topics of the left and the right images."""
     left, right = given.get("left"), given.get("right")
     if left is not None and right is not None:
         return left, right
@@ -395,7 +390,6 @@ def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: G
 
 
 def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
-    """Return the message for a bag in which no two topics of images are a pair by their names."""
     there = ", ".join(map(str, topics)) or "no topics"
     if not images:
         why = "holds no images that can be read, and the tracks are made of them"
@@ -471,7 +465,6 @@ def _most(topics: Iterable[Topic]) -> Topic | None:
 
 
 def _facts(topics: Sequence[Topic], chosen: Chosen, given: Given) -> tuple[str, ...]:
-    """Return remarks on the topics by role, given or guessed, and on those that are not used."""
     found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
     named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
     used = {topic.name for topic in (*found.values(), *chosen.transforms)}

@@ -152,7 +152,6 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
 
 
 def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
-    """Return the message for a folder without calibration: what was looked for, and what lies there instead."""
     missing = ", ".join(str(file.relative_to(mav0)) for file in lacking)
     there = [file for folder in (mav0.parent, mav0) for kind in _KINDS for file in folder.glob(kind)]
     others = [f"{printable(file.name)}{_of_system(file)} is not read" for file in sorted(set(there))[:_NAMED]]
@@ -163,7 +162,6 @@ def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
 
 
 def _of_system(file: Path) -> str:
-    """Return whose calibration a file is, by the names in it; empty where none is known."""
     with open_input(file) as opened:
         content = opened.read(_LOOKED_AT)
     return next((f" of {system}" for system, names in _SYSTEMS.items() if any(n in content for n in names)), "")
@@ -229,7 +227,6 @@ def _noise_beside(camchain: Path, root: Path, mav0: Path) -> tuple[tuple[ImuNois
 
 
 def _check_camchain(fields: Fields) -> None:
-    """Raise DataError where a camchain is not that of two cameras and an IMU."""
     if not any(key.startswith("cam1.") for key in fields.arrays):
         raise DataError(f"{fields.path}: holds one camera, and stereo needs two; calibrate cam0 and cam1 together")
     if "cam0.intrinsics" in fields and "cam0.T_cam_imu" not in fields:
@@ -323,10 +320,7 @@ def _in_flight(stated: ImuNoise) -> ImuNoise:
 
 
 def _camera_of(fields: Fields) -> Camera:
-    """Return the camera of a sensor.yaml, or of one camera of a camchain (:func:`_part`).
-
-    Raises DataError where a field is missing or impossible, or the model is one that images are not rectified with.
-    """
+    """Return the camera of a sensor.yaml, or of one camera of a camchain (:func:`_part`)."""
     fx, fy, cx, cy = _pinhole_of(fields)
     width, height = fields.constant("resolution", 2).tolist()
     if not (fx > 0.0 and fy > 0.0 and 0.0 < cx < width and 0.0 < cy < height):

@@ -304,7 +304,6 @@ def check_rows(path: Path, corners_px: Array) -> None:
 
 
 def _rows_mended(columns_px: Array) -> str:
-    """Return what to do about rows that differ in sightings whose uL - uR (N,) px is given."""
     exchanged = abs(np.median(columns_px)) <= _MOST_ROWS_APART_PX
     return "u and v look exchanged: exchange them" if exchanged else "rectify the images, or correct the rows"
 
@@ -431,7 +430,6 @@ def flattened(value: Any, key: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _as_matrix(mapping: dict[Any, Any]) -> np.ndarray | None:
-    """Return the matrix (rows, cols) that a mapping is in OpenCV's dialect, None where it is another."""
     data, rows, cols = _as_array(mapping.get("data")), mapping.get("rows"), mapping.get("cols")
     if data is None or not isinstance(rows, int) or not isinstance(cols, int) or data.size != rows * cols:
         return None

@@ -237,7 +237,6 @@ def _rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
 
 
 def _facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
-    """Return what a reader must know of the tracks of ``pairs`` pairs, and which of these were left out."""
     used = tracks.t_ns.size
     a_frame = np.bincount(tracks.frame, minlength=used)
     facts = [

@@ -43,15 +43,12 @@ _DAMAGED_PICKLE = (
 
 
 class _Layout(NamedTuple):
-    """What a header says of an array."""
-
     shape: tuple[int, ...]
     fortran_order: bool
     dtype: np.dtype[np.generic]
 
 
 def _header(stream: IO[bytes], what: str) -> _Layout:
-    """Read the header of an npy, and leave the stream at its values."""
     try:
         version = np.lib.format.read_magic(stream)
         # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
@@ -301,10 +298,7 @@ _InPython: Any = pickle._Unpickler
 
 
 class _PlainUnpickler(_InPython):  # type: ignore[misc]
-    """The standard library's reader in Python, to which no name is known but those of arrays and numbers.
-
-    Nothing else can be called: what a name gives is a function of this module, and no value of plain data is one.
-    """
+    """The standard library's reader in Python, to which no name is known but those of arrays and numbers."""
 
     def __init__(self, path: Path, source: _Mapped) -> None:
         super().__init__(source)

@@ -243,10 +243,7 @@ def _plain(heading: str) -> str:
 
 
 def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
-    """Return the line that names the columns, and the others with their numbers, without comments and empty ones.
-
-    The names may be a comment, the last one before the rows. Raises DataError where no line names them.
-    """
+    """Return the line that names the columns, and the others with their numbers, without comments and empty ones."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     before = [line for number, line in lines if not rows or number < rows[0][0]]

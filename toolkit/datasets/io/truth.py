@@ -227,11 +227,7 @@ def _read_csv(path: Path) -> TruthRead:
 
 
 def _rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
-    """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed.
-
-    A truth whose axes are not the IMU's rotates about other axes than the gyro measures. Infinite where the two share
-    no 0.2 s.
-    """
+    """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed."""
     sample_t_ns, gyro_radps = _usable(imu)
     if not sample_t_ns.size:
         return float("inf")

@@ -45,7 +45,6 @@ def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
 
 
 def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
-    """Return what a folder is; empty where that is unknown."""
     if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
         return (
             "is a run directory and no recording: vislam report shows it, and --config "
@@ -58,7 +57,6 @@ def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
 
 
 def _packed_in(folder: Path) -> str:
-    """Return which files in a folder are packed, and how each is unpacked; empty where none is."""
     files = [entry for entry in islice(sorted(folder.iterdir()), _LOOKED_AT) if is_regular(entry)]
     packed = {file.name: how for file in files if file.suffix != _ARRAYS and (how := _archive(file)) is not None}
     if not packed:
@@ -70,7 +68,6 @@ def _packed_in(folder: Path) -> str:
 
 
 def _of_file(path: Path) -> str:
-    """Return what a file is; empty where that is unknown."""
     if path.stat().st_size == 0:
         return "the file is empty and so of no known format"
     archive = None if path.suffix == _ARRAYS else _archive(path)

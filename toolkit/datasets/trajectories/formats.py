@@ -329,7 +329,6 @@ class Stamped:
         return StatedCovariances(from_triangle(entries, lower=lower), convention)
 
     def _stamps(self, rows: Rows, table: Array) -> IntArray:
-        """Return the stamps of rows (N,) ns; raises DataError naming a wrong unit, or stamps of too few digits."""
         _check_digits(rows, table)
         if self.unit_ns == NS_PER_S:
             stamps_ns(rows.path, "time", table[:, 0])  # names a wrong unit
@@ -532,7 +531,6 @@ def _is_usual(named: Named, rows: Rows) -> bool:
 
 
 def _by_name(rows: Rows, named: Named) -> PosesFile:
-    """Return the poses in columns that names say, or the positions alone; raises DataError as a format does."""
     table = rows.numbers(rows.width, ", ".join(rows.heading) or POSITIONS_ALONE)
     t_ns = _stamps_by_name(rows, named, table)
     turns = table[:, named.quaternion] if named.quaternion else np.tile([0.0, 0.0, 0.0, 1.0], (len(table), 1))
@@ -542,8 +540,6 @@ def _by_name(rows: Rows, named: Named) -> PosesFile:
 
 
 def _stamps_by_name(rows: Rows, named: Named, table: Array) -> IntArray:
-    """Return the stamps (N,) ns of rows; raises DataError naming a wrong unit, or stamps of too few digits."""
-
     def column(at: int, unit_ns: int) -> IntArray:
         return replace(rows, cells=[[cells[at]] for cells in rows.cells]).stamps(unit_ns)
 
@@ -573,7 +569,6 @@ def _begins_with_row_numbers(rows: Rows) -> bool:
 
 
 def _stamped_poses(rows: Rows, t_ns: IntArray, values: Array, kind: str) -> PosesFile:
-    """Return checked poses of rows (N, 7), those left out that are not known."""
     kept = known_poses(values)
     numbers = [n for n, is_kept in zip(rows.line_numbers, kept.tolist(), strict=True) if is_kept]
     if not numbers:
@@ -667,7 +662,6 @@ def _check_lines(
 
 
 def _finite(trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory without the poses that are not finite, which readers of files reject."""
     kept = np.isfinite(trajectory.T_world_imu).all(axis=(1, 2))
     others = (None if one is None else one[kept] for one in (trajectory.v_world, trajectory.bias, trajectory.cov))
     return Trajectory(trajectory.t_ns[kept], trajectory.T_world_imu[kept], *others)
@@ -707,10 +701,7 @@ def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
 
 
 def _concentration(positions: Array, R_world_imu: Array) -> float:
-    """Return the mean resultant length, 0 to 1, of the body-frame displacements: 1 where all point the same way.
-
-    Displacements are their own weights, so that noise at standstill does not count.
-    """
+    """Return the mean resultant length, 0 to 1, of the body-frame displacements: 1 where all point the same way."""
     steps = np.diff(positions, axis=0)
     total = np.linalg.norm(steps, axis=1).sum()
     in_body = np.einsum("nji,nj->ni", R_world_imu[:-1], steps)
