@@ -269,7 +269,7 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
         "imu0/data.csv: missing column w_RS_S_y",
     ),
     ("open list", lambda d: edit(d / "mav0/cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
-    ("aliases", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "its aliases .* more than 200000 values"),
+    ("aliases", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "more than 10 aliases"),
     ("too deep", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(f"a: {'[' * 5000}"), "is nested too deeply"),
     ("twice", lambda d: edit(d / "mav0/cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
     ("not rigid", lambda d: edit(d / "mav0/cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
