@@ -272,8 +272,8 @@ def check_rows(path: Path, corners_px: Array) -> None:
     exchanged = abs(np.median(columns_px[apart])) <= _MOST_ROWS_APART_PX
     remedy = "u and v look exchanged: exchange them" if exchanged else "rectify the images, or correct the rows"
     raise DataError(
-        f"{path}: in {apart.mean():.0%} of {len(whole)} sightings vL - vR is {np.median(rows_px[apart]):.1f} px and uL - "
-        f"uR {np.median(columns_px[apart]):.1f} px (medians), and the rows of a rectified pair are equal; {remedy}"
+        f"{path}: in {apart.mean():.0%} of {len(whole)} sightings vL - vR is {np.median(rows_px[apart]):.1f} px and "
+        f"uL - uR {np.median(columns_px[apart]):.1f} px (medians), and the rows of a rectified pair are equal; {remedy}"
     )
 
 

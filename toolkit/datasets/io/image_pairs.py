@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -99,30 +100,37 @@ def image_folder(camera: Path) -> Path:
     )
 
 
+class _Side(NamedTuple):
+    """The stamps (N,) ns and the images of a camera, in the order in which they are listed."""
+
+    t_ns: IntArray
+    images: Sequence[Path]
+
+
+def _paired(left: _Side, right: _Side, reach_ns: float, alone: str) -> Listed:
+    """Pair images by the nearest stamp within reach; ``alone`` says of left ones that none is."""
+    remarks = []
+    if (np.diff(left.t_ns) < 0).any():
+        remarks.append("the stamps of the left images were out of order and have been sorted")
+    t_ns, first = np.unique(left.t_ns, return_index=True)
+    if t_ns.size < left.t_ns.size:
+        remarks.append(f"{left.t_ns.size - t_ns.size} left images had the stamp of another and are left out")
+    partner = _nearest(right.t_ns, t_ns, reach_ns)
+    if (partner < 0).any():
+        remarks.append(f"{int((partner < 0).sum())} left images have no right one {alone} and are left out")
+    rows = zip(t_ns.tolist(), first.tolist(), partner.tolist(), strict=True)
+    pairs = tuple(StampedPair(t, left.images[i], right.images[j]) for t, i, j in rows if j >= 0)
+    none = t_ns.size > 0 and right.t_ns.size > 0 and not pairs
+    apart_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0))) if none else None
+    return Listed(pairs, t_ns.size, tuple(remarks), apart_ms)
+
+
 def pairs_of_asl(mav0: Path) -> Listed:
     """Pair the images of cam0 and cam1 by their stamps; files that are listed and missing stay in, to be named.
 
     Raises DataError where a table is damaged.
     """
-    left, right = (_files(mav0 / camera) for camera in ("cam0", "cam1"))
-    remarks = []
-    if not np.array_equal(np.sort(left.t_ns), left.t_ns):
-        remarks.append(f"the stamps of {left.camera}/data.csv were out of order and have been sorted")
-    t_ns, first = np.unique(left.t_ns, return_index=True)
-    if t_ns.size < left.t_ns.size:
-        remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.camera} had the stamp of another; left out")
-    partner = _nearest(right.t_ns, t_ns, _SAME_INSTANT_NS)
-    alone = int((partner < 0).sum())
-    if alone:
-        remarks.append(f"{alone} left images have no right one within 1 ms and are left out")
-    pairs = tuple(
-        StampedPair(int(t), left.path(int(i)), right.path(int(j)))
-        for t, i, j in zip(t_ns, first, partner, strict=True)
-        if j >= 0
-    )
-    none = 0 < alone == t_ns.size and right.t_ns.size > 0
-    apart_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0))) if none else None
-    return Listed(pairs, t_ns.size, tuple(remarks), apart_ms)
+    return _paired(_side(mav0 / "cam0"), _side(mav0 / "cam1"), _SAME_INSTANT_NS, "within 1 ms")
 
 
 def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
@@ -131,23 +139,15 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said. Either
     camera may write its numbers with other leading zeros or another suffix.
     """
-    lefts, rights = numbered(left), numbered(right)
-    numbers = lefts.keys() | rights.keys()
-    stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
-    remarks = []
-    if len(stamped) < len(numbers):
-        remarks.append(f"{len(numbers) - len(stamped)} images have no stamp and are left out")
-    if [number for _, number in stamped] != sorted(number for _, number in stamped):
-        remarks.append("the stamps of the images were out of order and have been sorted")
-    pairs: list[StampedPair] = []
-    for stamp, number in stamped:
-        if pairs and pairs[-1].t_ns == stamp:
-            remarks.append(f"image {number} has the stamp of another and is left out")
-            continue
-        paths = lefts.get(number), rights.get(number)
-        name = (paths[0] or paths[1] or left).name
-        pairs.append(StampedPair(stamp, paths[0] or left / name, paths[1] or right / name))
-    return Listed(tuple(pairs), len(numbers), tuple(remarks))
+    sides = {left: numbered(left), right: numbered(right)}
+    names = {number: path.name for side in sides.values() for number, path in side.items()}
+    stamped = [number for number in sorted(names) if number in t_ns]
+    stamps = np.array([t_ns[number] for number in stamped], dtype=np.int64)
+    both = [_Side(stamps, [there.get(n, folder / names[n]) for n in stamped]) for folder, there in sides.items()]
+    listed = _paired(both[0], both[1], 0, "")
+    unstamped = len(names) - len(stamped)
+    remarks = (f"{unstamped} images have no stamp and are left out",) if unstamped else ()
+    return replace(listed, stamps=len(names), remarks=(*remarks, *listed.remarks))
 
 
 def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> Listed:
@@ -157,17 +157,23 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     out of order they tell it less than the numbers do, as :func:`pairs_by_name`. A stamp of the right camera that is
     missing leaves its image to the left one of the same number.
     """
-    partner = _partners(t_ns, {**t_ns, **right_t_ns})
+    both = [dict(sorted(stamps.items())) for stamps in (t_ns, {**t_ns, **right_t_ns})]
+    lefts, rights = (np.array(list(stamps.values()), dtype=np.int64) for stamps in both)
+    reach_ns = 0.5 * float(np.median(np.diff(lefts))) if lefts.size > 1 else np.inf
+    numbers = np.array([*both[1], -1])[_nearest(rights, lefts, reach_ns)]
     in_order = all((np.diff([stamps[n] for n in sorted(stamps)]) > 0).all() for stamps in (t_ns, right_t_ns))
-    if not in_order or all(number == other for number, other in partner.items()):
+    if not in_order or (numbers[numbers >= 0] == np.array(list(both[0]))[numbers >= 0]).all():
         return pairs_by_name(left, right, t_ns)
-    lefts, rights = numbered(left), numbered(right)
-    paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
-    remarks = ["the cameras' images are numbered differently and paired by their stamps"]
-    if len(paired) < len(lefts):
-        remarks.append(f"{len(lefts) - len(paired)} left images have no right one of the same time and are left out")
-    pairs = tuple(StampedPair(stamp, path, rights.get(other, right / path.name)) for stamp, path, other in paired)
-    return Listed(pairs, len(lefts), tuple(remarks))
+    there = numbered(left), numbered(right)
+    kept = [number for number in both[0] if number in there[0]]
+    listed = _paired(
+        _Side(np.array([t_ns[number] for number in kept], dtype=np.int64), [there[0][number] for number in kept]),
+        _Side(rights, [there[1].get(number, right / f"{number:010d}.png") for number in both[1]]),
+        reach_ns,
+        "of the same time",
+    )
+    how = "the cameras' images are numbered differently and paired by their stamps"
+    return replace(listed, remarks=(how, *listed.remarks))
 
 
 def numbered(folder: Path) -> dict[int, Path]:
@@ -178,14 +184,6 @@ def numbered(folder: Path) -> dict[int, Path]:
     if plain or None in ends or len({end[1] for end in ends if end}) != 1:
         return plain
     return {int(end[2]): path for end, path in zip(ends, images, strict=True) if end}
-
-
-def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:
-    """Return the number of the right stamp nearest to each left one, by number; none beyond half an interval."""
-    stamps, wanted_ns = (np.array(list(items.values()), dtype=np.int64) for items in (right_t_ns, t_ns))
-    reach_ns = 0.5 * float(np.median(np.diff(np.sort(wanted_ns)))) if wanted_ns.size > 1 else np.inf
-    rows, numbers = _nearest(stamps, wanted_ns, reach_ns).tolist(), list(right_t_ns)
-    return {number: numbers[row] for number, row in zip(t_ns, rows, strict=True) if row >= 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,20 +247,7 @@ def _facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
     return tuple(facts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Files:
-    """The stamps (N,) and names of the images of a camera, and the folder they are in."""
-
-    camera: str
-    folder: Path
-    t_ns: IntArray
-    names: tuple[str, ...]
-
-    def path(self, row: int) -> Path:
-        return self.folder / self.names[row]
-
-
-def _files(camera: Path) -> _Files:
+def _side(camera: Path) -> _Side:
     """Return what a camera's table lists, or the images there are, whose names are stamps.
 
     An image that was converted is found by its stem: tables keep the old suffix.
@@ -270,21 +255,18 @@ def _files(camera: Path) -> _Files:
     table, folder = camera / "data.csv", image_folder(camera)
     there = images_in(folder)
     if not is_regular(table):
-        stamped = [(stamp, path.name) for path in there if (stamp := _stamp_ns(path.stem)) is not None]
-        return _Files(
-            camera.name, folder, np.array([t for t, _ in stamped], dtype=np.int64), tuple(n for _, n in stamped)
-        )
+        stamped = [(stamp, path) for path in there if (stamp := _stamp_ns(path.stem)) is not None]
+        return _Side(np.array([t for t, _ in stamped], dtype=np.int64), [path for _, path in stamped])
     lines = read_text_input(table, "copy it again").splitlines()
     headings = 0 if lines and lines[0][:1].isdigit() else 1
     t_ns = read_stamps(table, headings)
     rows = [row for row in lines[headings:] if row.strip() and row[0] != "#"]
-    names = tuple(row.partition(",")[2].strip() for row in rows)
+    names = [row.partition(",")[2].strip() for row in rows]
     if len(names) != t_ns.size or any("/" in name or "\\" in name for name in names):
         raise DataError(f"{table}: expected a stamp and the name of an image in each row; export it again")
-    named = (name or f"{t}.png" for name, t in zip(names, t_ns.tolist(), strict=True))
-    known, by_stem = {path.name for path in there}, {path.stem: path.name for path in there}
-    found = (name if name in known else by_stem.get(Path(name).stem, name) for name in named)
-    return _Files(camera.name, folder, t_ns, tuple(found))
+    by_name, by_stem = {path.name: path for path in there}, {path.stem: path for path in there}
+    named = [name or f"{t}.png" for name, t in zip(names, t_ns.tolist(), strict=True)]
+    return _Side(t_ns, [by_name.get(name) or by_stem.get(Path(name).stem, folder / name) for name in named])
 
 
 def _stamp_ns(stem: str) -> int | None:
