@@ -265,23 +265,6 @@ def test_poses_of_another_frame_are_moved_to_the_body(asl: Path, tmp_path: Path)
     np.testing.assert_allclose(truth.T_world_imu, expected.T_world_imu, atol=1e-9)
 
 
-UNKNOWN = "uint64 timestamp\nfloat32[3] gyro_rad\nfloat32[3] accelerometer_m_s2\n"
-
-
-def test_a_topic_of_another_type_that_measures_the_motion_or_holds_images_is_named(asl: Path, tmp_path: Path) -> None:
-    ros = Ros("sqlite", get_typestore(Stores.ROS2_HUMBLE))
-    px4, packet = "px4_msgs/msg/SensorCombined", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
-    ros.store.register({**get_types_from_msg(UNKNOWN, px4), **get_types_from_msg("uint8[] data\n", packet)})
-    film = [item for item in film_of(asl, Ros.of("sqlite")) if item.topic != "/imu0"]
-    sample = ros.store.types[px4](0, np.zeros(3, np.float32), np.zeros(3, np.float32))
-    film.append(Item(film[0].t_ns, "/fmu/out/combined", px4, sample))
-    with pytest.raises(DataError, match=r"/fmu/out/combined \(px4_msgs/SensorCombined\) may measure the motion"):
-        load_sequence(str(ros.write(tmp_path / "px4", film)))
-    packed = Item(film[0].t_ns, "/left/packets", packet, ros.store.types[packet](np.zeros(3, np.uint8)))
-    with pytest.raises(DataError, match=r"/left/packets .* may hold some: write them as sensor_msgs/Image"):
-        load_sequence(str(ros.write(tmp_path / "packed", [packed, *motion_of(asl, Ros.of("sqlite"))])))
-
-
 def test_a_truth_keeps_the_poses_it_has_or_is_of_positions_alone_or_left_out(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("sqlite")
     film, whole = film_of(asl, ros), load_sequence(str(asl)).truth
@@ -346,15 +329,9 @@ def test_the_roles_offered_are_those_there_are() -> None:
 @pytest.mark.parametrize(
     ("left_out", "pattern"),
     [
-        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one with"),
         ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
         ("image_raw", "holds no images that can be read.*; there are /cam0/camera_info"),
         ("", "holds no images that can be read.*; there are no topics"),
-        ("/cam0/camera_info", "there is no sensor_msgs/CameraInfo beside /cam0/image_raw"),
-        (
-            "/tf_static",
-            "the camera's pose on the body is unknown: no /tf_static connects the frames 'imu0' and 'cam0'",
-        ),
     ],
 )
 def test_what_is_missing_is_reported_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:

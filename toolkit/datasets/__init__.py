@@ -258,7 +258,7 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
     """
     path, reader = _found_at(source)
     if not isinstance(reader, HasImages):
-        raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
+        raise DataError(f"{source}: holds no images; name a bag, or a folder as EuRoC's or KITTI's")
     _check_topics(source, reader, frontend)
     return reader.images_of(path, frontend)
 

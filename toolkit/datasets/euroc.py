@@ -187,18 +187,16 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
 
 def _whole(path: Path) -> _Layout:
     layout = _layout(path)
-    if layout is None:
-        raise DataError(f"{path}: neither mav0/imu0 nor {_LEAN_IMU} beside {_STAMPS}; give the folder of the recording")
+    assert layout is not None  # as of what is recognised
     return layout
 
 
 def _imu(layout: _Layout) -> ImuSamples:
     if layout.mav0 is not None and not is_regular(layout.imu):
-        bags = [path.parent.name for path in sorted(layout.root.glob("*/*")) if _BAGS & set(path.suffixes)]
+        files = sorted((*layout.root.glob("*"), *layout.root.glob("*/*")))
+        bags = [path.relative_to(layout.root).parts[0] for path in files if _BAGS & set(path.suffixes)]
         if bags:
-            raise DataError(
-                f"{layout.root}: holds no measurements but those of a bag: name its folder {printable(bags[0])}"
-            )
+            raise DataError(f"{layout.root}: holds no measurements but those of a bag: name {printable(bags[0])} in it")
         raise DataError(
             f"{layout.imu}: cannot be read, and there is no imu0.csv of Kalibr's: name the folder that has mav0, or "
             "rectify images without an IMU and lay them out as KITTI's image_0, image_1 and calib.txt"

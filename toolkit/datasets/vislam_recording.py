@@ -21,7 +21,7 @@ from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array
 from toolkit.measurements import ImuNoise, MotionNoise, Prior, StereoRig, TwistChangeNoise, TwistNoise
 from toolkit.motion_samples import ImuPairing, ImuSamples, MotionSamples, NoSamples, Pairing, TwistSamples
-from toolkit.sequence import Observations, Provenance, Sequence, Truth, why_not_sightings
+from toolkit.sequence import Observations, Provenance, Sequence, Truth, check_stated, why_not_sightings
 
 _TEXT, _ARRAYS = "recording.json", "recording.npz"
 _REMEDY = "copy or save the recording again"
@@ -99,8 +99,10 @@ def load(path: Path) -> Sequence:
 def save(sequence: Sequence, directory: Path) -> None:
     """Write a recording to a folder, whole or not at all; a recording that is there already is replaced.
 
-    Raises OutputError where the folder holds anything else or cannot be written.
+    Raises OutputError where the folder holds anything else or cannot be written, DataError where it would not be read:
+    a name, a noise or a calibration is not valid.
     """
+    check_stated(sequence)
     with replaced_directory(Path(directory), _written_by_us) as partial:
         np.savez_compressed(partial / _ARRAYS, **_to_arrays(sequence))
         (partial / _TEXT).write_text(documents.to_text(_text_of(sequence)), encoding="utf-8")

@@ -378,9 +378,11 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
         if not baseline_m > 0.0 and T_right_left is not None:
             baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
         if not (baseline_m > 0.0 and pinhole_px[0] > 0.0):
+            lacks = "no baseline (Tx is 0), and no /tf_static joins the two cameras"
+            lacks = lacks if pinhole_px[0] > 0.0 else "no focal length"
             raise DataError(
-                f"{what[1]}: the images are rectified, P has no baseline (Tx is 0), and no /tf_static joins the two "
-                f"cameras; correct P, or {_PUT_BESIDE} and name the raw images"
+                f"{what[1]}: the images are rectified, and P states {lacks}; correct P, or {_PUT_BESIDE} and name the "
+                "raw images"
             )
         # The frame of an image is the camera's own; R turns it into the rectified one's.
         return replace(already_rectified(pinhole_px, baseline_m, size_px), R_rect_cam=R_rect_left), None, how

@@ -134,7 +134,8 @@ class Columns:
         values = self.values[SECONDS]
         if isinstance(values, np.ndarray) and values.dtype.kind in "fiu":
             return stamps_ns(self.what, SECONDS, values.astype(np.float64))
-        unit = probable_unit(self._numbers(SECONDS))
+        seconds = self._numbers(SECONDS)
+        unit = probable_unit(seconds[np.isfinite(seconds)])  # what is no number is named with its row below
         if unit is not None:
             raise DataError(f"{self.what}: {SECONDS} must be in seconds, but the stamps look like {unit}")
         return exact_ns(list(map(str, values)), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
