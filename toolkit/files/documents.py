@@ -9,6 +9,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
@@ -77,6 +78,11 @@ def to_text(record: msgspec.Struct) -> str:
 def to_line(record: msgspec.Struct) -> str:
     """Return a record as JSON on a single line, for long series; raises ValueError for NaN and infinity."""
     return json.dumps(msgspec.to_builtins(record), allow_nan=False) + "\n"
+
+
+def reader(record: type[Record], remedy: str, older: Older | None = None) -> Callable[[Path], Record]:
+    """Return the function that reads the record in a file, as :func:`read` does."""
+    return partial(read, record=record, remedy=remedy, older=older)
 
 
 def read(

@@ -1,13 +1,12 @@
 """The card of a recording as text and as a record: why a smoother is or is not better than a filter on it."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.files.documents import number, read, rounded
+from toolkit.files.documents import number, reader, rounded
 from toolkit.geometry import Array
 from toolkit.noise import Card
 from toolkit.report.comparison_table import sequence_line
@@ -53,9 +52,7 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     words: Annotated[tuple[str, ...], Meta(description="what that means for filters and smoothers")]
 
 
-def read_card(path: Path) -> CardRecord:
-    """Read what ``vislam card --json`` wrote; raises DataError, in one line with the place, where it is not that."""
-    return read(path, CardRecord, remedy="repeat vislam card")
+read_card = reader(CardRecord, "repeat vislam card")
 
 
 def card_lines(card: Card) -> Iterator[str]:

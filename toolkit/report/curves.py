@@ -234,7 +234,6 @@ def _difference(comparison: Comparison, row: Row) -> Components | None:
 
 
 def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: Array | None) -> Components | None:
-    """Turn errors in the body frame (n, 4, 4) and their covariances into the world's axes."""
     if not t_ns.size:
         return None
     turn = poses[:, :3, :3]

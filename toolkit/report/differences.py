@@ -105,7 +105,6 @@ def differences(before: Files, after: Files) -> DiffRecord:
 def _metric_change(
     estimator: str, output: str, metric: str, before: float | None, after: float | None, p: float | None
 ) -> MetricChangeRecord:
-    """Return by how much a metric changed, and whether by more than rounding and, by its corrected p, than chance."""
     moved, change_percent = before is not after, None
     if before is not None and after is not None:
         moved = not math.isclose(before, after, rel_tol=_SAME, abs_tol=1e-12)
@@ -161,7 +160,6 @@ def _lines(files: Files) -> dict[tuple[str, str], _Line]:
 
 
 def _repeats_causal(lines: Mapping[tuple[str, str], _Line], key: tuple[str, str]) -> bool:
-    """Say whether a final line repeats the causal one of its estimator, as a filter's does."""
     causal = lines.get((key[0], "causal"))
     if key[1] == "causal" or causal is None:
         return False
@@ -208,7 +206,6 @@ def _array(values: Mapping[int, float]) -> Array:
 
 
 def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[ChangeRecord]:
-    """Yield each line whose runs ended differently, or that only one side has."""
     for key in dict.fromkeys((*before, *after)):
         counts = [_counts(side[key]) if key in side else "" for side in (before, after)]
         if counts[0] != counts[1]:

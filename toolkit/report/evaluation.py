@@ -144,7 +144,6 @@ def sequences_table(evaluation: EvaluatedSystems) -> Table:
 
 
 def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
-    """Return the median of the runs of a system on a sequence, and how many of them failed."""
     failed = f"{len(runs.runs) - runs.ok} of {len(runs.runs)} failed" if runs.ok < len(runs.runs) else ""
     median = runs.median(metric)
     if median is None:
@@ -184,7 +183,6 @@ def uncertainty_table(evaluation: EvaluatedSystems) -> Table | None:
 
 
 def _over_runs(runs: Sequence[Mapping[str, float | int | None]], key: str) -> str:
-    """Return the mean of a metric over runs, with the interval where there are several."""
     values = np.array([value for run in runs if (value := run.get(key)) is not None], dtype=float)
     if not values.size:
         return MISSING
@@ -351,7 +349,6 @@ def write_evaluation(
 def _written_figures(
     evaluation: EvaluatedSystems, folder: Path, choice: "FigureChoice", kind: "FigureFormat"
 ) -> dict[str, str]:
-    """Draw into a new folder; return file name -> caption."""
     if choice == "none":
         return {}
     # Here alone, for matplotlib takes long to import.

@@ -15,7 +15,7 @@ from toolkit.experiment.contests import HELD_OUT
 from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation
 from toolkit.experiment.ingredients import Variant, called
 from toolkit.experiment.statistics import Paired
-from toolkit.files.documents import Count, read, rounded, to_text
+from toolkit.files.documents import Count, reader, rounded, to_text
 from toolkit.files.writing import check_replaceable
 from toolkit.metrics import metrics_called
 from toolkit.report.html import card
@@ -137,9 +137,7 @@ class ExplanationRecord(Struct, frozen=True, kw_only=True):
     files: Annotated[tuple[str, ...], Meta(description="that were written, relative to the directory")]
 
 
-def read_explanation(path: Path) -> ExplanationRecord:
-    """Read an ``explain.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, ExplanationRecord, remedy="repeat vislam explain")
+read_explanation = reader(ExplanationRecord, "repeat vislam explain")
 
 
 def explanation_document(
@@ -260,7 +258,6 @@ def where(kind: Kind, effect: ContributionRecord) -> str:
 
 
 def _tests(found: ExplanationRecord) -> int:
-    """Return how many effects on the error are tested together."""
     return sum(len(part.effects) for part in found.parts)
 
 
@@ -317,7 +314,6 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
 
 
 def _beside(found: ExplanationRecord) -> Iterator[str]:
-    """Yield how effects must not be read, where more than one is told."""
     if found.gap.error is not None and _tests(found) > 1:
         yield (
             "Bare ranges are of the error without an ingredient over that with it, near the former estimator and near "

@@ -184,7 +184,6 @@ def unpack_bundle(path: Path, directory: Path) -> BundleRecord:
 
 
 def _read_bundle(archive: zipfile.ZipFile) -> tuple[BundleRecord, dict[str, bytes]]:
-    """Return what a bundle says of its files, and their contents; raises DataError where the two do not agree."""
     entries = {entry.filename: entry.file_size for entry in archive.infolist()}
     if BUNDLE not in entries:
         raise DataError(f"it is a zip archive without {BUNDLE}")
@@ -205,7 +204,6 @@ def _read_bundle(archive: zipfile.ZipFile) -> tuple[BundleRecord, dict[str, byte
 
 
 def _names(run: RunFiles | SeedsFiles) -> list[str]:
-    """Return the files of a run that are bundled: all that its manifest lists but figures and what a sweep keeps."""
     listed = run.manifest.files
     if listed is UNSET:
         raise DataError(

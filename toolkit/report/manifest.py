@@ -19,7 +19,7 @@ from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.workers import usable_cpus
-from toolkit.files.documents import Json, read
+from toolkit.files.documents import Json, reader
 from toolkit.noise import MeasuredNoise
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
@@ -80,14 +80,12 @@ class Manifest(Struct, frozen=True, kw_only=True):
     ) = UNSET
 
 
-def read_manifest(path: Path) -> Manifest:
-    """Read a ``manifest.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, Manifest, remedy="repeat the comparison", older={"vislam.manifest/1": _of_today})
-
-
 def _of_today(manifest: Json) -> Json:
     settings = manifest.get("settings")
     return {**manifest, "settings": without_removed(settings)} if isinstance(settings, dict) else manifest
+
+
+read_manifest = reader(Manifest, "repeat the comparison", older={"vislam.manifest/1": _of_today})
 
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:
@@ -165,7 +163,6 @@ def _git_revision() -> str | None:
 
 
 def _cpu_model() -> str:
-    """Return the processor's name as the system tells it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

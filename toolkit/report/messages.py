@@ -88,7 +88,6 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
 
 
 def _ends(comparison: Comparison) -> Iterator[str]:
-    """Yield an explanation of every run that did not end well."""
     for outcome in comparison.outcomes:
         if outcome.status != "ok":
             yield f"{outcome.estimator} {outcome.status}{f': {outcome.why}' if outcome.why else ''}"
@@ -144,7 +143,6 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
 
 
 def _contradicted(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for the rows whose corrections have one direction, with their trend and its limit by chance."""
     rows = [row for row in comparison.lines if row.mark == "contradicted"]
     found = [(_name_of(row), one) for row in rows if (one := row.consistency) is not None]
     if found:
@@ -167,7 +165,6 @@ def _marks(comparison: Comparison) -> Iterator[str]:
 
 
 def _refusals(comparison: Comparison) -> Iterator[str]:
-    """Yield a line where outlier gates refused far more innovations than those of a consistent estimator."""
     accepted = {row.estimator: row.value(ACCEPTED) for row in comparison.rows if row.output == "causal"}
     refused = {name: 100.0 - share for name, share in accepted.items() if share is not None and refuses_much(share)}
     if refused:
@@ -176,7 +173,6 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
 
 
 def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each row that explains withheld tracks worse than the measured motion alone."""
     for row in comparison.lines:
         harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
         if harmed and comparison.over_seeds:
@@ -187,7 +183,6 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
 
 
 def _far_from_motion(comparison: Comparison) -> Iterator[str]:
-    """Yield a line on the estimator that is farthest from the measured motion, where any is too far."""
     found = too_far(comparison.lines)
     if found:
         worst = max(found, key=lambda one: one.squared)
@@ -200,7 +195,6 @@ def _far_from_motion(comparison: Comparison) -> Iterator[str]:
 
 
 def _remark_on(key: str, scored: Scored | None) -> str:
-    """Return what a metric remarks on its value; nothing where it has none."""
     if scored is None or scored.scores.values.get(key) is None:
         return ""
     return scored.scores.notes.get(key, "")
@@ -212,7 +206,6 @@ def _name_of(row: Row) -> str:
 
 
 def _seeds(seeds: Iterable[int]) -> str:
-    """Name seeds: "seed 3", "seeds 3 and 5"."""
     given = list(map(str, seeds))
     return f"seed{'s' if len(given) > 1 else ''} {listed(given)}"
 
@@ -255,7 +248,6 @@ def paired_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def _difference(found: Paired, metric: Metric, best: str) -> str:
-    """Say by how much two estimators differ, and whether that is significant."""
     if found.mean == found.error == 0.0:
         return f"equal to that of {best} under all {found.n} seeds"
     decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else 2

@@ -13,7 +13,7 @@ import msgspec
 
 from toolkit.evaluation.against_baseline import TrajectoryBaselineRecord
 from toolkit.evaluation.document import EvaluationRecord
-from toolkit.files.documents import read, schema
+from toolkit.files.documents import reader, schema
 from toolkit.files.writing import write_text
 from toolkit.gate.baseline import BaselineRecord
 from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
@@ -60,9 +60,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
 }
 
 
-def read_check(path: Path) -> CheckDocument:
-    """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
-    return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER_CHECKS)
+read_check = reader(CheckDocument, "repeat vislam check", older=OLDER_CHECKS)
 
 
 def schema_files() -> dict[str, str]:

@@ -5,7 +5,6 @@ Times ``t_s`` count from the first frame; numbers have six digits; a value that 
 """
 
 from collections.abc import Callable, Iterator, Sized
-from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from msgspec.structs import asdict
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.files.documents import number, numbers, of_attributes, read, rounded
+from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
@@ -58,7 +57,6 @@ class _Columns(Struct, frozen=True, kw_only=True):
 
 
 def _check_lengths(columns: dict[str, Sized]) -> None:
-    """Raise ValueError where columns are not as long as the first."""
     first, *others = columns
     for name in others:
         if len(columns[name]) != len(columns[first]):
@@ -284,14 +282,8 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
             _check_lengths({"t_s": self.t_s, **nees, **errors})
 
 
-def read_report(path: Path) -> Report:
-    """Read the ``report.json`` of a comparison; raises DataError, in one line with the place, where it is not one."""
-    return read(path, Report, remedy=REPEAT)
-
-
-def read_seeds_report(path: Path) -> SeedsReport:
-    """Read a ``report.json`` over seeds; raises DataError, in one line with the place, where it is not one."""
-    return read(path, SeedsReport, remedy=REPEAT)
+read_report = reader(Report, REPEAT)
+read_seeds_report = reader(SeedsReport, REPEAT)
 
 
 Series = TypeVar("Series", NeesSeries, NisSeries)
@@ -403,7 +395,6 @@ def _vector(values: Array) -> Vector:
 
 
 def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
-    """Return a series, or in words why there is none."""
     if row.run.trajectory(row.output) is None:
         return "the run gave no trajectory"
     try:
@@ -414,7 +405,6 @@ def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, com
 
 
 def _components(row: Row, comparison: Comparison) -> ComponentSeries | UnsetType:
-    """Return errors and stated deviations by component, or nothing where there are none."""
     with np.errstate(all="ignore"):  # as above
         found = components(comparison, row)
     if found is None:
@@ -459,7 +449,6 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
 
 
 def _over_seeds(group: Row) -> DrawnOverSeeds:
-    """Return the NEES averaged over the seeds with its band, and the position error over the seeds, or None each."""
     nees, errors_m = group.mean_nees, group.position_m
     return DrawnOverSeeds(
         estimator=group.estimator,

@@ -90,7 +90,6 @@ def _written(directory: Path) -> Iterator[str]:
 
 
 def _is_page(path: Path) -> bool:
-    """Say whether a file is a page of ours, by its title."""
     try:
         with path.open("rb") as file:
             return b"vislam report</title>" in file.read(4096)
@@ -164,7 +163,6 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
 
 
 def _written_figures(comparison: Comparison, folder: Path, made_by: MadeBy) -> dict[str, str]:
-    """Draw into a new folder; return file name -> caption."""
     folder.mkdir()
     if made_by.choice == "none":
         return {}
@@ -182,7 +180,6 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
 
 
 def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
-    """Write the images that the report shows, where the recording has any, and return their records."""
     seen = camera_frames(comparison)
     for frame, jpeg in seen:
         place = directory / frame.image
@@ -317,7 +314,6 @@ def _check_same_runs(
     scored: Sequence[ScoredRun | RunOverSeeds],
     drawn: Sequence[DrawnRun | DrawnOverSeeds],
 ) -> list[tuple[str, Output]]:
-    """Return the report's runs, which must be those that have scores, in their order; raises DataError otherwise."""
     runs = [(run.estimator, run.output) for run in drawn]
     if [(run.estimator, run.output) for run in scored] != runs:
         raise DataError(f"{directory}: {REPORT} does not have the runs of {name}; repeat the comparison")

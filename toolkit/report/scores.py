@@ -6,7 +6,6 @@ them from a comparison.
 
 import math
 from dataclasses import asdict, fields
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from toolkit.answers import STATUS_MEANING, Output, Status
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
-from toolkit.files.documents import Count, Value, of_attributes, read
+from toolkit.files.documents import Count, Value, of_attributes, reader
 from toolkit.metrics import CONTRACT_KEYS, Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
 from toolkit.sequence import Sequence
@@ -212,14 +211,8 @@ class Seeds(Struct, frozen=True, kw_only=True):
     log: Annotated[tuple[LogEntry, ...], Meta(description="every run that has log lines")]
 
 
-def read_metrics(path: Path) -> MetricsDocument:
-    """Read a ``metrics.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, MetricsDocument, remedy=REPEAT)
-
-
-def read_seeds(path: Path) -> Seeds:
-    """Read a ``seeds.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, Seeds, remedy=REPEAT)
+read_metrics = reader(MetricsDocument, REPEAT)
+read_seeds = reader(Seeds, REPEAT)
 
 
 def metrics_document(comparison: Comparison) -> MetricsDocument:

@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, Axis, Breaking, Effect, Sweep
 from toolkit.files.documents import number as finite
-from toolkit.files.documents import of_attributes, read, to_text
+from toolkit.files.documents import of_attributes, reader, to_text
 from toolkit.files.writing import check_replaceable
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import sequence_line
@@ -89,9 +89,7 @@ class SweepRecord(Struct, frozen=True, kw_only=True):
     files: Annotated[tuple[str, ...], Meta(description="that the sweep wrote, relative to its directory")]
 
 
-def read_sweep(path: Path) -> SweepRecord:
-    """Read a ``sweep.json``; raises DataError, in one line with the place, where it is not one."""
-    return read(path, SweepRecord, remedy="repeat the sweep")
+read_sweep = reader(SweepRecord, "repeat the sweep")
 
 
 def sweep_document(

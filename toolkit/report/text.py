@@ -204,7 +204,6 @@ def as_text(table: Table) -> str:
 
 
 def _marked(lines: list[str], table: Table) -> Iterator[str]:
-    """Yield the lines of the rows, each followed by its mark if it has one."""
     names, outputs = (
         max(len(printable(text)) for text in (*table.headings[i], *(row[i] for row in table.rows))) for i in (0, 1)
     )
@@ -245,7 +244,6 @@ def as_latex(table: Table) -> str:
 
 
 def _cells(table: Table, escaped: Callable[[str], str], bold: str) -> list[list[str]]:
-    """Return the cells as text of some markup, the best ones in bold."""
     return [
         [bold.format(escaped(text)) if (i, j) in table.best else escaped(text) for j, text in enumerate(row)]
         for i, row in enumerate(table.rows)
@@ -258,7 +256,6 @@ def in_html(text: str) -> str:
 
 
 def _in_latex(text: str) -> str:
-    """Return a text that LaTeX prints as it is."""
     return "".join(_LATEX.get(character, character) for character in printable(text))
 
 

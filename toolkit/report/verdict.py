@@ -66,7 +66,6 @@ def main_contest(comparison: Comparison) -> Contest | None:
 
 
 def _of_few(comparison: Comparison) -> str:
-    """Return the verdict where fewer than two runs can be compared."""
     ended = [row.estimator for row in comparison.lines if row.answered and row.counts["ok"] == len(row.outcomes)]
     if not ended:
         return "No run ended well: there is nothing to compare."
@@ -137,7 +136,6 @@ def why_sentence(contest: Contest) -> str:
 
 
 def _trust(comparison: Comparison) -> str:
-    """Say whose stated uncertainty can be trusted, and by how much the worst other errs more than it states."""
     ended = [row for row in comparison.lines if row.counts["ok"]]
     judged = [row for row in ended if row.consistency is not None]
     if not judged:

@@ -131,7 +131,6 @@ def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title: str) -> Figure:
-    """Draw tracks over the truth and one run's landmarks."""
     truth, tracks = true_track(comparison), [track_of(comparison, run) for run in runs]
     # A run that diverged would squash all the others; its own figure shows where it went.
     shown = [track for track, run in zip(tracks, runs, strict=True) if run.status == "ok" or len(runs) == 1]
@@ -161,7 +160,6 @@ def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, tit
 def _entries(
     comparison: Comparison, runs: Sequence[Run], truth: PathFromAbove | None, mapper: Run | None
 ) -> list[Entry]:
-    """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
     entries = [] if truth is None else [Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH)]
     for run in runs:
         line = Line2D([], [], linewidth=1.8, **style.stroke_of(comparison, run.estimator, shown_output(run)))

@@ -89,7 +89,6 @@ def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
 
 
 def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
-    """Keep the heading axis to what most runs that are ok need, and say which leave it."""
     largest = {row: float(np.nanmax(np.abs(errors.heading_deg))) for row, errors in curves}
     sizes = sorted(size for row, size in largest.items() if row.status == "ok") or sorted(largest.values())
     middle = max(sizes[(len(sizes) - 1) // 2], _LEAST_HEADING_DEG)
@@ -100,7 +99,6 @@ def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
 
 
 def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: str) -> None:
-    """Name above a panel, to the right, the rows whose largest errors are beyond its axis."""
     beyond = {row.estimator: size for row, size in largest.items() if size > 1.01 * reach}
     if beyond:
         listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
@@ -199,7 +197,6 @@ def _entries(found: list[tuple[Row, Components]], what: str, colour: str) -> lis
 
 
 def _caption(name: str, reference: str, has_truth: bool) -> str:
-    """Say what the panels show and how the band is to be read."""
     axes = "by component along and about the world's axes, z up"
     if not has_truth:
         of_whom = f" from {reference}" if reference else ""

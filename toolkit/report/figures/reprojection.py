@@ -59,7 +59,6 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
-    """Return the legend's entries for the kinds of error that any panel shows."""
     samples: dict[str, Artist] = {
         "in-sample": Patch(color=style.MUTED_COLOUR, alpha=0.35, linewidth=0.0),
         "held-out": Line2D([], [], color=style.MUTED_COLOUR, linewidth=1.5),
@@ -69,7 +68,6 @@ def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
 
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
-    """Return the errors (n,) px by kind, for the kinds that the run has."""
     found = {
         kind: available(errors_of, run, shown_output(run), comparison.sequence) for kind, errors_of in _KINDS.items()
     }

@@ -60,7 +60,6 @@ def draw(evaluation: EvaluatedSystems, *, all_sequences: bool = False) -> Iterat
 
 
 def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
-    """Return the run of the middle error of each of the first systems that has one."""
     truth, found = evaluation.truths[sequence], []
     for standing in evaluation.leaderboard[:_MOST_SYSTEMS]:
         system = standing.estimator
@@ -110,7 +109,6 @@ def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
 
 
 def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
-    """Return distances, and angles where the truth has orientations, with RMSE and median in the legend."""
     with_angles = changes(truth.poses[:, :3, :3])
     figure = style.new_figure(4.4 if with_angles else 2.8)
     grid = figure.subplots(1 + with_angles, 1, sharex=True, squeeze=False).ravel()
@@ -142,7 +140,6 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
 
 
 def _fit_scale(axes: Axes, sizes: list[float], largest: float) -> None:
-    """Make an axis logarithmic where the errors differ by more than an order of magnitude."""
     least = min((size for size in sizes if size > 0.0), default=0.0)
     if least and max(sizes) > _ORDER_OF_MAGNITUDE * least:
         style.scale_by_decades(axes, 0.2 * least, 1.2 * largest)

@@ -90,7 +90,6 @@ def draw_explanation(found: ExplanationRecord) -> Iterator[NamedFigure]:
 
 
 def _key(found: ExplanationRecord) -> list[Entry]:
-    """Return what colours and whiskers stand for."""
     start, goal = found.gap.less, found.gap.more
     drawn = "world and noise" if found.settings.get("vary") == "world" else "the noise of the sensors"
     what = f"; each draws {drawn} anew, the same for all estimators" if found.intervals == "seeds" else ""
@@ -105,7 +104,6 @@ def _key(found: ExplanationRecord) -> list[Entry]:
 
 
 def _draw(axes: Axes, words: Axes, bar: _Bar) -> None:
-    """Draw a bar with its interval, and say beside it what it is."""
     one, effect = bar.effect.error, bar.effect
     told = f"{effect.ok} of {effect.runs} ended well"
     is_sure = effect.shown or (bar.kind is None and one is not None and one.is_off)

@@ -68,7 +68,6 @@ def _titles(runs: Sequence[Files]) -> list[str]:
 
 
 def _case(files: Files, case_id: str, title: str, colours: dict[str, int]) -> Json:
-    """Return what the page shows of one run directory: its documents, and what only a page needs."""
     if isinstance(files, SeedsFiles):
         rows = _rows_over_seeds(files, case_id, colours)
         own: Json = {"kind": "seeds", "seeds": files.scores.seeds}
@@ -105,7 +104,6 @@ def _of_one_run(files: RunFiles, rows: list[Json]) -> Json:
 
 
 def _frame(frame: CameraFrame, files: RunFiles, rows: list[Json]) -> Json:
-    """Return an image, which the page holds itself, with the tracks on it and their errors by the rows' ids."""
     ids = {(row["estimator"], "causal" if row["output"] == "both" else row["output"]): row["id"] for row in rows}
     errors = {
         ids[one.estimator, one.output]: _decimals(one.off_px, 2)
@@ -170,7 +168,6 @@ def _drawn(track: DrawnPath, aligned_as: DrawnRun | None = None) -> Json:
 
 
 def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
-    """Return a run's landmarks, aligned to the truth as its final answer is."""
     points, name = files.landmarks[one.landmarks], one.estimator
     last = next(run for run in files.report.runs if (run.estimator, run.output) == (name, one.output))
     shown = _moved(points[evenly(len(points), _MOST_LANDMARKS)], last)
@@ -190,7 +187,6 @@ def _components(series: ComponentSeries) -> Json:
 
 
 def _nees(series: NeesSeries | str) -> Json | str:
-    """Return a thinned series with its constant band, or the words that say why there is none."""
     if isinstance(series, str):
         return series
     columns = asdict(series)
@@ -269,7 +265,6 @@ def _are_the_same(causal: RunOverSeeds, final: RunOverSeeds) -> bool:
 
 
 def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
-    """Return the NEES and the position errors over the frames' times, thinned, or None each where there is none."""
     nees, errors_m = drawn.nees, drawn.position_rms_m
     return {
         "nees": None if nees is None else thinned({"t_s": t_s, **asdict(nees)}, "pose"),
