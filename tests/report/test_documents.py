@@ -203,21 +203,37 @@ def test_fields_of_a_later_version_are_passed_over(name: str) -> None:
     assert parse(json.dumps(later), record) == read(OLD / name, record)
 
 
-@pytest.fixture(scope="module")
-def scores(comparison: Comparison) -> dict[str, Any]:
-    return json.loads(to_text(metrics_document(comparison)))
+NEES_BAND = [pytest.approx(1.2373 / 6, rel=1e-4), pytest.approx(14.4494 / 6, rel=1e-4)]
 
 
-def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(comparison: Comparison) -> None:
-    timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
-    built = json.loads(to_text(metrics_document(timid)))
-    assert parse(to_text(metrics_document(timid)), MetricsDocument) == metrics_document(timid)
-    low, high = built["runs"][0]["consistency"].pop("band")
-    assert (low, high) == (pytest.approx(1.2373 / 6, rel=1e-4), pytest.approx(14.4494 / 6, rel=1e-4))
-    assert built["runs"][0]["consistency"] == {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1}
-    assert "consistency" not in built["runs"][-1]  # it failed without an answer
-    words = [line for line in note_lines(timid) if "timid" in line]
-    assert all(part in words[0] for part in ("steady", "NEES", "0.100", "2.41"))
+@pytest.mark.parametrize(
+    ("values", "mark", "words"),
+    [
+        (
+            {"nees_pose_mean": 0.1},
+            {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1, "band": NEES_BAND},
+            ("timid", "steady", "NEES", "0.100", "2.41"),
+        ),
+        (
+            {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0},
+            {"verdict": "contradicted", "metric": "correction_trend", "mean": 5.25, "band": [0.0, 4.0]},
+            ("contradicted", "steady", "trend 5.2", "limit 4.00", "check calibration"),
+        ),
+        ({"gate_accepted_percent": 55.0}, None, ("outlier gate", "steady 45 %", "calibration")),
+        ({"gate_accepted_percent": 91.0}, None, ()),
+    ],
+)
+def test_a_doubt_is_in_the_document_and_in_a_note_with_its_figures(
+    comparison: Comparison, values: dict[str, float], mark: Document | None, words: tuple[str, ...]
+) -> None:
+    doubted = rescored(comparison, lambda row: Scores(row.scores.values | values, {}))
+    built = metrics_document(doubted)
+    assert parse(to_text(built), MetricsDocument) == built
+    runs = json.loads(to_text(built))["runs"]
+    assert mark is None or runs[0]["consistency"] == mark
+    assert "consistency" not in runs[-1]  # it failed without an answer
+    notes = [line for line in note_lines(doubted) if line.startswith(("timid", "contradicted", "the outlier gate"))]
+    assert [all(word in line for word in words) for line in notes[:1]] == ([True] if words else [])
 
 
 def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimator(comparison: Comparison) -> None:
@@ -228,23 +244,7 @@ def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimato
         assert checked is not None
         return checked.verdict
 
-    assert mark(95.0) == "timid"
-    assert mark(88.0) == "heavy-tailed"
-
-
-def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(comparison: Comparison) -> None:
-    trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
-    leaning = rescored(comparison, lambda row: Scores(row.scores.values | trend, {}))
-    built = json.loads(to_text(metrics_document(leaning)))
-    assert parse(to_text(metrics_document(leaning)), MetricsDocument) == metrics_document(leaning)
-    assert built["runs"][0]["consistency"] == {
-        "verdict": "contradicted",
-        "metric": "correction_trend",
-        "mean": 5.25,
-        "band": [0.0, 4.0],
-    }
-    words = [line for line in note_lines(leaning) if "contradicted" in line]
-    assert all(text in words[0] for text in ("steady", "trend 5.2", "limit 4.00", "check calibration"))
+    assert (mark(95.0), mark(88.0)) == ("timid", "heavy-tailed")
 
 
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(comparison: Comparison) -> None:
@@ -256,19 +256,7 @@ def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(comparison:
         return Scores(row.scores.values | found, {"heldout_over_motion": harm} if is_first else {})
 
     reported = [line for line in note_lines(rescored(comparison, given)) if "withheld tracks worse" in line]
-    assert reported == [f"{comparison.lines[0].estimator} {harm}"] * len(reported)
-    assert reported
-
-
-def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Comparison) -> None:
-    def words(accepted: float) -> list[str]:
-        reported = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
-        return [line for line in note_lines(reported) if "outlier gate" in line]
-
-    assert words(91.0) == []
-    (line,) = words(55.0)
-    assert "steady 45 %" in line
-    assert "calibration" in line
+    assert reported == [f"{comparison.lines[0].estimator} {harm}"]
 
 
 def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison) -> None:
