@@ -21,7 +21,7 @@ from toolkit.report.explanation import (
     in_words,
 )
 from toolkit.report.manifest import RecordingRecord, SeedsUsed
-from toolkit.report.verdict import why_sentence
+from toolkit.report.messages import why_sentence
 
 
 def variant(name: str, *without: str) -> VariantRecord:

@@ -25,7 +25,7 @@ from toolkit.report.curves import (
     onto_truth,
     truth_during,
 )
-from toolkit.report.figures import FigureChoice, FigureFormat, bands, from_above, over_time, reprojection, save
+from toolkit.report.figures import FigureChoice, FigureFormat, bands, from_above, over_time, save
 from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
@@ -107,7 +107,7 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert "astray" in position.get_title(loc="right")
 
 
-@pytest.mark.parametrize("draw", [reprojection.draw, over_time.draw_errors, from_above.draw_all])
+@pytest.mark.parametrize("draw", [bands.draw_reprojection, over_time.draw_errors, from_above.draw_all])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)

@@ -16,9 +16,9 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.report.html import json_in_html, page_text
 from toolkit.report.html.payload import highlights, payload_of, running_median, with_peaks
+from toolkit.report.messages import ContestRecord, Rival
 from toolkit.report.records import schema_files
 from toolkit.report.run_directory import MadeBy, read_run, write_run
-from toolkit.report.verdict import ContestRecord, Rival
 
 Json = dict[str, Any]
 HOSTILE = "</script><script>window.broken = 1</script><!-- <img src=x onerror=alert(1)> {{ script }} \u2028"

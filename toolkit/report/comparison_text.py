@@ -22,6 +22,7 @@ from toolkit.report.messages import (
     paired_lines,
     remark_lines,
     undecided_lines,
+    verdict,
 )
 from toolkit.report.text import (
     WIDTH,
@@ -35,7 +36,6 @@ from toolkit.report.text import (
     markdown_section,
     section,
 )
-from toolkit.report.verdict import verdict
 
 # Notes below the printed table, and lines of them with the verdict's; the report has all notes.
 _MOST_NOTES, _MOST_LINES = 3, 7

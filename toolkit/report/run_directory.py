@@ -29,7 +29,6 @@ from toolkit.files.writing import check_parent, check_replaceable, plain_name, r
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
 from toolkit.report import report_json
-from toolkit.report.camera_frames import camera_frames
 from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.manifest import Manifest, manifest_document, read_manifest
@@ -180,7 +179,7 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
 
 
 def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
-    seen = camera_frames(comparison)
+    seen = report_json.camera_frames(comparison)
     for frame, jpeg in seen:
         place = directory / frame.image
         place.parent.mkdir(exist_ok=True)

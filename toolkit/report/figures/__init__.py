@@ -1,6 +1,6 @@
 """The figures of a comparison as files, PNG, PDF or SVG; drawn without a display.
 
-Reading order: style -> over_time, bands, from_above, reprojection; the numbers are those of report.curves. sweeps has
+Reading order: style -> over_time, bands, from_above; the numbers are those of report.curves. sweeps has
 the figures of a sweep, waterfall that of an explanation, trajectories those of trajectory files.
 """
 
@@ -31,7 +31,7 @@ FigureChoice = Literal["few", "all", "none"]
 def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[NamedFigure]:
     """Draw the few most important figures, or all that the comparison has data for, each when it is reached."""
     # With GTSAM, which figures of trajectory files do without.
-    from toolkit.report.figures import bands, from_above, over_time, reprojection
+    from toolkit.report.figures import bands, from_above, over_time
 
     # Figures that are always drawn, and those drawn on request, because drawing takes time and few are looked at.
     few = (
@@ -42,7 +42,7 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
         over_time.draw_bound,
     )
     more = (
-        reprojection.draw,
+        bands.draw_reprojection,
         bands.draw_nis,
         from_above.draw_trajectories,
         over_time.draw_other_components,

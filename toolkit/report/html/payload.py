@@ -19,11 +19,11 @@ from toolkit.metrics import Metric, known_metrics
 from toolkit.report import curves
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import look_numbers
+from toolkit.report.messages import ContestRecord, contest_text
 from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
 from toolkit.report.text import unit_of
-from toolkit.report.verdict import ContestRecord, contest_text
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
