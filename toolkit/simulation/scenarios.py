@@ -22,7 +22,7 @@ from toolkit.sequence import Observations, Provenance, Sequence, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors
 from toolkit.simulation.scenes import Scene, SceneOf, hall, road
-from toolkit.simulation.sensors import CameraLimits, Imu, ImuStamps, MotionMeasurements, Odometer, TrackNoise
+from toolkit.simulation.sensors import CameraLimits, Imu, MotionMeasurements, Odometer, TrackNoise
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 
 START_NS = 1_600_000_000 * NS_PER_S
@@ -94,7 +94,8 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
         np.random.default_rng, streams
     )
     track_rngs = [tracks_rng, pixels_rng, outliers_rng, slips_rng]
-    view = _view(scenario, world_rng)
+    parts = scenario.scene, scenario.duration_s, scenario.rig, scenario.camera
+    view = _view(*parts, world_rng) if scenario.varied else _view_of_all_seeds(*parts)
     frames_t_ns, motion = view.frames_t_ns, view.motion
     measured = _measure_motion(scenario, view.scene.trajectory, frames_t_ns, motion_rng)
     return Sequence(
@@ -120,23 +121,21 @@ class _View(NamedTuple):
     in_view: BoolArray
 
 
-def _view(scenario: Scenario, world_rng: np.random.Generator) -> _View:
-    scene_of, duration_s, rig, camera = scenario.scene, scenario.duration_s, scenario.rig, scenario.camera
-    if scenario.varied:
-        return _viewed(scene_of(duration_s, world_rng), duration_s, rig, camera)
-    return _viewed_once(scene_of, duration_s, rig, camera)
-
-
-@lru_cache(maxsize=2)
-def _viewed_once(scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
-    """Return the parts that all seeds of a scenario share, which take longer than the draws of a seed."""
-    return _viewed(scene_of(duration_s), duration_s, rig, camera)
-
-
-def _viewed(scene: Scene, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
+def _view(
+    scene_of: SceneOf,
+    duration_s: float,
+    rig: StereoRig,
+    camera: CameraLimits,
+    drawn: np.random.Generator | None = None,
+) -> _View:
+    scene = scene_of(duration_s) if drawn is None else scene_of(duration_s, drawn)
     frames_t_ns = sensors.stamps_ns(START_NS, camera.rate_hz, duration_s)
     motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
     return _View(scene, frames_t_ns, motion, sensors.visibility(scene.points, motion.T_world_imu, rig, camera))
+
+
+# What all seeds of a scenario share takes longer than the draws of a seed.
+_view_of_all_seeds = lru_cache(maxsize=2)(_view)
 
 
 def _measure_motion(
@@ -144,8 +143,9 @@ def _measure_motion(
 ) -> MotionMeasurements:
     sensor, scale = scenario.motion, scenario.noise_scale
     if isinstance(sensor, Imu):
-        stamps = ImuStamps.over(START_NS, sensor.rate_hz, scenario.duration_s)
-        return sensors.measure_imu(sensor, scale, stamps, trajectory, scenario.gravity_world, rng)
+        t_ns = sensors.imu_stamps_ns(START_NS, sensor.rate_hz, scenario.duration_s)
+        motion = trajectory.at((t_ns - START_NS) / NS_PER_S)
+        return sensors.measure_imu(sensor, scale, t_ns, motion, scenario.gravity_world, rng)
     # One stamp beyond the last frame, so that the last sample is a mean twist like every other.
     t_ns = np.append(frames_t_ns, frames_t_ns[-1] + round(NS_PER_S / scenario.camera.rate_hz))
     T_world_imu = trajectory.at((t_ns - START_NS) / NS_PER_S).T_world_imu

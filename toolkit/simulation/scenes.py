@@ -4,8 +4,8 @@ A scene is a function of its duration alone, or one of a family of its kind: oth
 landmarks, drawn from a stream of random numbers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -43,14 +43,8 @@ class Scene:
     points: Array
 
 
-class SceneOf(Protocol):
-    """Makes a scene of a given duration: always the same one, or one drawn from random numbers."""
-
-    def __call__(self, duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
-        """Return the scene."""
-
-    def __hash__(self) -> int:
-        """Hash by identity, because the parts that all seeds share are cached by scene."""
+# Makes a scene of a given duration (s): always the same one, or one drawn from random numbers if any are given.
+SceneOf = Callable[..., Scene]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from toolkit.measurements import NS_PER_S, ImuNoise, StereoRig, TwistNoise
 from toolkit.models.stereo import CHANNELS, project
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.sequence import Observations
-from toolkit.simulation.trajectory import SmoothTrajectory
+from toolkit.simulation.trajectory import Kinematics
 
 # Poses projected at a time: bounds the memory of the (poses, 3, landmarks) intermediate.
 _POSES_AT_ONCE = 64
@@ -98,23 +98,14 @@ def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
     return start_ns + np.round(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
-@dataclass(frozen=True, eq=False)
-class ImuStamps:
-    """Stamps (S,) of IMU samples, and the stamp of the trajectory's time 0 s.
+def imu_stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
+    """Return the stamps (S,) ns of an IMU's samples: the midpoints of its intervals, one beyond either end.
 
-    They are the midpoints of the IMU's intervals, from one before the start of a recording to one after its end. Each
-    frame then lies between two intervals, and no sample is used on both sides of a frame: the measurements between
+    Each frame then lies between two intervals, and no sample is used on both sides of a frame: the measurements between
     successive pairs of frames have independent errors, as every estimator assumes.
     """
-
-    t_ns: IntArray
-    start_ns: int
-
-    @classmethod
-    def over(cls, start_ns: int, rate_hz: float, duration_s: float) -> "ImuStamps":
-        """Return the stamps for a recording."""
-        count = int(np.floor(duration_s * rate_hz + 1e-9)) + 2
-        return cls(start_ns + np.round((np.arange(count) - 0.5) * (NS_PER_S / rate_hz)).astype(np.int64), start_ns)
+    count = int(np.floor(duration_s * rate_hz + 1e-9)) + 2
+    return start_ns + np.round((np.arange(count) - 0.5) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
 def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
@@ -271,16 +262,13 @@ def measure_twist(
 
 
 def measure_imu(
-    imu: Imu, scale: float, stamps: ImuStamps, trajectory: SmoothTrajectory, gravity: Array, rng: np.random.Generator
+    imu: Imu, scale: float, t_ns: IntArray, motion: Kinematics, gravity: Array, rng: np.random.Generator
 ) -> MotionMeasurements:
-    """Measure the instantaneous specific force and angular velocity at stamps, plus noise and bias.
+    """Measure the instantaneous specific force and angular velocity at stamps (S,), plus noise and bias.
 
-    ``gravity`` (3,) m/s^2 is that of the world.
+    ``motion`` is the exact one there, ``gravity`` (3,) m/s^2 that of the world.
     """
-    t_ns = stamps.t_ns
-    t_s = (t_ns - stamps.start_ns) / NS_PER_S
     dt_s = 1.0 / imu.rate_hz
-    motion = trajectory.at(t_s)
     R_imu_world = np.swapaxes(motion.T_world_imu[:, :3, :3], 1, 2)
     exact = np.hstack([(R_imu_world @ (motion.a_world - gravity)[:, :, None])[:, :, 0], motion.w_imu])
     white_rng, walk_rng, start_rng = rng.spawn(3)
