@@ -306,7 +306,6 @@ def run_estimator() -> Callable[..., Run]:
 
     def run(name: str, sequence: Sequence, prior: Prior | None = None, settings: Settings = DEFAULTS) -> Run:
         start = sequence.prior if prior is None else prior
-        assert start is not None
         return runner.run(name, find(name).load(), sequence, start, SILENT, settings=settings)
 
     return run

@@ -156,7 +156,6 @@ def test_a_metric_file_that_is_none_is_named(
 def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer: str) -> None:
     announce("toolkit.metrics", {"answer.py": METRIC.replace('Scores({"answer": 42.0})', answer)})
     sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
-    assert sequence.prior is not None
     run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
     with pytest.raises(ExtensionError, match=r"answer\.py: score must return Scores of \['answer'\], and returned"):
         metrics.score_run(run, "causal", sequence)

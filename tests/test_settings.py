@@ -121,7 +121,6 @@ def test_a_file_that_is_not_toml_is_refused_with_its_place(tmp_path: Path) -> No
 
 def test_the_smoothers_threshold_is_under_the_classic_policy_the_filters_gate_as_a_length() -> None:
     classic = POLICIES["classic"]
-    assert classic.gate_probability is not None
     assert classic.smoother_huber == float(np.sqrt(chdtri(3, 1.0 - classic.gate_probability)))
 
 

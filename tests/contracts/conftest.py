@@ -78,7 +78,6 @@ def _corners(sequence: Sequence) -> np.ndarray:
 
 def _utias(sequence: Sequence) -> Files:
     rig, count, truth = sequence.rig, sequence.frame_count, sequence.truth
-    assert truth is not None
     T_cam_imu = np.linalg.inv(rig.T_imu_cam)
     out = io.BytesIO()
     variables = {
@@ -142,7 +141,6 @@ def valid_trajectories() -> dict[str, Files]:
 
 
 def _trajectory(sequence: Sequence) -> Trajectory:
-    assert sequence.truth is not None
     return Trajectory(sequence.truth.t_ns, sequence.truth.T_world_imu)
 
 

@@ -39,7 +39,6 @@ def with_noise(sequence: Sequence, weight: float, factor: float) -> Sequence:
 
 
 def run_on(name: str, sequence: Sequence, policy: PolicyName) -> Run:
-    assert sequence.prior is not None
     settings = Settings(outliers=POLICIES[policy])
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.status == "ok", run.log
@@ -48,7 +47,6 @@ def run_on(name: str, sequence: Sequence, policy: PolicyName) -> Run:
 
 def apart_in_sigmas(one: Trajectory, other: Trajectory) -> tuple[float, float]:
     """Return by how many standard deviations poses differ at most, and by which share of them covariances."""
-    assert one.cov is not None and other.cov is not None
     sigmas = np.sqrt(np.diagonal(other.cov, axis1=1, axis2=2))
     off = se3_log(se3_inverse(other.T_world_imu) @ one.T_world_imu) / sigmas[:, :6]
     covs = (one.cov - other.cov) / (sigmas[:, :, None] * sigmas[:, None, :])
@@ -74,7 +72,6 @@ def test_a_weight_is_an_update_by_the_stated_covariance_over_it(name: str, scena
 def test_a_weight_makes_every_estimator_less_certain(name: str) -> None:
     """Otherwise the test above would compare two runs that ignore both."""
     weighted, plain = (run_on(name, with_noise(recording("flight"), weight, 1.0), "none") for weight in (WEIGHT, 1.0))
-    assert weighted.final is not None and plain.final is not None
     volumes = [np.linalg.slogdet(run.final.cov[-1, :6, :6])[1] for run in (weighted, plain)]
     assert volumes[0] > volumes[1] + 0.5
 

@@ -141,7 +141,6 @@ def error_since_recovery_m(trajectory: Trajectory, sequence: Sequence) -> float:
 
     By then every trouble is over, and what it has cost, to one as to the other, is not counted.
     """
-    assert sequence.truth is not None
     last = np.s_[-int(3 * RATE_HZ) :]
     relative, true = (se3_inverse(T[last][0]) @ T[last] for T in (trajectory.T_world_imu, sequence.truth.T_world_imu))
     return float(np.sqrt(np.square(relative[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean()))

@@ -47,13 +47,11 @@ class Recording:
 
     def truth_at(self, k: int) -> Estimate:
         truth = self.sequence.truth
-        assert truth is not None and truth.v_world is not None and truth.bias is not None
         return Estimate(int(truth.t_ns[k]), truth.T_world_imu[k], v_world=truth.v_world[k], bias=truth.bias[k])
 
     def error_of(self, estimate: Estimate, k: int) -> Array:
         """Return the error (d,) of an estimate of state k, in the order of its covariance."""
         truth = self.truth_at(k)
-        assert estimate.bias is not None and truth.bias is not None
         pose = se3_log(se3_inverse(truth.T_world_imu) @ estimate.T_world_imu)
         bias = estimate.bias - truth.bias
         if self.sequence.motion_kind == "twist":
@@ -69,7 +67,6 @@ def recorded(scenario: Scenario, noise_scale: float, seed: int = SEED) -> Record
     exact = simulate(replace(unrounded, noise_scale=0.0), seed)
     np.testing.assert_array_equal(exact.visible.track_id, sequence.visible.track_id)
     track_ids, first = np.unique(exact.visible.track_id, return_index=True)
-    assert exact.truth is not None
     poses = exact.truth.T_world_imu[exact.visible.frame[first]]
     return Recording(sequence, track_ids, triangulate_world(exact.visible.uv_px[first], poses, exact.rig))
 
@@ -163,7 +160,6 @@ def short(scenario: Scenario, duration_s: float, tracks: int | None = None, seed
 
 
 def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
-    assert sequence.prior is not None
     return runner.setup_of(sequence, sequence.prior, settings)
 
 

@@ -133,7 +133,6 @@ def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
     log = estimator.finish().log
     assert any("in all" in line for line in log)
     truth = sequence.truth
-    assert truth is not None
     ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 45 m of odometry that is good to 0.1 m: what vehicles take vision to is not more than a metre off.
     assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0

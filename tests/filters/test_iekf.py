@@ -78,7 +78,6 @@ def test_the_covariance_keeps_relative_inverse_depths_and_the_pose_while_the_est
     """The anchored error by its definition, differentiated before and after a move: what the move must carry over."""
     joint, *_ = scene(scenario)
     joint.forget_clones(np.ones(1, dtype=bool))
-    assert isinstance(joint, AnchoredBelief)
     before, P = numerical_jacobian(partial(anchored_error, joint), joint.cov.shape[0]), joint.cov
     drawn = np.random.default_rng(4).standard_normal(joint.cov.shape[0])
     joint.move(np.linalg.cholesky(joint.cov) @ drawn)
@@ -118,7 +117,6 @@ class LagZero:
     """A graph of one pose and the landmarks: the prediction as a Gaussian, and the sightings of one frame."""
 
     def __init__(self, given: Scene) -> None:
-        assert isinstance(given.joint, AnchoredBelief)
         self._joint, part = given.joint, joint_landmarks.columns(given.joint)
         self._keys = [X(0), *(L(i) for i in given.joint.landmark_ids.tolist())]
         noise = gtsam.noiseModel.Gaussian.Covariance(given.joint.cov[part, part])
@@ -258,7 +256,6 @@ def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
         """Return the mean normalised error squared of the pose over a run."""
         sequence = short(FLIGHT, 3.0, 25, seed)
         ekf, errors = JointEkf(setup_of(sequence), AT, partial(BELIEFS[belief], sequence.rig), iekf.correct), []
-        assert sequence.truth is not None
         for packet in sequence.packets():
             estimate = ekf.step(packet)
             error = se3_log(se3_inverse(estimate.T_world_imu) @ sequence.truth.T_world_imu[packet.index])

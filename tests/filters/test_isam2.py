@@ -353,7 +353,6 @@ def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew
     assert any("indeterminate and was dropped" in line for line in log)
     assert set(tree.isam.getLinearizationPoint().keys()) == {*tree.isam.getFactorsUnsafe().keyVector()}
     truth = sequence.truth
-    assert truth is not None
     ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 20 m of odometry that is good to 0.1 m.
     assert np.linalg.norm(newest.T_world_imu[:3, 3] - ends_at) < 0.5

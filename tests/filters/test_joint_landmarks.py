@@ -20,7 +20,6 @@ SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)
 
 def belief_with_a_landmark(depth_m: float) -> JointBelief:
     """Return a belief whose only landmark has that depth in the camera and is uncertain by 0.1 m."""
-    assert SEQUENCE.prior is not None
     model = motion_model(SEQUENCE.noise, SEQUENCE.gravity_world)
     joint = JointBelief(model.initial_belief(SEQUENCE.prior))
     joint.clone()

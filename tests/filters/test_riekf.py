@@ -101,7 +101,6 @@ def test_its_error_propagates_alike_from_every_state(scenario) -> None:
     """Group-affine: but for the biases' columns the transition of xi does not know the estimate."""
     sequence = short(scenario, 1.0, 15, 3)
     setup, motion = setup_of(sequence), list(sequence.packets())[3].motion
-    assert motion is not None
     carry, rng = motion_model(setup.noise, setup.gravity_world), np.random.default_rng(1)
     start = motion_model(setup.noise, setup.gravity_world).initial_belief(setup.prior)
     transitions = []
@@ -217,7 +216,6 @@ def test_the_world_a_filter_starts_in_makes_no_difference() -> None:
     """Started 700 m away and turned by two radians, its relative motion and covariance are the same."""
     sequence = short(DRIVE, 1.0, 15, 3)
     T_other_world = se3(se3_exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))[:3, :3], np.array([500.0, -490.0, 3.0]))
-    assert sequence.prior is not None
     elsewhere = replace(sequence.prior, T_world_imu=T_other_world @ sequence.prior.T_world_imu)
     setup = setup_of(sequence)
     here, there = (JointEkf(s, AT, InvariantBelief) for s in (setup, replace(setup, prior=elsewhere)))

@@ -29,7 +29,6 @@ def answer(name: str, part: Window | Outliers = Window()) -> Run:  # noqa: B008 
     """Run an estimator over the recording, once for each choice."""
     settings = Settings(window=part) if isinstance(part, Window) else Settings(outliers=part)
     sequence = recording()
-    assert sequence.prior is not None
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.final is not None, run.log
     return run

@@ -13,7 +13,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
-from toolkit.motion_samples import ImuSamples, cut_at
+from toolkit.motion_samples import cut_at
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
 
@@ -29,7 +29,6 @@ def without_tracks(scenario: Scenario) -> Scenario:
 def motion_chi2(sequence: Sequence) -> Array:
     """Return the chi-square (K - 1,) of each interval's factors at the true states, per degree of freedom."""
     model, truth = motion_model(sequence.noise, sequence.gravity_world), sequence.truth
-    assert truth is not None and truth.v_world is not None and truth.bias is not None
     states = [
         Estimate(int(t_ns), truth.T_world_imu[k], v_world=truth.v_world[k], bias=truth.bias[k])
         for k, t_ns in enumerate(truth.t_ns)
@@ -68,7 +67,6 @@ def test_intervals_between_frames_share_no_sample_of_the_imu() -> None:
     """So that what they measure errs independently."""
     sequence = simulate(replace(DRIVE_IMU, duration_s=1.0), 0)
     motion = sequence.motion
-    assert isinstance(motion, ImuSamples)
     which = np.arange(motion.t_ns.size, dtype=float)[:, None]
     used = [rows[:, 0] for _, rows in cut_at(sequence.frames_t_ns, motion.t_ns, which, motion.pairing)]
     np.testing.assert_array_equal(np.concatenate(used), which[1:-1, 0])
