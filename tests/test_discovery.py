@@ -1,36 +1,81 @@
-"""Finding estimators: by the files of an announced package, with no list of names and no re-install."""
+"""Estimators, metrics and datasets are found by the files of an announced package, with no list of names."""
 
+import re
 import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from toolkit import discovery
+from filters import dead_reckoning
+from toolkit import datasets, discovery, metrics, runner
+from toolkit.cli import main
 from toolkit.discovery import FoundModule
-from toolkit.errors import EstimatorError, ExtensionError
+from toolkit.errors import DataError, EstimatorError, ExtensionError, VislamError
 from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, EstimatorEntry, discover, find, find_all, ladder
 from toolkit.settings import DEFAULTS
+from toolkit.simulation import DRIVE, simulate
 
-PACKAGE = "temporary_estimators"
+METRIC = """'''A metric of another project.'''
+
+from toolkit.metrics import Metric, Scores
+
+ORDER = 99
+METRICS = (Metric("answer", "the answer (1)", "1", ("the", "answer")),)
+
+
+def score(evaluation):
+    return Scores({"answer": 42.0})
+"""
+DATASET = """'''A format of another project.'''
+
+
+def recognises(path):
+    return path.read_text().startswith("theirs")
+
+
+def load(path):
+    from dataclasses import replace
+
+    from toolkit.simulation import DRIVE, simulate
+
+    return replace(simulate(replace(DRIVE, duration_s=1.0), 0), name=f"loaded {path.name}")
+"""
+
+Announce = Callable[[str, dict[str, str]], None]
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return an empty package that an entry point announces, as an installed distribution would."""
-    folder = tmp_path / PACKAGE
-    folder.mkdir()
-    (folder / "__init__.py").write_text('"""Somebody\'s estimators."""\n')
+def announce(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Announce]:
+    """Return a function that installs a package of given files and announces it under a group."""
+    points: list[EntryPoint] = []
+
+    def installed(group: str, files: dict[str, str], package: str = "") -> None:
+        package = package or f"their_{group.rpartition('.')[2]}"
+        (tmp_path / package).mkdir(exist_ok=True)
+        for name, text in ({"__init__.py": ""} | files).items():
+            (tmp_path / package / name).write_text(text)
+        points.append(EntryPoint(package, package, group))
+
+    def forget() -> None:
+        metrics._found.cache_clear()
+        datasets._found.cache_clear()
+
     monkeypatch.syspath_prepend(str(tmp_path))
-    point = EntryPoint(PACKAGE, PACKAGE, ENTRY_POINT_GROUP)
-    monkeypatch.setattr(discovery, "entry_points", lambda group: [point] if group == ENTRY_POINT_GROUP else [])
-    yield folder
-    for module in [m for m in sys.modules if m.partition(".")[0] == PACKAGE]:
+    monkeypatch.setattr(discovery, "entry_points", lambda group: [p for p in points if p.group == group])
+    forget()
+    yield installed
+    forget()
+    for module in [m for m in sys.modules if m.startswith("their_")]:
         del sys.modules[module]
 
 
-def write(package: Path, file: str, body: str) -> None:
-    (package / file).write_text(f'"""Stands still and says so."""\n\n{body}\n')
+@pytest.fixture
+def write(announce: Announce) -> Callable[[str, str], None]:
+    """Return a function that writes an estimator's file, with a docstring, into an announced package."""
+    return lambda file, body: announce(ENTRY_POINT_GROUP, {file: f'"""Stands still and says so."""\n\n{body}\n'})
 
 
 def test_the_projects_own_estimators_are_found():
@@ -40,39 +85,35 @@ def test_the_projects_own_estimators_are_found():
     assert all(entry.change() for entry in rungs)
 
 
-def test_a_new_file_is_a_new_estimator(package):
-    (package / "parts").mkdir()  # folders and private files are parts, not estimators
-    (package / "parts" / "__init__.py").write_text("")
-    write(package, "_helper.py", "")
+def test_a_new_file_is_a_new_estimator(write, tmp_path):
+    write("_helper.py", "")
+    parts = tmp_path / "their_estimators" / "parts"  # folders and private files are parts, not estimators
+    parts.mkdir()
+    (parts / "__init__.py").write_text("")
     assert discover() == {}
-    write(package, "my_new_filter.py", "def build(setup):\n    return setup")
+    write("my_new_filter.py", "def build(setup):\n    return setup")
     assert list(discover()) == ["my-new-filter"]
     entry = find("my-new-filter")
     assert entry.summary() == "Stands still and says so."
     assert entry.load()("a setup") == "a setup"
 
 
-def test_discovery_and_summaries_import_nothing(package):
-    write(package, "explosive.py", "raise RuntimeError('imported')")
+def test_discovery_and_summaries_import_nothing(write):
+    write("explosive.py", "raise RuntimeError('imported')")
     assert find("explosive").summary() == "Stands still and says so."
-    assert f"{PACKAGE}.explosive" not in sys.modules
+    assert "their_estimators.explosive" not in sys.modules
 
 
-def test_several_packages_are_found_together(package, tmp_path, monkeypatch):
-    other = tmp_path / "other_estimators"
-    other.mkdir()
-    (other / "__init__.py").write_text("")
-    write(package, "zebra.py", "build = print")
-    (other / "ant.py").write_text("")
-    points = [EntryPoint(name, name, ENTRY_POINT_GROUP) for name in (PACKAGE, "other_estimators")]
-    monkeypatch.setattr(discovery, "entry_points", lambda group: points)
+def test_several_packages_are_found_together(announce):
+    announce(ENTRY_POINT_GROUP, {"zebra.py": "build = print"})
+    announce(ENTRY_POINT_GROUP, {"ant.py": ""}, "their_others")
     assert list(discover()) == ["ant", "zebra"]
 
 
-def test_a_missing_optional_dependency_makes_one_estimator_unavailable(package):
-    write(package, "needy.py", "import a_package_nobody_has.part\n\ndef build(setup): ...")
-    write(package, "modest.py", "def build(setup): ...")
-    write(package, "empty.py", "")
+def test_a_missing_optional_dependency_makes_one_estimator_unavailable(write):
+    write("needy.py", "import a_package_nobody_has.part\n\ndef build(setup): ...")
+    write("modest.py", "def build(setup): ...")
+    write("empty.py", "")
     with pytest.raises(EstimatorError, match=r"empty.py defines no function build\(setup\)"):
         find("empty").load()
     with pytest.raises(EstimatorError, match="needy is unavailable: it needs the package a_package_nobody_has"):
@@ -83,7 +124,7 @@ def test_a_missing_optional_dependency_makes_one_estimator_unavailable(package):
 @pytest.mark.parametrize(
     ("body", "error"),
     [
-        (f"import {PACKAGE}.prats", ModuleNotFoundError),
+        ("import their_estimators.prats", ModuleNotFoundError),
         ("from toolkit.geometri import se3", ModuleNotFoundError),
         ("from toolkit.geometry import se4", ImportError),
         ("buildd = setupp", NameError),
@@ -91,17 +132,17 @@ def test_a_missing_optional_dependency_makes_one_estimator_unavailable(package):
     ],
     ids=["own package", "toolkit module", "toolkit name", "name", "syntax"],
 )
-def test_a_typo_still_fails(package, body, error):
+def test_a_typo_still_fails(write, body, error):
     """It must not pass for a missing dependency: the run would go on without the estimator."""
-    write(package, "typo.py", body) if error is not SyntaxError else (package / "typo.py").write_text(body)
+    write("typo.py", body)
     with pytest.raises(error):
         find("typo").load()
 
 
-def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
-    write(package, "aaa.py", 'RUNG, CHANGE = 20, "+ the future"')
-    write(package, "bbb.py", 'RUNG: int = 10\nCHANGE = "the past"')
-    write(package, "ccc.py", "raise RuntimeError('imported')")
+def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(write):
+    write("aaa.py", 'RUNG, CHANGE = 20, "+ the future"')
+    write("bbb.py", 'RUNG: int = 10\nCHANGE = "the past"')
+    write("ccc.py", "raise RuntimeError('imported')")
     assert [(entry.name, entry.rung(), entry.change()) for entry in ladder()] == [
         ("bbb", 10, "the past"),
         ("aaa", 20, "+ the future"),
@@ -113,10 +154,10 @@ def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
         find_all([LADDER, "ddd"])
 
 
-def test_a_module_says_which_common_rules_it_treats_otherwise(package):
-    write(package, "says.py", 'RULES = {"window": "it keeps all"}')
-    write(package, "silent.py", "")
-    write(package, "parts.py", 'RULES = {"window": ("imu",)}')
+def test_a_module_says_which_common_rules_it_treats_otherwise(write):
+    write("says.py", 'RULES = {"window": "it keeps all"}')
+    write("silent.py", "")
+    write("parts.py", 'RULES = {"window": ("imu",)}')
     says, silent, parts = find("says"), find("silent"), find("parts")
     assert parts.obeys("window", "imu")
     assert not parts.obeys("window", "twist")
@@ -131,8 +172,8 @@ def test_a_module_says_which_common_rules_it_treats_otherwise(package):
     "rules",
     ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '{"window": ("car",)}', '("window",)'],
 )
-def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(package, rules):
-    write(package, "odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
+def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(write, rules):
+    write("odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
     with pytest.raises(EstimatorError, match=r"odd: in odd.py RULES has to map some of outliers, .* to True"):
         find("odd").check_usable(DEFAULTS)
 
@@ -160,3 +201,148 @@ def test_a_rung_is_read_without_importing(tmp_path: Path, source: str, rung: int
     path.write_text(source)
     entry = EstimatorEntry("one", FoundModule("nowhere.one", path))
     assert (entry.rung(), entry.change()) == (rung, change)
+
+
+def test_a_metric_of_another_package_is_known(announce: Announce) -> None:
+    announce(metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "_part.py": "raise RuntimeError"})
+    assert list(metrics.describe())[-1] == "answer"
+
+
+def test_a_dataset_of_another_package_is_read(announce: Announce, tmp_path: Path) -> None:
+    announce(datasets.ENTRY_POINT_GROUP, {"their_format.py": DATASET, "more.py": "BUILT_IN = {'theirs': str}\n"})
+    assert datasets.formats()["their-format"] == "A format of another project."
+    assert "theirs" in datasets.built_in_names()
+    (tmp_path / "recording").write_text("theirs, all of it")
+    assert datasets.load_sequence(str(tmp_path / "recording")).name == "loaded recording"
+
+
+def test_a_missing_dependency_makes_one_file_unavailable(announce: Announce, tmp_path: Path) -> None:
+    announce(
+        metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "needy.py": f"import a_package_nobody_has.part\n{METRIC}"}
+    )
+    announce(datasets.ENTRY_POINT_GROUP, {"needy.py": "import a_package_nobody_has\n"})
+    lacking = {"needy": "it needs the package a_package_nobody_has"}
+    assert metrics.unavailable() == datasets.unavailable() == lacking
+    assert "answer" in metrics.describe()
+    (tmp_path / "recording").write_text("of nobody")
+    with pytest.raises(DataError, match=r"no known format.*; needy is unavailable: it needs the package a_package_nob"):
+        datasets.load_sequence(str(tmp_path / "recording"))
+
+
+def test_a_metric_that_is_unavailable_is_named_where_it_is_requested(announce: Announce) -> None:
+    announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
+    with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
+        metrics.metrics_called(["answer"])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "why"),
+    [
+        ("empty.py", "", "empty.py: defines neither recognises(path) and load(path) nor BUILT_IN"),
+        ("their_world.py", "BUILT_IN = {'drive': lambda seed: None}\n", "both offer the sequence drive; rename one"),
+        ("course_npz.py", DATASET, "two dataset modules are called course-npz"),
+    ],
+)
+def test_a_module_that_is_no_dataset_is_named(announce: Announce, file: str, text: str, why: str) -> None:
+    announce(datasets.ENTRY_POINT_GROUP, {file: text})
+    with pytest.raises(ExtensionError, match=re.escape(why)):
+        datasets.formats()
+        datasets.built_ins()
+
+
+def test_an_estimators_file_that_is_no_python_is_named_with_its_line(announce: Announce) -> None:
+    announce("toolkit.estimators", {"broken.py": "import math\ndef (\n"})
+    with pytest.raises(ExtensionError, match=r"broken\.py: line 2 is no Python \(invalid syntax\)"):
+        find("broken").summary()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (METRIC.replace("ORDER", "ORDR"), "answer.py: a metric file defines METRICS, a tuple of Metric records, ORDER"),
+        (METRIC.replace("),)", "))"), "a metric file defines METRICS, a tuple"),
+        (METRIC.replace("def score", "def scored"), "a metric file defines METRICS"),
+        (
+            METRIC.replace('"answer")),)', '"answer"), best="bigger"),)'),
+            "answer.py: the metric answer has best='bigger'; it is one of",
+        ),
+        (METRIC.replace('("the", "answer")', '"answer"'), "the metric answer has heading='answer'; it is two lines"),
+    ],
+)
+def test_a_metric_file_that_is_none_is_named(
+    announce: Announce, text: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is a defect of that file (70), whatever the command line asks for, and no wrong command line (2)."""
+    announce("toolkit.metrics", {"answer.py": text})
+    with pytest.raises(ExtensionError, match=re.escape(why)):
+        metrics.known_metrics()
+    for words in (
+        ("compare", "drive", "--columns", "answer"),
+        ("diff", "one", "two", "--columns", "all"),
+        ("list", "metrics"),
+    ):
+        assert main(words) == 70
+        assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answer", ['Scores({"other": 1.0})', '{"answer": 1.0}', "None"])
+def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer: str) -> None:
+    announce("toolkit.metrics", {"answer.py": METRIC.replace('Scores({"answer": 42.0})', answer)})
+    sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
+    run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
+    with pytest.raises(ExtensionError, match=r"answer\.py: score must return Scores of \['answer'\], and returned"):
+        metrics.score_run(run, "causal", sequence)
+
+
+def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp_path: Path) -> None:
+    announce(
+        "toolkit.datasets",
+        {"theirs.py": DATASET.replace("return replace(", "return str(").replace(", name=", ") or (")},
+    )
+    (tmp_path / "some.file").write_text("theirs")
+    with pytest.raises(ExtensionError, match=r"theirs\.py returned a str; it must return a Sequence"):
+        datasets.load_sequence(str(tmp_path / "some.file"))
+
+
+def test_a_defect_of_another_package_is_not_blamed_on_vislam(
+    announce: Announce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = DATASET.replace("    from dataclasses", "    1 / 0\n    from dataclasses")
+    announce("toolkit.datasets", {"theirs.py": broken})
+    (tmp_path / "some.file").write_text("theirs")
+    assert main(["check-data", str(tmp_path / "some.file")]) == 70
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"a defect of \S+theirs\.py, line 9, which another package brings \(ZeroDivisionError", message)
+    assert "vislam itself" not in message
+
+
+def test_a_defect_that_comes_back_from_another_process_keeps_its_place(announce: Announce, tmp_path: Path) -> None:
+    announce("toolkit.datasets", {"theirs.py": DATASET})
+    file = tmp_path / "their_datasets" / "theirs.py"
+    error = ValueError("boom")
+    error.__cause__ = RuntimeError(f'\n"""\nTraceback (most recent call last):\n  File "{file}", line 7, in load\n"""')
+    assert discovery.line_of_another_package(error) == f"{file}, line 7"
+    assert discovery.line_of_another_package(ValueError("boom")) == ""
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ("replace(drawn, name=3)", "a recording: its name is of type int, expected str"),
+        ("replace(drawn, observations=None)", "drive: its observations is of type NoneType, expected Observations"),
+        ("replace(drawn, provenance='x')", "drive: its provenance is of type str"),
+        (
+            "replace(drawn, rig=replace(drawn.rig, fx_px=None))",
+            "drive: its rig.fx_px is of type NoneType",
+        ),
+        ("replace(drawn, motion=replace(drawn.motion, v_mps=drawn.motion.v_mps[1:]))", "motion.v_mps has 10 rows, and"),
+        ("replace(drawn, frames_t_ns=drawn.frames_t_ns[:3])", "is of frame 3, there are 3"),
+    ],
+)
+def test_a_part_of_a_sequence_that_is_none_is_named(announce: Announce, tmp_path: Path, answer: str, why: str) -> None:
+    drawn = "drawn = simulate(replace(DRIVE, duration_s=1.0), 0)\n    return "
+    text = DATASET[: DATASET.index("return replace(")] + drawn + answer + "\n"
+    announce("toolkit.datasets", {"theirs.py": text})
+    (tmp_path / "some.file").write_text("theirs")
+    with pytest.raises(DataError, match=re.escape(why)):
+        datasets.load_sequence(str(tmp_path / "some.file"))

@@ -71,8 +71,8 @@ def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction(scenario, jump, run_o
     sequence = recording(scenario)
     spoiled = jumping(run_on("ekf", scenario).causal, 0.2, jump)
     reason = contradiction(spoiled, sequence)
-    assert reason is not None
     assert "contradict the measured motion" in reason
+    assert int(reason.split()[0]) > 15 and f"at most {100 * MOST_FAR_STEPS:.0f} %" in reason
 
 
 @every_scenario
@@ -130,24 +130,12 @@ def test_jumps_of_half_a_hundredth_of_what_the_pose_is_uncertain_by_are_no_contr
     assert (found is not None) == is_one
 
 
-def test_the_reason_counts_the_far_steps(run_on):
-    sequence = recording("drive")
-    run = run_on("dead-reckoning", "drive")
-    poses = run.causal.T_world_imu.copy()
-    poses[1::2] = poses[1::2] @ se3_exp(JUMP_M)
-    reason = contradiction(replace(run.causal, T_world_imu=poses), sequence)
-    assert reason.startswith("100 % of its steps")
-    assert f"at most {100 * MOST_FAR_STEPS:.0f} %" in reason
-
-
 def test_a_pose_that_is_not_a_number_is_a_contradiction():
     sequence = recording("drive")
     poses = sequence.truth.T_world_imu.copy()
     poses[17:, 0, 3] = np.inf
-    assert (
-        contradiction(Trajectory(sequence.truth.t_ns, poses), sequence)
-        == "its poses are not numbers from estimate 17 on"
-    )
+    reason = contradiction(Trajectory(sequence.truth.t_ns, poses), sequence)
+    assert reason == "its poses are not numbers from estimate 17 on"
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -162,16 +150,17 @@ def gated(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, 
     return {"gate_tested": tested_of, "gate_accepted": tested_of * np.repeat([share, share_in_the_end], [75, 25])}
 
 
-def test_a_filter_that_rejects_nearly_all_measurements_has_diverged():
-    assert gate_collapse(gated(0.06, 0.06)).startswith("6 % of its measurements passed its own gate")
-
-
-def test_a_filter_whose_gate_collapsed_in_the_last_quarter_has_diverged():
-    assert gate_collapse(gated(0.95, 0.1)).startswith("10 % of its last quarter's")
-
-
-def test_a_filter_on_a_rough_recording_has_not_diverged():
-    assert gate_collapse(gated(0.65, 0.5)) is None
+@pytest.mark.parametrize(
+    ("share", "in_the_end", "reason"),
+    [
+        (0.06, 0.06, "6 % of its measurements passed its own gate"),
+        (0.95, 0.1, "10 % of its last quarter's"),
+        (0.65, 0.5, None),  # on a rough recording
+    ],
+)
+def test_a_filter_that_rejects_nearly_all_measurements_has_diverged(share, in_the_end, reason):
+    found = gate_collapse(gated(share, in_the_end))
+    assert found is None if reason is None else found.startswith(reason)
 
 
 def test_tracks_tested_as_a_whole_may_fail_more_often_than_sightings_for_outliers_spoil_all_of_one():
