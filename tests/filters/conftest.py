@@ -163,15 +163,6 @@ def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
     return runner.setup_of(sequence, sequence.prior, settings)
 
 
-def numerical_jacobian(function: Callable[[Array], Array], size: int, step: float = 1e-3) -> Array:
-    """Five-point central differences: good to 1e-10 of values near 1."""
-    columns = []
-    for unit in step * np.eye(size):
-        near, far = function(unit) - function(-unit), function(2.0 * unit) - function(-2.0 * unit)
-        columns.append((8.0 * near - far) / (12.0 * step))
-    return np.stack(columns, axis=-1)
-
-
 def carried(
     scenario: Scenario, belief: Callable[..., JointBelief], tracks: int
 ) -> tuple[JointBelief, StereoFrame, StereoRig]:

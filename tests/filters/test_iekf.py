@@ -18,7 +18,8 @@ from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import AtLatestEstimates, JointBelief
-from tests.filters.conftest import BELIEFS, carried, numerical_jacobian, setup_of, short
+from tests.filters.conftest import BELIEFS, carried, setup_of, short
+from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models.factors import L, StereoFactors, X

@@ -16,7 +16,8 @@ from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InvariantBelief
 from filters.kalman.joint import AtLatestEstimates, JointBelief
-from tests.filters.conftest import BELIEFS, carried, numerical_jacobian, setup_of, short
+from tests.filters.conftest import BELIEFS, carried, setup_of, short
+from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
 from toolkit.measurements import Prior
 from toolkit.models.gating import FrameGate

@@ -6,39 +6,28 @@ velocity is perturbed in the world, ours in the body.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
 import pytest
 
+from tests.models.conftest import numerical_jacobian
 from toolkit.datasets import load_sequence
-from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
+from toolkit.geometry import Array
 from toolkit.initialization import start_from_measurements
 from toolkit.measurements import GRAVITY_WORLD, ImuMotion
 from toolkit.models import imu
 from toolkit.models.factors import B, V, X
+from toolkit.models.state import IMU_LAYOUT, Belief
 from toolkit.simulation import FLIGHT, noise_free, simulate
 
-PARAMS = imu.preintegration_params(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
+MODEL = imu.ImuModel(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
 BIAS = np.array([0.05, -0.08, 0.03, 0.004, -0.006, 0.002])
 
 
-class State(NamedTuple):
-    T_world_imu: Array
-    v_world: Array
-    bias: Array
-
-    def moved(self, delta: Array) -> "State":
-        """Return the state perturbed by (15,) in the order and on the side of GTSAM."""
-        v_world = self.v_world + self.T_world_imu[:3, :3] @ delta[6:9]
-        return State(self.T_world_imu @ se3_exp(delta[:6]), v_world, self.bias + delta[9:])
-
-    def error_to(self, other: "State") -> Array:
-        """Return the perturbation (15,) of this state that gives the other."""
-        pose_error = se3_log(se3_inverse(self.T_world_imu) @ other.T_world_imu)
-        velocity_error = self.T_world_imu[:3, :3].T @ (other.v_world - self.v_world)
-        return np.concatenate([pose_error, velocity_error, other.bias - self.bias])
+def at(T_world_imu: Array, v_world: Array, bias: Array) -> Belief:
+    """Return a state."""
+    return Belief(IMU_LAYOUT, T_world_imu, v_world, bias, np.eye(15))
 
 
 @pytest.fixture
@@ -50,15 +39,9 @@ def motion() -> ImuMotion:
     return ImuMotion(rng.uniform(0.003, 0.007, 20), accel, gyro)
 
 
-@pytest.fixture
-def state() -> State:
-    return State(se3_exp(np.array([0.4, -0.8, 1.1, 3.0, -2.0, 5.0])), np.array([3.0, -1.0, 0.5]), BIAS + 0.01)
-
-
 def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) -> None:
     noise = FLIGHT.motion.noise
-    model = imu.ImuModel(noise, np.array(GRAVITY_WORLD))
-    bridged = model.integrate(replace(motion, noise_scale=np.tile([3.0, 2.0], (20, 1))), BIAS).preintegration
+    bridged = MODEL.integrate(replace(motion, noise_scale=np.tile([3.0, 2.0], (20, 1))), BIAS).preintegration
     larger = replace(
         noise, accel_noise_density=3.0 * noise.accel_noise_density, gyro_noise_density=2.0 * noise.gyro_noise_density
     )
@@ -67,30 +50,17 @@ def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) 
     np.testing.assert_array_equal(bridged.deltaPij(), expected.deltaPij())
 
 
-def predicted(preintegration: imu.Preintegration, start: State) -> State:
-    step = imu.predict(preintegration, *start)
-    return State(step.T_world_imu, step.v_world, start.bias)
+def predicted(motion: ImuMotion, start: Belief) -> Belief:
+    """Return a state predicted over a motion that is preintegrated about its own bias."""
+    return start.predicted(MODEL.integrate(motion, start.bias).predict(start))
 
 
-def test_transition_is_the_derivative_of_the_prediction(motion, state, numerical_jacobian):
-    """The preintegration stays as it is, made about another bias than the state's: its own bias Jacobian counts."""
-    preintegration = imu.preintegrate(motion, BIAS, PARAMS)
-    end = predicted(preintegration, state)
-    numerical = numerical_jacobian(lambda d: end.error_to(predicted(preintegration, state.moved(d))), 15)
-    # Entries are of the order of 1; the differences are good to 1e-10.
-    np.testing.assert_allclose(imu.predict(preintegration, *state).transition, numerical, atol=1e-9)
-
-
-def test_bias_jacobian_describes_a_new_preintegration_too(motion, numerical_jacobian):
+def test_bias_jacobian_describes_a_new_preintegration_too(motion):
     """What the filter does at each frame: preintegrate afresh about the latest bias."""
-    start = State(np.eye(4), np.array([3.0, -1.0, 0.5]), BIAS)
-
-    def again(delta: Array) -> State:
-        moved = start.moved(delta)
-        return predicted(imu.preintegrate(motion, moved.bias, PARAMS), moved)
-
-    numerical = numerical_jacobian(lambda d: again(np.zeros(15)).error_to(again(d)), 15)
-    transition = imu.predict(imu.preintegrate(motion, BIAS, PARAMS), *start).transition
+    start = at(np.eye(4), np.array([3.0, -1.0, 0.5]), BIAS)
+    end = predicted(motion, start)
+    numerical = numerical_jacobian(lambda d: end.error_to(predicted(motion, start.moved(d, start.cov))), 15)
+    transition = MODEL.integrate(motion, BIAS).predict(start).transition
     dt_s = motion.dt_s.sum()
     # The midpoint turn of each specific force also depends on the gyro bias, by half a step; GTSAM's Jacobian does not
     # know: over n steps that is 1 / n of the effect on the velocity, 0.5 g dt^2, and less on the position.
@@ -103,15 +73,14 @@ def test_bias_jacobian_describes_a_new_preintegration_too(motion, numerical_jaco
 def test_noise_covariance_is_that_of_the_sampled_noise(motion):
     """Monte Carlo: every sample of the interval gets the white noise of its density, the bias walks on."""
     noise = FLIGHT.motion.noise
-    start = State(np.eye(4), np.zeros(3), np.zeros(6))
-    clean = imu.predict(imu.preintegrate(motion, np.zeros(6), PARAMS), *start)
-    end, rng, draws = State(clean.T_world_imu, clean.v_world, start.bias), np.random.default_rng(7), 2000
+    start, rng, draws = at(np.eye(4), np.zeros(3), np.zeros(6)), np.random.default_rng(7), 2000
+    clean, end = MODEL.integrate(motion, start.bias).predict(start), predicted(motion, start)
     density = np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
     errors = np.empty((draws, 9))
     for i in range(draws):
         white = density * rng.standard_normal((motion.dt_s.size, 6)) / np.sqrt(motion.dt_s)[:, None]
         noisy = ImuMotion(motion.dt_s, motion.accel_mps2 + white[:, :3], motion.gyro_radps + white[:, 3:])
-        errors[i] = end.error_to(predicted(imu.preintegrate(noisy, np.zeros(6), PARAMS), start))[:9]
+        errors[i] = end.error_to(predicted(noisy, start))[:9]
     normal = np.linalg.solve(np.linalg.cholesky(clean.noise[:9, :9]), errors.T)
     # The sample covariance of 2000 normal draws: each entry has a standard error of 0.022 or 0.032; five of them.
     # The midpoint rule shifts the white noise of the gyro by half a step, which is 1 / n of its effect at most.
@@ -120,7 +89,7 @@ def test_noise_covariance_is_that_of_the_sampled_noise(motion):
     np.testing.assert_allclose(clean.noise[9:, 9:], np.diag(bias_walk), rtol=1e-9, atol=1e-18)
 
 
-def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: State, end: State, k: int) -> tuple[Array, ...]:
+def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: Belief, end: Belief, k: int) -> tuple[Array, ...]:
     """Return the factor's residual (15,) between two states and the transition and noise (15, 15) it implies."""
     values = gtsam.Values()
     for index, state in ((k - 1, start), (k, end)):
@@ -141,15 +110,14 @@ def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: State, end: Sta
 def test_filter_equals_gtsams_factor_on_every_interval_of_kitti00():
     sequence = load_sequence("kitti00")
     prior = start_from_measurements(sequence)
-    params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
-    start, compared = State(prior.T_world_imu, prior.v_world, prior.bias), 0
+    model, compared = imu.ImuModel(sequence.noise, sequence.gravity_world), 0
+    start = at(prior.T_world_imu, prior.v_world, prior.bias)
     for packet in sequence.packets():
         if packet.motion is None:
             continue
-        preintegration = imu.preintegrate(packet.motion, prior.bias, params)
-        step = imu.predict(preintegration, *start)
-        end = State(step.T_world_imu, step.v_world, start.bias)
-        factor = imu.ImuIncrement(preintegration, 0.0, sequence.gravity_world).factors(packet.index).at(0)
+        increment = model.integrate(packet.motion, prior.bias)
+        step = increment.predict(start)
+        end, factor = start.predicted(step), increment.factors(packet.index).at(0)
         residual, transition, noise = factor_in_filter_terms(factor, start, end, packet.index)
         # 1e-9 is the promise of docs; double precision gives 1e-14 on entries of the order of 1.
         np.testing.assert_allclose(residual, 0.0, atol=1e-9)
@@ -165,10 +133,10 @@ def drift_m(rate_hz: float) -> float:
     """Return where 5 s of exact IMU samples of the flight lead, integrated at once, against the truth."""
     scenario = noise_free(replace(FLIGHT, duration_s=5.0))
     sequence = simulate(replace(scenario, motion=replace(scenario.motion, rate_hz=rate_hz)), 0)
-    state = State(sequence.prior.T_world_imu, sequence.prior.v_world, np.zeros(6))
+    state = at(sequence.prior.T_world_imu, sequence.prior.v_world, np.zeros(6))
     for packet in sequence.packets():
         if packet.motion is not None:
-            state = predicted(imu.preintegrate(packet.motion, np.zeros(6), PARAMS), state)
+            state = predicted(packet.motion, state)
     return float(np.linalg.norm(state.T_world_imu[:3, 3] - sequence.truth.T_world_imu[-1, :3, 3]))
 
 

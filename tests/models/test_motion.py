@@ -7,20 +7,25 @@ import gtsam
 import numpy as np
 import pytest
 
+from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import se3_exp
-from toolkit.measurements import Packet
+from toolkit.measurements import Packet, TwistChangeNoise
 from toolkit.models.factors import B, V, X, joint_cov
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief, predicted
+from toolkit.motion_samples import NoSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-each_motion = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
+each_motion = pytest.mark.parametrize("kind", ["twist", "imu", "none"])
 K = 7
+CHANGE_NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
 
 
-def recorded(scenario) -> tuple[Sequence, Packet]:
-    sequence = simulate(replace(scenario, duration_s=2.0), 4)
+def recorded(kind: str) -> tuple[Sequence, Packet]:
+    sequence = simulate(replace(FLIGHT if kind == "imu" else DRIVE, duration_s=2.0), 4)
+    if kind == "none":
+        sequence = replace(sequence, motion=NoSamples(sequence.frames_t_ns), noise=CHANGE_NOISE)
     return sequence, list(sequence.packets())[K]
 
 
@@ -39,16 +44,16 @@ def some_belief(sequence: Sequence, seed: int = 0) -> Belief:
 
 
 @each_motion
-def test_the_error_to_a_moved_belief_is_what_moved_it(scenario):
-    sequence, _ = recorded(scenario)
+def test_the_error_to_a_moved_belief_is_what_moved_it(kind):
+    sequence, _ = recorded(kind)
     belief, rng = some_belief(sequence), np.random.default_rng(3)
     error = 0.3 * rng.standard_normal(len(belief.cov))
     np.testing.assert_allclose(belief.error_to(belief.moved(error, belief.cov)), error, rtol=0.0, atol=1e-14)
 
 
 @each_motion
-def test_what_is_inserted_is_read(scenario):
-    sequence, packet = recorded(scenario)
+def test_what_is_inserted_is_read(kind):
+    sequence, packet = recorded(kind)
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
     estimate = some_belief(sequence).estimate(packet.frame.t_ns)
     model.insert(values, estimate, K)
@@ -64,8 +69,8 @@ def test_what_is_inserted_is_read(scenario):
 
 
 @each_motion
-def test_a_held_state_has_the_covariance_it_is_held_with(scenario):
-    sequence, packet = recorded(scenario)
+def test_a_held_state_has_the_covariance_it_is_held_with(kind):
+    sequence, packet = recorded(kind)
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
     belief = some_belief(sequence)
     model.insert(values, belief.estimate(packet.frame.t_ns), K)
@@ -77,9 +82,9 @@ def test_a_held_state_has_the_covariance_it_is_held_with(scenario):
 
 
 @each_motion
-def test_a_prediction_is_what_the_graph_of_the_same_increment_says(scenario):
+def test_a_prediction_is_what_the_graph_of_the_same_increment_says(kind):
     """The filter's F P F^T + Q is the marginal of the next state, and the predicted mean costs nothing."""
-    sequence, packet = recorded(scenario)
+    sequence, packet = recorded(kind)
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
     before = some_belief(sequence)
     after = predicted(before, model, packet.motion)
@@ -96,8 +101,8 @@ def test_a_prediction_is_what_the_graph_of_the_same_increment_says(scenario):
 
 
 @each_motion
-def test_the_transition_between_a_prediction_and_its_own_start_is_the_predictions(scenario):
-    sequence, packet = recorded(scenario)
+def test_the_transition_between_a_prediction_and_its_own_start_is_the_predictions(kind):
+    sequence, packet = recorded(kind)
     model, belief = motion_model(sequence.noise, sequence.gravity_world), some_belief(sequence)
     increment = model.integrate(packet.motion, belief.bias)
     prediction = increment.predict(belief)
@@ -106,9 +111,29 @@ def test_the_transition_between_a_prediction_and_its_own_start_is_the_prediction
 
 
 @each_motion
-def test_states_predicted_at_once_are_those_predicted_one_by_one(scenario):
+def test_the_transition_is_the_derivative_of_the_prediction(kind):
+    """An increment stays as it is, made about another bias than the state's: its own Jacobian by the bias counts."""
+    sequence, packet = recorded(kind)
+    model, belief = motion_model(sequence.noise, sequence.gravity_world), some_belief(sequence)
+    about = belief.bias + np.r_[np.full(3, 0.01 if kind == "imu" else 0.0), np.full(3, 0.002)]
+    increment = model.integrate(packet.motion, about)
+    prediction = increment.predict(belief)
+    end = belief.predicted(prediction)
+
+    def moved(delta):
+        start = belief.moved(delta, belief.cov)
+        # Twists are integrated about the bias that they are predicted with.
+        again = model.integrate(packet.motion, about + start.bias - belief.bias) if kind == "twist" else increment
+        return end.error_to(start.predicted(again.predict(start)))
+
+    # Entries are of the order of 1; the differences are good to 1e-10.
+    np.testing.assert_allclose(prediction.transition, numerical_jacobian(moved, model.layout.size), atol=1e-8)
+
+
+@each_motion
+def test_states_predicted_at_once_are_those_predicted_one_by_one(kind):
     """Over intervals of one sample, of two and of three, in any order."""
-    sequence, _ = recorded(scenario)
+    sequence, _ = recorded(kind)
     model, packets = motion_model(sequence.noise, sequence.gravity_world), list(sequence.packets())[1:7]
     whole = [replace(packet.motion, **_first(packet.motion, 1 + k % 3)) for k, packet in enumerate(packets)]
     starts = [some_belief(sequence, seed) for seed in range(len(whole))]
@@ -130,9 +155,9 @@ def _first(motion, count):
 
 
 @each_motion
-def test_a_turn_and_a_shift_of_the_world_pass_through_first_estimates(scenario):
+def test_a_turn_and_a_shift_of_the_world_pass_through_first_estimates(kind):
     """Between any two states the transition takes the gauge's error at one to the gauge's error at the other."""
-    sequence, packet = recorded(scenario)
+    sequence, packet = recorded(kind)
     model, belief = motion_model(sequence.noise, sequence.gravity_world), some_belief(sequence)
     increment = model.integrate(packet.motion, belief.bias)
     end = increment.predict(belief)

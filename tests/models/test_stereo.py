@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from tests.models.conftest import numerical_jacobian
 from toolkit.answers import Run
 from toolkit.datasets import load_sequence
 from toolkit.geometry import Array, se3_exp, transform
@@ -49,7 +50,7 @@ def in_world(points_cam: Array, pose: Array, rig: StereoRig) -> Array:
 
 
 @every_rig
-def test_pose_jacobian_is_the_derivative_on_the_right(rig, pose, points_cam, numerical_jacobian):
+def test_pose_jacobian_is_the_derivative_on_the_right(rig, pose, points_cam):
     points = in_world(points_cam, pose, rig)
     predicted = stereo.predict(points, pose, rig)
     numerical = numerical_jacobian(lambda xi: stereo.predict(points, pose @ se3_exp(xi), rig).uv_px, 6)
@@ -57,7 +58,7 @@ def test_pose_jacobian_is_the_derivative_on_the_right(rig, pose, points_cam, num
 
 
 @every_rig
-def test_point_jacobian_is_the_derivative(rig, pose, points_cam, numerical_jacobian):
+def test_point_jacobian_is_the_derivative(rig, pose, points_cam):
     points = in_world(points_cam, pose, rig)
     numerical = numerical_jacobian(lambda d: stereo.predict(points + d, pose, rig).uv_px, 3)
     predicted = stereo.predict(points, pose, rig)
@@ -201,7 +202,7 @@ def test_unwhitened_its_rows_and_noise_say_the_same(scene):
     np.testing.assert_array_equal(stereo.degrees_of_freedom(uvs_px), [2, 3, 2, 3])
 
 
-def test_smoothers_have_gtsam_factors_of_the_left_camera_for_it(scene, numerical_jacobian):
+def test_smoothers_have_gtsam_factors_of_the_left_camera_for_it(scene):
     pose, points, uvs_px = scene
     frame = StereoFrame(0, np.arange(4), uvs_px)
     values = gtsam.Values()

@@ -217,7 +217,7 @@ class SmoothIncrement:
         v_body = start.T_world_imu[:3, :3].T @ start.v_world
         T_world_imu = start.T_world_imu @ T_start_end
         v_world = T_world_imu[:3, :3] @ v_body
-        transition = _transition(T_start_end, se3_right_jacobian(xi), v_body, self.dt_s)
+        transition = _transition(T_start_end, se3_right_jacobian(xi), (v_body, v_body), self.dt_s)
         # A rotation error at the end also changes the velocity error, because the body's velocity is fixed in its axes.
         spread = np.zeros((12, 12))
         spread[POSE, POSE] = np.eye(6)
@@ -229,7 +229,7 @@ class SmoothIncrement:
     def transition_between(self, start: Belief, end: Prediction) -> Array:
         """Return the transition (12, 12) from the mean of ``start`` to that of ``end``."""
         T_start_end = se3_inverse(start.T_world_imu) @ end.T_world_imu
-        v_body = start.T_world_imu[:3, :3].T @ start.v_world
+        v_body = start.T_world_imu[:3, :3].T @ start.v_world, end.T_world_imu[:3, :3].T @ end.v_world
         return _transition(T_start_end, se3_right_jacobian(se3_log(T_start_end)), v_body, self.dt_s)
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
@@ -239,16 +239,19 @@ class SmoothIncrement:
         return graph
 
 
-def _transition(T_start_end: Array, d_end_d_xi: Array, v_body: Array, dt_s: float) -> Array:
-    """Return F (12, 12): an error of the start's pose, velocity (body) and turn rate, carried to the end."""
+def _transition(T_start_end: Array, d_end_d_xi: Array, v_body: tuple[Array, Array], dt_s: float) -> Array:
+    """Return F (12, 12): an error of the start's pose, velocity (body) and turn rate, carried to the end.
+
+    ``v_body`` are the velocities (3,) in the axes of the body at the start and at the end.
+    """
     F = np.zeros((12, 12))
     F[POSE, POSE] = se3_adjoint(se3_inverse(T_start_end))
     # The velocity in the body frame depends on the velocity in the world and on the body's attitude.
-    F[POSE, ROTATION] += dt_s * d_end_d_xi[:, 3:] @ skew(v_body)
+    F[POSE, ROTATION] += dt_s * d_end_d_xi[:, 3:] @ skew(v_body[0])
     F[POSE, _VELOCITY] = dt_s * d_end_d_xi[:, 3:]
     F[POSE, _TURN] = -dt_s * d_end_d_xi[:, :3]
-    F[_VELOCITY] = -skew(v_body) @ F[ROTATION]
-    F[_VELOCITY, ROTATION] += skew(v_body)
+    F[_VELOCITY] = -skew(v_body[1]) @ F[ROTATION]
+    F[_VELOCITY, ROTATION] += skew(v_body[0])
     F[_VELOCITY, _VELOCITY] += np.eye(3)
     F[_TURN, _TURN] = np.eye(3)
     return F
