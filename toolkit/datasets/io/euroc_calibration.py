@@ -15,7 +15,6 @@ ends of those ranges; the walks stay as stated. A simulated IMU errs as it state
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,7 @@ _INFLATED = (
     f"white noise of the accelerometer and the gyro assumed to be {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the "
     "stated one, as measured in flight against the truth"
 )
-_AS_STATED = "the noise of the IMU is as its file states it"
+AS_STATED = "the noise of the IMU is as its file states it"
 _DENSITIES = {
     "accel_noise_density": "accelerometer_noise_density",
     "gyro_noise_density": "gyroscope_noise_density",
@@ -83,7 +82,7 @@ _SYSTEMS = {
     "OpenVINS": (b"relative_config_imucam",),
 }
 _LOOKED_AT, _NAMED, _KINDS = 1 << 16, 3, ("*.yaml", "*.yml", "*.json")
-_COEFFICIENTS = "distortion_coefficients|distortion_coeffs"
+_COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +128,8 @@ def read_calibration(root: Path, mav0: Path) -> AslCalibration:
     Extrinsics are made relative to the IMU. Raises DataError where a file is missing, damaged or incomplete, or the
     right camera is not right of the left one.
     """
-    camchain = next((path for path in _chains(root, mav0)), None)
+    chains = (path for folder in (root, mav0, root / "dso") for path in sorted(folder.glob("*camchain*.yaml")))
+    camchain = next(chains, None)
     return _of_sensor_files(mav0, is_simulated(root)) if camchain is None else _of_kalibr(camchain, root, mav0)
 
 
@@ -142,13 +142,13 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
         raise DataError(_no_calibration(mav0, lacking))
     left, right, imu = map(read_fields, files)
     left.require("T_BS.data", "intrinsics", "resolution")
-    stated = _stated_noise(imu)
+    stated, unused = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
     _check_right(right.path, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
-    noise = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
+    noise = (stated, AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
     found = _calibration(left, right, (T_imu_left, T_left_right), noise, "the folder's sensor.yaml files")
-    return replace(found, unused=tuple(chain.from_iterable(map(_unused, (left, right, imu)))))
+    return replace(found, unused=(*_unused(left), *_unused(right), *unused))
 
 
 def _no_calibration(mav0: Path, lacking: list[Path]) -> str:
@@ -188,13 +188,13 @@ def _is_nothing(array: npt.NDArray[np.generic]) -> bool:
 
 def _shift(left: Fields, right: Fields) -> tuple[float, tuple[str, ...]]:
     """Return the time from the cameras' clock to the IMU's that Kalibr states, and what to know of it."""
-    stated = [side.number(_SHIFT) if _SHIFT in side else None for side in (left, right)]
-    shift_s = next((one for one in stated if one is not None), 0.0)
+    stated = [side.number(_SHIFT) for side in (left, right) if _SHIFT in side]
+    shift_s, other_s = (stated[0], stated[-1]) if stated else (0.0, 0.0)
     remarks = []
     if shift_s:
         remarks.append(f"{1e3 * shift_s:+.3f} ms are added to the stamps of images: {_SHIFT} in {left.path.name}")
-    if None not in stated and abs(float(stated[1] or 0.0) - shift_s) > _SAME_SHIFT_S:
-        other = f"{1e3 * float(stated[1] or 0.0):+.3f} ms"
+    if abs(other_s - shift_s) > _SAME_SHIFT_S:
+        other = f"{1e3 * other_s:+.3f} ms"
         remarks.append(f"{left.path.name} states another {_SHIFT} for cam1, {other}; cam0's is that of both")
     return shift_s, tuple(remarks)
 
@@ -207,23 +207,14 @@ def _of_kalibr(camchain: Path, root: Path, mav0: Path) -> AslCalibration:
     T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
     mounted = "T_cam_imu" in right
     T_right_left = right.rigid("T_cam_imu") @ T_imu_left if mounted else right.rigid("T_cn_cnm1")
-    noise, unused = _noise_beside(camchain, root, mav0)
+    sensor = mav0 / "imu0/sensor.yaml"
+    stated = kalibr_noise(camchain.parent, root, mav0) or (is_regular(sensor) and _stated_noise(read_fields(sensor)))
+    noise, unused = stated or (mems_imu(), ())
     T_left_right = se3_inverse(T_right_left)
     _check_right(camchain, T_left_right, None)
-    found = _calibration(left, right, (T_imu_left, T_left_right), noise, str(camchain.relative_to(root)))
+    how = (noise, AS_STATED if stated else NO_NOISE)
+    found = _calibration(left, right, (T_imu_left, T_left_right), how, str(camchain.relative_to(root)))
     return replace(found, unused=(*_unused(left, "cam0"), *_unused(right, "cam1"), *unused))
-
-
-def _noise_beside(camchain: Path, root: Path, mav0: Path) -> tuple[tuple[ImuNoise, str], tuple[str, ...]]:
-    """Return the noise of Kalibr's IMU file or of sensor.yaml with its source, else a MEMS unit's, and unused keys."""
-    kalibrs = [(path, "imu0.") for folder in (camchain.parent, root, mav0) for path in sorted(folder.glob("imu*.yaml"))]
-    files = [*kalibrs, *(((mav0 / "imu0/sensor.yaml"), "") for _ in range(is_regular(mav0 / "imu0/sensor.yaml")))]
-    if not files:
-        return (mems_imu(), NO_NOISE), ()
-    fields, prefix = read_fields(files[0][0]), files[0][1]
-    nested = any(key.startswith(prefix) for key in fields.arrays) if prefix else False
-    inner = _part(fields, "imu0") if nested else fields
-    return (_stated_noise(fields, prefix), _AS_STATED), tuple(_unused(inner, "imu0" if nested else ""))
 
 
 def _check_camchain(fields: Fields) -> None:
@@ -237,25 +228,21 @@ def _check_camchain(fields: Fields) -> None:
     fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
 
 
-def kalibr_noise(folder: Path) -> ImuNoise | None:
-    """Return the noise that Kalibr's IMU file in a folder states, None where there is none.
+def kalibr_noise(*folders: Path) -> tuple[ImuNoise, tuple[str, ...]] | None:
+    """Return the noise that Kalibr's IMU file in one of some folders states, and remarks; None where there is none.
 
     Raises DataError where it is damaged or incomplete.
     """
-    imu = next(iter(sorted(folder.glob("imu*.yaml"))), None)
-    return None if imu is None else _stated_noise(read_fields(imu), "imu0.")
+    file = next((path for folder in folders for path in sorted(folder.glob("imu*.yaml"))), None)
+    return None if file is None else _stated_noise(read_fields(file))
 
 
-def _chains(root: Path, mav0: Path) -> list[Path]:
-    folders = [root, mav0, root / "dso"]
-    return [path for folder in folders for path in sorted(folder.glob("*camchain*.yaml"))]
-
-
-def _stated_noise(imu: Fields, prefix: str = "") -> ImuNoise:
-    """Return the densities that a file states, at its top or under the name of the sensor."""
-    nested = prefix if f"{prefix}{_DENSITIES['accel_noise_density']}" in imu else ""
-    imu.require(*(nested + theirs for theirs in _DENSITIES.values()))
-    return ImuNoise(**{ours: imu.positive(nested + theirs) for ours, theirs in _DENSITIES.items()})
+def _stated_noise(fields: Fields) -> tuple[ImuNoise, tuple[str, ...]]:
+    """Return the densities that a file states, at its top or under imu0, and remarks on what it states besides."""
+    name = "imu0" if any(key.startswith("imu0.") for key in fields.arrays) else ""
+    imu = _part(fields, name) if name else fields
+    imu.require(*_DENSITIES.values())
+    return ImuNoise(**{ours: imu.positive(theirs) for ours, theirs in _DENSITIES.items()}), tuple(_unused(imu, name))
 
 
 def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> None:
@@ -269,15 +256,10 @@ def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> Non
     if max(abs(x), abs(y), abs(z)) < _SAME_PLACE_M:
         raise DataError(f"{path}: cam0 and cam1 stand at one place, so there is no baseline; give each its own pose")
     if -x < max(abs(y), abs(z)):
-        turned = inverted is not None and _is_right(inverted)
+        turned = inverted is not None and inverted[0, 3] > np.abs(inverted[1:3, 3]).max()
         remedy = "each T_BS looks like the inverse of one: invert both" if turned else "correct the pose of one of them"
         raise DataError(f"{path}: cam1 is at {x:.3g} {y:.3g} {z:.3g} m of cam0, not to the right of it; {remedy}")
     raise DataError(f"{path}: cam1 is not to the right of cam0; exchange the two")
-
-
-def _is_right(T_left_right: Array) -> bool:
-    x, y, z = T_left_right[:3, 3]
-    return bool(x > max(abs(y), abs(z)))
 
 
 def _calibration(
@@ -327,8 +309,14 @@ def _camera_of(fields: Fields) -> Camera:
         raise DataError(
             f"{fields.path}: intrinsics {fx:g} {fy:g} {cx:g} {cy:g} are not of a {width:g}x{height:g} image"
         )
-    distortion, coefficients = _distortion(fields)
-    return Camera((fx, fy, cx, cy), distortion, coefficients, (int(width), int(height)))
+    name = str(fields.arrays["distortion_model"])
+    given = next((key for key in _COEFFICIENTS if key in fields), None)
+    if given is None and name != "none" and name in _LENSES:
+        fields.require("|".join(_COEFFICIENTS))
+    coefficients = np.zeros(0) if given is None else fields.vector(given)
+    return Camera(
+        (fx, fy, cx, cy), *lens_of(str(fields.path), name, coefficients, given or ""), (int(width), int(height))
+    )
 
 
 def _pinhole_of(fields: Fields) -> Pinhole:
@@ -350,16 +338,6 @@ def _part(fields: Fields, name: str) -> Fields:
     if not inner:
         raise DataError(f"{fields.path}: holds no {name}; it has {', '.join(sorted(fields.arrays)) or 'nothing'}")
     return Fields(fields.path, inner)
-
-
-def _distortion(fields: Fields) -> tuple[Distortion, Array]:
-    name = str(fields.arrays["distortion_model"]) if "distortion_model" in fields else "none"
-    given = next((key for key in _COEFFICIENTS.split("|") if key in fields), None)
-    if given is None and name != "none" and name in _LENSES:
-        fields.require(_COEFFICIENTS)
-    if given is None:
-        return lens_of(str(fields.path), name, np.zeros(0))
-    return lens_of(str(fields.path), name, fields.vector(given), given)
 
 
 def lens_of(what: str, name: str, coefficients: Array, key: str = "distortion") -> tuple[Distortion, Array]:

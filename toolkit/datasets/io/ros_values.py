@@ -30,7 +30,7 @@ from toolkit.datasets.io.bag_reader import (
     Message,
     Topic,
 )
-from toolkit.datasets.io.euroc_calibration import NO_NOISE, kalibr_noise, lens_of, read_calibration
+from toolkit.datasets.io.euroc_calibration import AS_STATED, NO_NOISE, kalibr_noise, lens_of, read_calibration
 from toolkit.datasets.io.fields import camera_matrix
 from toolkit.datasets.io.image_pairs import pinhole_of
 from toolkit.errors import DataError, printable
@@ -65,7 +65,6 @@ _COLOURS |= {
 }
 _PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
 Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-_STATED = "the noise of the IMU is as its file states it"
 _PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
 
 
@@ -329,11 +328,11 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
     if T_imu_left is None or (source.chosen.imu is not None and source.body == left):
         raise DataError(_not_joined(source))
     pair, as_they_are, how = _pair(source)
-    stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
-    noise = () if twist else (NO_NOISE if stated is None else _STATED,)
+    stated = kalibr_noise(*_folders_beside(source.path))
+    noise = () if twist else (NO_NOISE if stated is None else AS_STATED,)
     tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
     notes = (f"calibration from {how} and {tf}", *noise)
-    return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)
+    return Mounted(pair, T_imu_left, twist or (stated[0] if stated else mems_imu()), notes, as_they_are)
 
 
 def _not_joined(source: Recorded) -> str:
