@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from toolkit.cli import main
 from toolkit.cli.arguments import TOPIC_ROLES
 from toolkit.datasets import load_images, load_sequence
+from toolkit.datasets.bags import ROLES
 from toolkit.datasets.io import bag_reader
-from toolkit.datasets.io.bag_reader import ROLES
 from toolkit.errors import DataError
 from toolkit.geometry import so3_exp
 from toolkit.measurements import ImuNoise

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from toolkit.datasets.io.ros_values import grey
+from toolkit.datasets.io.bag_reader import grey
 from toolkit.errors import DataError
 
 

@@ -252,7 +252,7 @@ def _seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
 
 
-# Repeated from toolkit.datasets.io.bag_reader (a test compares them), which would cost the help a third of a second.
+# Repeated from toolkit.datasets.bags (a test compares them), which would cost the help a third of a second.
 TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "accel", "twist", "truth")
 
 

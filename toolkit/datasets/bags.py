@@ -5,28 +5,44 @@ A ``.bag``, ``.mcap`` or ``.db3``, or the folder of a rosbag2. Topics are guesse
 
 Calibration is that beside the bag where there is any: Kalibr's camchain, or the sensor.yaml files of an ASL folder.
 Otherwise lenses and baseline are those of the CameraInfo messages, and the camera stands on the body where /tf_static
-has it. Poses of a truth are those of the IMU, or of a frame that /tf_static knows.
+has it. Poses of a truth are those of the IMU, or of a frame that /tf_static knows. Sources: REP 103 (camera axes), REP
+104 (rectified images; the P of a right camera's CameraInfo has the baseline), REP 105 (frames).
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.io import bag_reader, ros_values
-from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Chosen, Message, Topic, choose
-from toolkit.datasets.io.fields import check_frame_count, joined_imu
-from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, seen_in
-from toolkit.datasets.io.ros_values import Mounted, Recorded, mounted, recorded
+from toolkit.datasets.io import bag_reader as ros
+from toolkit.datasets.io.bag_reader import Bag, Message, Topic, Tree
+from toolkit.datasets.io.euroc_calibration import AS_STATED, NO_NOISE, kalibr_noise, lens_of, read_calibration
+from toolkit.datasets.io.fields import camera_matrix, check_frame_count, joined_imu
+from toolkit.datasets.io.image_pairs import Listed, images_only, pairs_of_asl, pinhole_of, seen_in
 from toolkit.datasets.io.truth import OF_POSITIONS, truth_near, with_truth
 from toolkit.datasets.trajectories.covariances import ROS, CovConvention, StatedCovariances
 from toolkit.datasets.trajectories.formats import PosesFile, checked_poses, known_poses, states_turns
 from toolkit.errors import DataError, no_such
-from toolkit.frontend import ImageRecording, StampedPair, matched_corners
+from toolkit.files.reading import is_regular
+from toolkit.frontend import (
+    Camera,
+    ImageRecording,
+    RectifiedPair,
+    StampedPair,
+    already_rectified,
+    matched_corners,
+    rectified,
+)
 from toolkit.frontend.cache import ImageSpool
-from toolkit.geometry import Array, IntArray
-from toolkit.measurements import NS_PER_S
+from toolkit.geometry import Array, IntArray, se3
+from toolkit.measurements import NS_PER_S, MotionNoise
+from toolkit.models.noise import mems_imu, twist_noise
 from toolkit.motion_samples import ImuSamples, MotionSamples, TwistSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Provenance, Truth
@@ -43,7 +59,7 @@ uses_images = images_only
 
 def recognises(path: Path) -> bool:
     """Say whether the path is a bag, from its first bytes or a folder's metadata.yaml."""
-    return bag_reader.kind_of(path) is not None
+    return ros.kind_of(path) is not None
 
 
 def load(path: Path) -> Recording:
@@ -55,8 +71,8 @@ def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs within the motion's time and their cameras; raises as :func:`load_from_images`."""
     spool = ImageSpool(str(path))
     with spool.errors_named():
-        filmed = _read(path, frontend, spool, SILENT)
-    return ImageRecording(filmed.pairs, filmed.mounted.pair, spool)
+        mounted, pairs = _read(path, frontend, spool, SILENT)[:2]
+    return ImageRecording(pairs, mounted.pair, spool)
 
 
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Recording:
@@ -67,38 +83,27 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
     spool = ImageSpool(str(path))
     try:
         with spool.errors_named():
-            read = _read(path, frontend, spool, progress)
-        filmed = ImageRecording(read.pairs, read.mounted.pair, spool)
-        seen = seen_in(path, filmed, read.mounted.T_imu_left, frontend, progress)
+            mounted, pairs, motion, truth, facts = _read(path, frontend, spool, progress)
+        seen = seen_in(path, ImageRecording(pairs, mounted.pair, spool), mounted.T_imu_left, frontend, progress)
     finally:
         spool.close()
-    facts = (*seen.facts, *read.remarks, *read.chosen.facts, *read.mounted.facts)
     sequence = Recording(
         name=path.resolve().stem,
         rig=seen.rig,
-        noise=read.mounted.noise,
+        noise=mounted.noise,
         frames_t_ns=seen.frames_t_ns,
         observations=seen.observations,
-        motion=read.motion,
-        provenance=Provenance("bags", f"{path}: stereo tracks from the images", facts),
+        motion=motion,
+        provenance=Provenance("bags", f"{path}: stereo tracks from the images", (*seen.facts, *facts)),
     )
-    return sequence if read.truth is None else with_truth(sequence, truth_near(read.truth, seen.frames_t_ns))
+    return sequence if truth is None else with_truth(sequence, truth_near(truth, seen.frames_t_ns))
 
 
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """What a bag holds; images are in the spool."""
-
-    chosen: Chosen
-    motion: MotionSamples
-    mounted: Mounted
-    pairs: tuple[StampedPair, ...]
-    truth: Truth | None
-    remarks: tuple[str, ...]
-
-
-def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress) -> _Read:
-    with bag_reader.opened(path) as bag:
+def _read(
+    path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress
+) -> tuple[Mounted, tuple[StampedPair, ...], MotionSamples, Truth | None, tuple[str, ...]]:
+    """Return the cameras, the image pairs (in the spool), the motion, the truth, and what to know of them."""
+    with ros.opened(path) as bag:
         chosen = choose(path, bag.topics, frontend.topics)
         source = recorded(bag, chosen)
         motion, how_moved = _motion_of(source)
@@ -111,8 +116,8 @@ def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress)
         raise DataError(f"{path}: {_why_no_pairs(chosen, listed, motion)}")
     check_frame_count(path, len(within.pairs))
     camera = _as_filmed(camera, within.pairs, frontend)
-    remarks = (*within.remarks, *unstamped, *how_moved, *whose)
-    return _Read(chosen, motion, camera, within.pairs, truth, remarks)
+    facts = (*within.remarks, *unstamped, *how_moved, *whose, *chosen.facts, *camera.facts)
+    return camera, within.pairs, motion, truth, facts
 
 
 def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
@@ -152,14 +157,14 @@ def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     topic, messages = source.chosen.truth, source.of(source.chosen.truth)
     if topic is None or not messages:
         return None, ()
-    t_ns, rows, values = ros_values.poses_of(messages, topic.type)
+    t_ns, rows, values = ros.poses_of(messages, topic.type)
     kept = known_poses(values)
     if not kept.any():
         return None, (f"no pose of {topic.name} is finite: it is left out, and there is no truth",)
     what, lost = Path(f"{source.path}: {topic.name}"), int((~kept).sum())
     T_world_child = checked_poses(what, rows[kept].tolist(), t_ns[kept], values[kept], "message")
     remarks = [f"{lost} of {kept.size} poses of {topic.name} are not finite and left out of the truth"] if lost else []
-    body, child = source.body, ros_values.frame_name(getattr(messages[0].value, "child_frame_id", ""))
+    body, child = source.body, ros.frame_name(getattr(messages[0].value, "child_frame_id", ""))
     T_child_body = source.tree.between(child, body)
     if not states_turns(values).any():
         remarks.append(f"{topic.name} states no orientation (quaternions of 0 or NaN): {OF_POSITIONS}")
@@ -182,14 +187,14 @@ def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progres
     total, unstamped = chosen.left.count + chosen.right.count, 0
     for done, message in enumerate(bag.messages(sides.keys())):
         what = f"{bag.path}: {message.topic}: message {done}"
-        t_ns = ros_values.stamp_ns(message.value.header, message.t_ns)
-        unstamped += not ros_values.is_stamped(message.value.header)
+        t_ns = ros.stamp_ns(message.value.header, message.t_ns)
+        unstamped += not ros.is_stamped(message.value.header)
         name = f"{sides[message.topic]}/data/{t_ns}"
-        if types[message.topic] == COMPRESSED:
-            ending, content = ros_values.image_file(message.value, what)
+        if types[message.topic] == ros.COMPRESSED:
+            ending, content = ros.image_file(message.value, what)
             spool.add(name + ending, content)
         else:
-            spool.add_grey(name, ros_values.grey(message.value, what))
+            spool.add_grey(name, ros.grey(message.value, what))
         progress.advance(done + 1, max(total, done + 1), "unpacking images")
     return (f"{unstamped} images have no stamp, and the time of recording is used",) if unstamped else ()
 
@@ -219,10 +224,10 @@ def _twists(source: Recorded) -> TwistSamples:
         raise DataError(f"{path}: {missing}; {remedy}")
     messages = _messages_of(source, topic)
     values = [message.value for message in messages]
-    linear, angular = (ros_values.columns(values, part) for part in ros_values.VECTORS[topic.type])
+    linear, angular = (ros.columns(values, part) for part in ros.VECTORS[topic.type])
     if not (linear.any() or angular.any()):
         raise DataError(f"{path}: {topic.name} states no twist (all are 0); name {_NAME_ANOTHER}")
-    return TwistSamples(ros_values.stamps_ns(messages), linear, angular)
+    return TwistSamples(ros.stamps_ns(messages), linear, angular)
 
 
 def _joined(source: Recorded, gyro: tuple[Topic, IntArray, Array], accel: Topic) -> tuple[ImuSamples, tuple[str, ...]]:
@@ -239,31 +244,452 @@ def _joined(source: Recorded, gyro: tuple[Topic, IntArray, Array], accel: Topic)
 
 
 def _messages_of(source: Recorded, topic: Topic) -> Sequence[Message]:
-    messages = source.of(topic)
-    if not messages:
-        raise DataError(f"{source.path}: {topic.name} has no message; name another topic with --topics")
-    return messages
+    if messages := source.of(topic):
+        return messages
+    raise DataError(f"{source.path}: {topic.name} has no message; name another topic with --topics")
 
 
 def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Array]:
     """Return stamps (N,) and what an Imu measures (N, 3)."""
     messages = _messages_of(source, topic)
-    part = ros_values.VECTORS[topic.type][what == "acceleration"]
-    values = ros_values.columns([message.value for message in messages], part)
-    covariance = getattr(messages[0].value, f"{part}_covariance")
-    if not values.any() or float(np.asarray(covariance).ravel()[0]) == -1.0:
+    part = ros.VECTORS[topic.type][what == "acceleration"]
+    values = ros.columns([message.value for message in messages], part)
+    # A covariance of -1 says that a value is absent.
+    if not values.any() or getattr(messages[0].value, f"{part}_covariance").ravel()[0] == -1.0:
         apart = "the accelerometer's topic with --topics accel=TOPIC, " if what == "acceleration" else ""
         raise DataError(
             f"{source.path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}"
             f"{_NAME_ANOTHER}"
         )
-    return ros_values.stamps_ns(messages), values
+    return ros.stamps_ns(messages), values
+
+
+# Roles of topics -----------------------------------------------------------------------------------------------------
+
+_IMAGES, _TRUTHS = (ros.IMAGE, ros.COMPRESSED), (ros.ODOMETRY, ros.POSE, ros.POSE_COV, ros.TRANSFORM)
+ROLES: dict[str, tuple[str, ...]] = {
+    "left": _IMAGES,
+    "right": _IMAGES,
+    "left_info": (ros.CAMERA_INFO,),
+    "right_info": (ros.CAMERA_INFO,),
+    "imu": (ros.IMU,),
+    "accel": (ros.IMU,),
+    "twist": (ros.ODOMETRY, ros.TWIST, ros.TWIST_COV),
+    # A point is taken for a truth only where it is said: it may be a goal.
+    "truth": (*_TRUTHS, ros.POINT),
+}
+# Of a sensor that publishes both by themselves, as RealSense's cameras do.
+_GYRO, _ACCEL = "gyro", "accel"
+# In the name of a topic whose poses are a truth, and not another system's estimate.
+_OF_TRUTH = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "vrpn", "leica")
+_STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
+# Of a message that lists the topics of a bag, which may be hundreds.
+_LONGEST = 900
+_COMPRESSED_SUFFIX = "/compressed"
+# What names and definitions of other types have that measure motion, or hold images.
+_LIKE_IMU = re.compile(r"gyro|accelerometer|angular_velocity|(^|[^a-z])imu", re.IGNORECASE)
+_LIKE_IMAGES = re.compile(r"ffmpeg|image|video|theora|h264|h265", re.IGNORECASE)
+# The topics asked for by role, None of a truth that is left out.
+Given = dict[str, Topic | None]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The topics of a recording by role, None where there is none, and remarks on the choice.
+
+    ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
+    transforms that may change, ``other_imus`` those that were not chosen, and ``like_imus`` those of types that are not
+    read.
+    """
+
+    left: Topic
+    right: Topic
+    left_info: Topic | None
+    right_info: Topic | None
+    imu: Topic | None
+    accel: Topic | None
+    twist: Topic | None
+    truth: Topic | None
+    transforms: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
+    other_imus: tuple[str, ...]
+    other_twists: tuple[str, ...]
+    like_imus: tuple[str, ...] = ()
+    facts: tuple[str, ...] = ()
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images come rectified, as ROS says it in the last words of a topic's name."""
+        return any(_RECTIFIED in word for word in self.left.name.split("/")[-2:])
+
+
+def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
+    """Return the topics by role; raises DataError where a requested one, or a pair of images, is missing."""
+    given = _requested(path, topics, requested)
+    usable = [topic for topic in topics if topic.type in ros.KNOWN_TYPES and not topic.unreadable and topic.count]
+    left, right = _stereo(path, topics, usable, given)
+    truth = given.get("truth", _truth_topic(usable))
+    imus = _of_types(usable, (ros.IMU,))
+    imu = given.get("imu") or (None if "twist" in given else _imu(imus))
+    accel = given.get("accel") or _partner(imu, imus)
+    odometry = [topic for topic in _of_types(usable, (ros.ODOMETRY,)) if topic != truth]
+    chosen = Chosen(
+        left=left,
+        right=right,
+        left_info=given.get("left_info") or _info(usable, left),
+        right_info=given.get("right_info") or _info(usable, right),
+        imu=imu,
+        accel=accel,
+        twist=given.get("twist") or (None if imu else _most(odometry)),
+        truth=truth,
+        transforms=tuple(topic for topic in _of_types(usable, ros.TRANSFORMS) if topic.name.endswith(_STATIC)),
+        moving=tuple(topic for topic in _of_types(usable, ros.TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
+        other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
+        other_twists=tuple(topic.name for topic in _of_types(usable, ROLES["twist"])),
+        like_imus=tuple(
+            str(one) for one in topics if one.is_like(_LIKE_IMU) or (one.type == ros.IMU and one.unreadable)
+        ),
+    )
+    return replace(chosen, facts=_facts(topics, chosen, given))
+
+
+def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Given:
+    """Return the topics asked for by role, as in left=/cam0/image_raw,imu=/imu0; None of a truth that is left out."""
+    by_name = {topic.name: topic for topic in topics}
+    given: Given = {}
+    for part in filter(None, (text.strip() for text in (requested or "").split(","))):
+        role, equals, name = (text.strip() for text in part.partition("="))
+        if not equals or role not in ROLES:
+            raise DataError(f"--topics: {no_such('role', role, ROLES)}; write left=/cam0/image_raw,right=...,imu=...")
+        if (role, name) == ("truth", "none"):
+            given[role] = None
+            continue
+        if name not in by_name:
+            raise DataError(f"{path}: {no_such('topic', name, by_name)}"[:_LONGEST])
+        topic = by_name[name]
+        if topic.type not in ROLES[role] or topic.unreadable:
+            wanted = " or ".join(kind.replace("/msg/", "/") for kind in ROLES[role])
+            raise DataError(f"{path}: {topic} cannot be {role}, which is {wanted}")
+        if role in given:
+            raise DataError(f"{path}: --topics names {role} twice; leave one out")
+        given[role] = topic
+    for left, right in (("left", "right"), ("left_info", "right_info")):
+        same = given.get(left)
+        if same is not None and same == given.get(right):
+            raise DataError(f"{path}: --topics names {same.name} as {left} and {right}; a pair has a topic each")
+    return given
+
+
+def _stereo(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
+    left, right = given.get("left"), given.get("right")
+    if left is not None and right is not None:
+        return left, right
+    images = [topic for topic in _of_types(usable, _IMAGES) if topic.count >= _LEAST_IMAGES]
+    pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
+    pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
+    if not pairs:
+        raise DataError(_no_pair(path, topics, images))
+    # Rectified images need no calibration of a lens; of raw and compressed ones raw ones are whole.
+    return min(
+        pairs,
+        key=lambda pair: (_RECTIFIED not in pair[0].name, pair[0].type != ros.IMAGE, -pair[0].count, pair[0].name),
+    )
+
+
+def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
+    there = ", ".join(map(str, topics)) or "no topics"
+    if not images:
+        why = "holds no images that can be read, and the tracks are made of them"
+        packed = [str(topic) for topic in topics if topic.is_like(_LIKE_IMAGES)]
+        if packed:
+            may = f"{' and '.join(packed)} may hold some"
+            why += f"; {may}: write them as sensor_msgs/Image with image_transport republish"
+    elif len(images) == 1:
+        why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
+    else:
+        why = "no two topics of images are a stereo pair by their names; name them with --topics left=TOPIC,right=TOPIC"
+    return f"{path}: {why}; there are {there}"[:_LONGEST]
+
+
+def _alone(word: str) -> str:
+    """Return the pattern of a word as a word of its own, letters and digits apart."""
+    same_kind = r"\d" if word.isdigit() else r"[^\W\d_]"
+    return rf"(?<!{same_kind}){word}(?!{same_kind})"
+
+
+# What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
+_SIDES = ((_alone("0"), "1"), (_alone("1"), "2"), (_alone("l"), "r"), ("left", "right"), ("Left", "Right"))
+
+
+def _differ_by(one: str, two: str, pattern: str, other: str) -> bool:
+    """Say whether a name becomes another where one place that a pattern fits is exchanged."""
+    return two in (one[: at.start()] + other + one[at.end() :] for at in re.finditer(pattern, one))
+
+
+def _are_sides(one: str, two: str) -> bool:
+    """Say whether two names differ in nothing but the side of a pair, the left one first."""
+    return any(_differ_by(one, two, left, right) for left, right in _SIDES)
+
+
+def _imu(imus: Sequence[Topic]) -> Topic | None:
+    """Return the IMU with the most messages; gyros whose accelerometers publish by themselves only for want of one."""
+    gyros = [topic for topic in imus if _partner(topic, imus)]
+    halves = {topic for gyro in gyros for topic in (gyro, _partner(gyro, imus))}
+    return _most(topic for topic in imus if topic not in halves) or _most(gyros)
+
+
+def _partner(gyro: Topic | None, imus: Sequence[Topic]) -> Topic | None:
+    """Return the accelerometer that has the name of a gyro but for that word."""
+    name = "" if gyro is None else gyro.name.lower()
+    return next((topic for topic in imus if _differ_by(name, topic.name.lower(), _alone(_GYRO), _ACCEL)), None)
+
+
+def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
+    """Return the calibration that stands beside a topic of images, as ROS names it: in the same namespace."""
+    base = image.name.removesuffix(_COMPRESSED_SUFFIX)
+    infos = {topic.name: topic for topic in _of_types(usable, (ros.CAMERA_INFO,))}
+    namespace = base
+    while namespace:
+        namespace = namespace.rpartition("/")[0]
+        for name in (f"{namespace}/camera_info", f"{namespace}/info/camera_info"):
+            if name in infos:
+                return infos[name]
+    return None
+
+
+def _truth_topic(usable: Sequence[Topic]) -> Topic | None:
+    words = re.compile("|".join(map(_alone, _OF_TRUTH)), re.IGNORECASE)
+    return _most(topic for topic in _of_types(usable, _TRUTHS) if words.search(topic.name))
+
+
+def _of_types(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:
+    return [topic for topic in topics if topic.type in types]
+
+
+def _most(topics: Iterable[Topic]) -> Topic | None:
+    """Return the topic with the most messages, the first by name of several."""
+    return max(sorted(topics, key=lambda topic: topic.name), key=lambda topic: topic.count, default=None)
+
+
+def _facts(topics: Sequence[Topic], chosen: Chosen, given: Given) -> tuple[str, ...]:
+    found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
+    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
+    used = {topic.name for topic in (*found.values(), *chosen.transforms)}
+    left_out = [str(topic) for topic in topics if topic.name not in used]
+    facts = [f"topics: {', '.join(named)}"]
+    if left_out:
+        facts.append(f"topics not used: {', '.join(left_out)}")
+    return tuple(facts)
+
+
+# Calibration ---------------------------------------------------------------------------------------------------------
+
+_PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
+
+
+def camera(info: Any, what: str) -> Camera:
+    """Return the camera of a CameraInfo; raises DataError where it is not calibrated or its lens is not known."""
+    K, coefficients = _field(info, "K").reshape(3, 3), _field(info, "D")
+    if not (K.any() and np.isfinite(K).all() and info.width and info.height):
+        raise DataError(f"{what}: is not calibrated (K is zero or the size is missing); {_PUT_BESIDE}")
+    name = str(info.distortion_model) if coefficients.any() else "none"
+    model, coefficients = lens_of(what, name or "none", coefficients)
+    return Camera(pinhole_of(camera_matrix(Path(what), "K", K)), model, coefficients, _size(info))
+
+
+def _field(info: Any, name: str) -> Array:
+    """Return a field of a CameraInfo, which ROS 1 writes large and ROS 2 small."""
+    return np.asarray(getattr(info, name if hasattr(info, name) else name.lower()), dtype=np.float64)
+
+
+def _size(info: Any) -> tuple[int, int]:
+    return int(info.width), int(info.height)
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """The pair of cameras, where the left one stands on the body, the motion's noise, and where all this is from.
+
+    ``as_they_are`` is the pair that images make which come rectified already, where that is possible; ``shift_s`` is
+    added to the stamps of images.
+    """
+
+    pair: RectifiedPair
+    T_imu_left: Array
+    noise: MotionNoise
+    facts: tuple[str, ...]
+    as_they_are: RectifiedPair | None = None
+    shift_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What a bag holds but its images: messages by topic, of cameras the first, and the fixed transforms.
+
+    ``in_tf`` says that /tf connects the frames of body and camera, and not /tf_static.
+    """
+
+    path: Path
+    chosen: Chosen
+    held: Mapping[str, Sequence[Message]]
+    tree: Tree
+    in_tf: bool = False
+
+    def of(self, topic: Topic | None) -> Sequence[Message]:
+        """Return the messages of a topic in the order of recording; none where there is no such topic."""
+        return () if topic is None else self.held.get(topic.name, ())
+
+    def frame_of(self, topic: Topic | None, *, of_child: bool = False) -> str:
+        """Return the frame of a topic's first message; of an odometry that of the child, which its twist is in."""
+        if not self.of(topic):
+            return ""
+        value = self.of(topic)[0].value
+        child = getattr(value, "child_frame_id", "") if of_child else ""
+        return ros.frame_name(child or value.header.frame_id)
+
+    @property
+    def body(self) -> str:
+        """The frame of the IMU, or the one whose twists are measured."""
+        imu = self.chosen.imu
+        return self.frame_of(self.chosen.twist, of_child=True) if imu is None else self.frame_of(imu)
+
+    @property
+    def T_imu_left(self) -> Array | None:
+        """Where the left camera stands on the body, None where no transform says it."""
+        return self.tree.between(self.body, self.frame_of(self.chosen.left))
+
+
+def recorded(bag: Bag, chosen: Chosen) -> Recorded:
+    """Read what a bag holds but its images; /tf is read where /tf_static does not join the body and the camera."""
+    wanted = (chosen.imu, chosen.accel, chosen.twist, chosen.truth, *chosen.transforms)
+    held: dict[str, list[Message]] = {}
+    for message in bag.messages({topic.name for topic in wanted if topic is not None}):
+        held.setdefault(message.topic, []).append(message)
+    for topic in (chosen.left_info, chosen.right_info, chosen.left, chosen.right):
+        if topic is not None:
+            held[topic.name] = list(islice(bag.messages({topic.name}), 1))
+    static = [one for topic in chosen.transforms for message in held.get(topic.name, ()) for one in _joints(message)]
+    found = Recorded(bag.path, chosen, held, Tree(static))
+    if not chosen.moving or found.T_imu_left is not None:
+        return found
+    moving = (one for message in bag.messages({topic.name for topic in chosen.moving}) for one in _joints(message))
+    by_tf = replace(found, tree=Tree([*ros.fixed(moving), *static]), in_tf=True)
+    return found if by_tf.T_imu_left is None else by_tf
+
+
+def _joints(message: Message) -> Sequence[Any]:
+    transforms: Sequence[Any] = message.value.transforms
+    return transforms
+
+
+def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
+    """Return the calibration: from files beside the bag, or from its own messages.
+
+    Raises DataError where there is none, it is incomplete, or the pose of the camera on the body is unknown.
+    """
+    folder = _calibration_folder(source.path)
+    twist = twist_noise(motion.t_ns, motion.v_mps, motion.w_radps) if isinstance(motion, TwistSamples) else None
+    if folder is not None:
+        root, mav0 = folder
+        calibration = read_calibration(root, mav0)
+        if calibration.cameras is None:
+            raise DataError(f"{mav0}: the calibration lacks distortion_model or intrinsics of a camera; add them")
+        pair = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
+        noise = () if twist else (calibration.noise_source,)
+        notes = (f"{calibration.source}, beside the bag", *noise, *calibration.shifted, *calibration.unused)
+        return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes, shift_s=calibration.shift_s)
+    T_imu_left, left = source.T_imu_left, source.frame_of(source.chosen.left)
+    # An IMU does not have the axes of a camera: if both name the same frame, the name is wrong for one of them.
+    if T_imu_left is None or (source.chosen.imu is not None and source.body == left):
+        raise DataError(_not_joined(source))
+    pair, as_they_are, how = _pair(source)
+    stated = kalibr_noise(*_folders_beside(source.path))
+    noise = () if twist else (NO_NOISE if stated is None else AS_STATED,)
+    tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
+    notes = (f"calibration from {how} and {tf}", *noise)
+    return Mounted(pair, T_imu_left, twist or (stated[0] if stated else mems_imu()), notes, as_they_are)
+
+
+def _not_joined(source: Recorded) -> str:
+    others = ", ".join(source.chosen.other_imus)
+    other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
+    tf = "/tf_static and no fixed transform of /tf" if source.chosen.moving else "/tf_static"
+    return (
+        f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
+        f"{source.body!r} and {source.frame_of(source.chosen.left)!r}; {_PUT_BESIDE}{other}"
+    )
+
+
+def _calibration_folder(path: Path) -> tuple[Path, Path] | None:
+    """Return the folder of calibration files beside a bag, or in the folder that it is, and that of its sensors."""
+    for root in _folders_beside(path):
+        if any(root.glob("*camchain*.yaml")):
+            return root, root
+        for mav0 in (root, root / "mav0"):
+            if is_regular(mav0 / "cam0/sensor.yaml"):
+                return root, mav0
+    return None
+
+
+def _folders_beside(path: Path) -> tuple[Path, ...]:
+    """Return where files about a bag may lie: in the folder that it is, and in that where it is."""
+    resolved = path.resolve()
+    return (resolved, resolved.parent) if resolved.is_dir() else (resolved.parent,)
+
+
+def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
+    """Return the pair of cameras of the CameraInfo messages, that of images which come rectified, and the topics."""
+    topics, infos = _infos(source)
+    what, size_px = [f"{source.path}: {topic.name}" for topic in topics], _size(infos[0])
+    how = " and ".join(topic.name for topic in topics)
+    turns, projections = ([_field(info, name).reshape(3, -1) for info in infos] for name in "RP")
+    R_rect_left, R_rect_right = (R if R.any() else np.eye(3) for R in turns)
+    # How far right each camera is of the origin of the rectified axes; 0 where nothing is stated.
+    left_m, right_m = (-float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0 for P in projections)
+    pinhole_px, baseline_m = pinhole_of(projections[0]), right_m - left_m
+    T_right_left = source.tree.between(*(source.frame_of(one) for one in (source.chosen.right, source.chosen.left)))
+    if source.chosen.rectified:
+        if not baseline_m > 0.0 and T_right_left is not None:
+            baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
+        if not (baseline_m > 0.0 and pinhole_px[0] > 0.0):
+            lacks = "no baseline (Tx is 0), and no /tf_static joins the two cameras"
+            lacks = lacks if pinhole_px[0] > 0.0 else "no focal length"
+            raise DataError(
+                f"{what[1]}: the images are rectified, and P states {lacks}; correct P, or {_PUT_BESIDE} and name the "
+                "raw images"
+            )
+        # The frame of an image is the camera's own; R turns it into the rectified one's.
+        return replace(already_rectified(pinhole_px, baseline_m, size_px), R_rect_cam=R_rect_left), None, how
+    left, right = (camera(info, text) for info, text in zip(infos, what, strict=True))
+    as_they_are = None
+    if baseline_m > 0.0:
+        # In rectified axes the right camera stands on x; R turns each camera's own axes into them.
+        T_right_left = se3(R_rect_right.T @ R_rect_left, R_rect_right.T @ np.array([-baseline_m, 0.0, 0.0]))
+        as_they_are = already_rectified(pinhole_px, baseline_m, size_px)
+    if T_right_left is None:
+        raise DataError(f"{what[1]}: P has no baseline, and /tf_static does not join the two cameras; {_PUT_BESIDE}")
+    return rectified(left, right, T_right_left, f"{source.path}: {how}"), as_they_are, how
+
+
+def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
+    """Return the topics of both calibrations and their first messages; raises DataError where one is missing."""
+    chosen, topics, infos = source.chosen, [], []
+    for image, topic in ((chosen.left, chosen.left_info), (chosen.right, chosen.right_info)):
+        messages = source.of(topic)
+        if topic is None or not messages:
+            raise DataError(
+                f"{source.path}: there is no sensor_msgs/CameraInfo beside {image.name}; name it with --topics "
+                f"left_info=TOPIC,right_info=TOPIC, or {_PUT_BESIDE}"
+            )
+        infos.append(messages[0].value)
+        topics.append(topic)
+    return topics, infos
 
 
 # Trajectories --------------------------------------------------------------------------------------------------------
 
-_WITH_COVARIANCES = (bag_reader.ODOMETRY, bag_reader.POSE_COV)
-_OF_POSES = (*_WITH_COVARIANCES, bag_reader.POSE, bag_reader.TRANSFORM)
+_WITH_COVARIANCES = (ros.ODOMETRY, ros.POSE_COV)
+_OF_POSES = (*_WITH_COVARIANCES, ros.POSE, ros.TRANSFORM)
 
 
 def read_topic(path: Path, name: str | None, cov_convention: CovConvention | None = None) -> PosesFile:
@@ -273,10 +699,10 @@ def read_topic(path: Path, name: str | None, cov_convention: CovConvention | Non
     programs that write theirs into ROS's messages. Raises DataError where the bag is damaged, rosbags is not installed,
     or it has no such topic.
     """
-    with bag_reader.opened(path) as bag:
+    with ros.opened(path) as bag:
         topic = _topic_of_poses(path, bag.topics, name)
         messages = list(bag.messages({topic.name}))
-    t_ns, rows, values = ros_values.poses_of(messages, topic.type)
+    t_ns, rows, values = ros.poses_of(messages, topic.type)
     T_world_body = checked_poses(Path(f"{path}: {topic.name}"), rows.tolist(), t_ns, values)
     stated = None
     if topic.type in _WITH_COVARIANCES:

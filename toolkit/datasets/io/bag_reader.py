@@ -1,25 +1,32 @@
-"""The interface to the rosbags library: the kind of a bag, its topics and their roles, and its messages, one by one.
+"""The interface to the rosbags library: the kind of a bag, its topics, its messages one by one, and what they hold.
 
 Messages are read with the library's own definitions of ROS's types and never with those in a bag, because code is
 generated from definitions. Any error that a damaged bag makes the library raise becomes a DataError. Formats:
 http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2.
-Topics get their roles as given with ``--topics``, else guessed from types and names.
+Values: the definitions of sensor_msgs, geometry_msgs and nav_msgs, whose stamps, grey images, poses and tree of fixed
+transforms (REP 105) are read.
 """
 
 import heapq
 import importlib.util
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from toolkit.errors import DataError, VislamError, no_such, printable
+import numpy as np
+import numpy.typing as npt
+
+from toolkit.errors import DataError, VislamError, printable
 from toolkit.files.reading import is_regular, open_input
+from toolkit.geometry import Array, IntArray, rotation_from_quaternion, se3, se3_inverse
+from toolkit.measurements import NS_PER_S
 
 Kind = Literal["ros1", "mcap", "sqlite", "folder"]
 _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}
@@ -49,29 +56,7 @@ POINT = "geometry_msgs/msg/PointStamped"
 KNOWN_TYPES = frozenset(
     {IMAGE, COMPRESSED, CAMERA_INFO, IMU, *TRANSFORMS, ODOMETRY, TWIST, TWIST_COV, POSE, POSE_COV, TRANSFORM, POINT}
 )
-_IMAGES, _POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE, POSE_COV, TRANSFORM)
-ROLES: dict[str, tuple[str, ...]] = {
-    "left": _IMAGES,
-    "right": _IMAGES,
-    "left_info": (CAMERA_INFO,),
-    "right_info": (CAMERA_INFO,),
-    "imu": (IMU,),
-    "accel": (IMU,),
-    "twist": (ODOMETRY, TWIST, TWIST_COV),
-    # A point is taken for a truth only where it is said: it may be a goal.
-    "truth": (*_POSES, POINT),
-}
-# Of a sensor that publishes both by themselves, as RealSense's cameras do.
-_GYRO, _ACCEL = "gyro", "accel"
-# In the name of a topic whose poses are a truth, and not another system's estimate.
-_OF_TRUTH = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "vrpn", "leica")
-_STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
-# Of a message that lists the topics of a bag, which may be hundreds.
-_LONGEST = 900
-_COMPRESSED_SUFFIX = "/compressed"
-# What names and definitions of other types have that measure motion, or hold images, and types that do neither.
-_LIKE_IMU = re.compile(r"gyro|accelerometer|angular_velocity|(^|[^a-z])imu", re.IGNORECASE)
-_LIKE_IMAGES = re.compile(r"ffmpeg|image|video|theora|h264|h265", re.IGNORECASE)
+# Types that neither measure motion nor hold images.
 _OF_ROS = (
     "rcl_interfaces/",
     "rosgraph_msgs/",
@@ -81,7 +66,6 @@ _OF_ROS = (
     "nav_msgs/",
     "geometry_msgs/",
 )
-_NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -105,10 +89,6 @@ class Topic:
     def __str__(self) -> str:
         why = f", {self.unreadable}" if self.unreadable else ""
         return f"{printable(self.name)} ({printable(self.type).replace('/msg/', '/')}{why})"
-
-
-# The topics asked for by role, None of a truth that is left out.
-Given = dict[str, Topic | None]
 
 
 class Message(NamedTuple):
@@ -286,190 +266,170 @@ def _guarded(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {remedy}") from error
 
 
-# Roles of topics -----------------------------------------------------------------------------------------------------
+# Values of messages ---------------------------------------------------------------------------------------------------
+
+# Of the planar encodings the first plane is the brightness.
+_GREY = {
+    **dict.fromkeys(("mono8", "8UC1", "nv12", "nv21", "nv24", "i420"), np.uint8),
+    **dict.fromkeys(("mono16", "16UC1"), np.uint16),
+}
+# Channels, and OpenCV's conversion; it names a pattern of Bayer by its second row, ROS by its first. Names that end in
+# 16 are of 16 bits.
+_COLOURS = {
+    "rgb8": (3, "COLOR_RGB2GRAY"),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, "COLOR_BGR2GRAY")),
+    "rgba8": (4, "COLOR_RGBA2GRAY"),
+    "bgra8": (4, "COLOR_BGRA2GRAY"),
+    "bayer_rggb8": (1, "COLOR_BayerBG2GRAY"),
+    "bayer_bggr8": (1, "COLOR_BayerRG2GRAY"),
+    "bayer_gbrg8": (1, "COLOR_BayerGR2GRAY"),
+    "bayer_grbg8": (1, "COLOR_BayerGB2GRAY"),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, "COLOR_YUV2GRAY_UYVY")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "COLOR_YUV2GRAY_YUY2")),
+}
+_COLOURS |= {
+    f"{name.removesuffix('8')}16": what for name, what in _COLOURS.items() if name.startswith(("rgb", "bgr", "bayer"))
+}
+_PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
+Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """The topics of a recording by role, None where there is none, and remarks on the choice.
+def stamp_ns(header: Any, recorded_ns: int) -> int:
+    """Return the stamp of a header; where it has none, when the message was recorded."""
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec) if is_stamped(header) else recorded_ns
 
-    ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
-    transforms that may change, ``other_imus`` those that were not chosen, and ``like_imus`` those of types that are not
-    read.
+
+def is_stamped(header: Any) -> bool:
+    """Say whether a header has a stamp."""
+    return bool(header.stamp.sec or header.stamp.nanosec)
+
+
+def stamps_ns(messages: Sequence[Message]) -> IntArray:
+    """Return the stamps (N,) of messages as :func:`stamp_ns`."""
+    return np.array([stamp_ns(message.value.header, message.t_ns) for message in messages], dtype=np.int64)
+
+
+def grey(message: Any, what: str) -> Grey:
+    """Return the grey values (height, width) of an Image; raises DataError where its encoding or size cannot be."""
+    encoding, height, width = str(message.encoding), int(message.height), int(message.width)
+    if encoding in _GREY:
+        return _rows(message, what, height, width, 1, np.dtype(_GREY[encoding]))[..., 0]
+    if encoding not in _COLOURS:
+        known = ", ".join((*_GREY, *_COLOURS))
+        raise DataError(f"{what}: images are encoded as {printable(encoding)[:50] or 'nothing'}; there are {known}")
+    import cv2
+
+    channels, conversion = _COLOURS[encoding]
+    dtype = np.dtype(np.uint16 if encoding.endswith("16") else np.uint8)
+    raw = np.ascontiguousarray(_rows(message, what, height, width, channels, dtype), dtype=dtype)
+    return np.asarray(cv2.cvtColor(raw, getattr(cv2, conversion)), dtype=dtype)
+
+
+def _rows(message: Any, what: str, height: int, width: int, channels: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Return pixels (height, width, channels) of an image whose rows may be longer than they."""
+    step, row = int(message.step), width * channels * dtype.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not (height > 0 and width > 0 and step >= row and data.size >= height * step):
+        raise DataError(
+            f"{what}: an image of {width}x{height} px has {data.size} bytes in rows of {step}; it is cut off"
+        )
+    pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
+    return pixels.view(dtype.newbyteorder(">" if message.is_bigendian else "<")).reshape(height, width, channels)
+
+
+def image_file(message: Any, what: str) -> tuple[str, bytes]:
+    """Return the ending and the content of the file that a CompressedImage is; raises DataError where it is none.
+
+    One without content is returned as it is: the front end names it, and leaves it out where others are sound.
     """
-
-    left: Topic
-    right: Topic
-    left_info: Topic | None
-    right_info: Topic | None
-    imu: Topic | None
-    accel: Topic | None
-    twist: Topic | None
-    truth: Topic | None
-    transforms: tuple[Topic, ...]
-    moving: tuple[Topic, ...]
-    other_imus: tuple[str, ...]
-    other_twists: tuple[str, ...]
-    like_imus: tuple[str, ...] = ()
-    facts: tuple[str, ...] = ()
-
-    @property
-    def rectified(self) -> bool:
-        """Whether the images come rectified, as ROS says it in the last words of a topic's name."""
-        return any(_RECTIFIED in word for word in self.left.name.split("/")[-2:])
-
-
-def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
-    """Return the topics by role; raises DataError where a requested one, or a pair of images, is missing."""
-    given = _requested(path, topics, requested)
-    usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
-    left, right = _pair(path, topics, usable, given)
-    truth = given.get("truth", _truth(usable))
-    imus = _of_types(usable, (IMU,))
-    imu = given.get("imu") or (None if "twist" in given else _imu(imus))
-    accel = given.get("accel") or _partner(imu, imus)
-    odometry = [topic for topic in _of_types(usable, (ODOMETRY,)) if topic != truth]
-    chosen = Chosen(
-        left=left,
-        right=right,
-        left_info=given.get("left_info") or _info(usable, left),
-        right_info=given.get("right_info") or _info(usable, right),
-        imu=imu,
-        accel=accel,
-        twist=given.get("twist") or (None if imu else _most(odometry)),
-        truth=truth,
-        transforms=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.endswith(_STATIC)),
-        moving=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
-        other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
-        other_twists=tuple(topic.name for topic in _of_types(usable, ROLES["twist"])),
-        like_imus=tuple(str(one) for one in topics if one.is_like(_LIKE_IMU) or (one.type == IMU and one.unreadable)),
-    )
-    return replace(chosen, facts=_facts(topics, chosen, given))
-
-
-def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Given:
-    """Return the topics asked for by role, as in left=/cam0/image_raw,imu=/imu0; None of a truth that is left out."""
-    by_name = {topic.name: topic for topic in topics}
-    given: Given = {}
-    for part in filter(None, (text.strip() for text in (requested or "").split(","))):
-        role, equals, name = (text.strip() for text in part.partition("="))
-        if not equals or role not in ROLES:
-            raise DataError(f"--topics: {no_such('role', role, ROLES)}; write left=/cam0/image_raw,right=...,imu=...")
-        if (role, name) == ("truth", _NONE):
-            given[role] = None
-            continue
-        if name not in by_name:
-            raise DataError(f"{path}: {no_such('topic', name, by_name)}"[:_LONGEST])
-        topic = by_name[name]
-        if topic.type not in ROLES[role] or topic.unreadable:
-            wanted = " or ".join(kind.replace("/msg/", "/") for kind in ROLES[role])
-            raise DataError(f"{path}: {topic} cannot be {role}, which is {wanted}")
-        if role in given:
-            raise DataError(f"{path}: --topics names {role} twice; leave one out")
-        given[role] = topic
-    for left, right in (("left", "right"), ("left_info", "right_info")):
-        same = given.get(left)
-        if same is not None and same == given.get(right):
-            raise DataError(f"{path}: --topics names {same.name} as {left} and {right}; a pair has a topic each")
-    return given
-
-
-def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
-    left, right = given.get("left"), given.get("right")
-    if left is not None and right is not None:
-        return left, right
-    images = [topic for topic in _of_types(usable, _IMAGES) if topic.count >= _LEAST_IMAGES]
-    pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
-    pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
-    if not pairs:
-        raise DataError(_no_pair(path, topics, images))
-    # Rectified images need no calibration of a lens; of raw and compressed ones raw ones are whole.
-    return min(
-        pairs, key=lambda pair: (_RECTIFIED not in pair[0].name, pair[0].type != IMAGE, -pair[0].count, pair[0].name)
+    content = bytes(message.data)
+    if content.startswith(_PNG) or not content:
+        return ".png", content
+    if content.startswith(_JPEG):
+        return ".jpg", content
+    raise DataError(
+        f"{what}: compressed images are {printable(str(message.format))[:50]}, expected PNG or JPEG; republish them as "
+        "one of these, or as raw images"
     )
 
 
-def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
-    there = ", ".join(map(str, topics)) or "no topics"
-    if not images:
-        why = "holds no images that can be read, and the tracks are made of them"
-        packed = [str(topic) for topic in topics if topic.is_like(_LIKE_IMAGES)]
-        if packed:
-            may = f"{' and '.join(packed)} may hold some"
-            why += f"; {may}: write them as sensor_msgs/Image with image_transport republish"
-    elif len(images) == 1:
-        why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
-    else:
-        why = "no two topics of images are a stereo pair by their names; name them with --topics left=TOPIC,right=TOPIC"
-    return f"{path}: {why}; there are {there}"[:_LONGEST]
+# Where messages have their vectors, by type: of an IMU rates and specific force, of others linear and angular velocity.
+VECTORS = {
+    IMU: ("angular_velocity", "linear_acceleration"),
+    ODOMETRY: ("twist.twist.linear", "twist.twist.angular"),
+    TWIST: ("twist.linear", "twist.angular"),
+    TWIST_COV: ("twist.twist.linear", "twist.twist.angular"),
+}
+_POSES = {
+    ODOMETRY: ("pose.pose.position", "pose.pose.orientation"),
+    POSE: ("pose.position", "pose.orientation"),
+    POSE_COV: ("pose.pose.position", "pose.pose.orientation"),
+    TRANSFORM: ("transform.translation", "transform.rotation"),
+}
 
 
-def _alone(word: str) -> str:
-    """Return the pattern of a word as a word of its own, letters and digits apart."""
-    same_kind = r"\d" if word.isdigit() else r"[^\W\d_]"
-    return rf"(?<!{same_kind}){word}(?!{same_kind})"
+def columns(values: Sequence[Any], part: str, axes: str = "xyz") -> Array:
+    """Return a part of messages (N, 3), or a quaternion (N, 4) with the axes xyzw."""
+    get = attrgetter(*(f"{part}.{axis}" for axis in axes))
+    return np.array([get(value) for value in values], dtype=np.float64).reshape(-1, len(axes))
 
 
-# What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
-_SIDES = ((_alone("0"), "1"), (_alone("1"), "2"), (_alone("l"), "r"), ("left", "right"), ("Left", "Right"))
+def poses_of(messages: Sequence[Message], message_type: str) -> tuple[IntArray, IntArray, Array]:
+    """Return stamps (N,) ns, each once and in order, of which message each is, and x y z qx qy qz qw (N, 7).
+
+    A point's quaternion is NaN.
+    """
+    t_ns, rows = np.unique(stamps_ns(messages), return_index=True)
+    values = [messages[row].value for row in rows.tolist()]
+    if message_type == POINT:
+        return t_ns, rows, np.hstack([columns(values, "point"), np.full((len(values), 4), np.nan)])
+    at, turn = _POSES[message_type]
+    return t_ns, rows, np.hstack([columns(values, at), columns(values, turn, "xyzw")])
 
 
-def _differ_by(one: str, two: str, pattern: str, other: str) -> bool:
-    """Say whether a name becomes another where one place that a pattern fits is exchanged."""
-    return two in (one[: at.start()] + other + one[at.end() :] for at in re.finditer(pattern, one))
+def frame_name(name: Any) -> str:
+    """Return the name of a frame without the slash that ROS 1 may write before it."""
+    return str(name).lstrip("/")
 
 
-def _are_sides(one: str, two: str) -> bool:
-    """Say whether two names differ in nothing but the side of a pair, the left one first."""
-    return any(_differ_by(one, two, left, right) for left, right in _SIDES)
+_joint: Callable[[Any], tuple[float, ...]] = attrgetter(
+    *(f"transform.translation.{axis}" for axis in "xyz"), *(f"transform.rotation.{axis}" for axis in "xyzw")
+)
 
 
-def _imu(imus: Sequence[Topic]) -> Topic | None:
-    """Return the IMU with the most messages; gyros whose accelerometers publish by themselves only for want of one."""
-    gyros = [topic for topic in imus if _partner(topic, imus)]
-    halves = {topic for gyro in gyros for topic in (gyro, _partner(gyro, imus))}
-    return _most(topic for topic in imus if topic not in halves) or _most(gyros)
+def fixed(transforms: Iterable[Any]) -> list[Any]:
+    """Return those of many transforms that never change, each once."""
+    first: dict[tuple[str, str], Any] = {}
+    moved: set[tuple[str, str]] = set()
+    for transform in transforms:
+        edge = (frame_name(transform.header.frame_id), frame_name(transform.child_frame_id))
+        if _joint(first.setdefault(edge, transform)) != _joint(transform):
+            moved.add(edge)
+    return [transform for edge, transform in first.items() if edge not in moved]
 
 
-def _partner(gyro: Topic | None, imus: Sequence[Topic]) -> Topic | None:
-    """Return the accelerometer that has the name of a gyro but for that word."""
-    name = "" if gyro is None else gyro.name.lower()
-    return next((topic for topic in imus if _differ_by(name, topic.name.lower(), _alone(_GYRO), _ACCEL)), None)
+class Tree:
+    """The fixed transforms of a robot."""
 
+    def __init__(self, transforms: Iterable[Any]) -> None:
+        self._next: dict[str, dict[str, Array]] = {}
+        for transform in transforms:
+            parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+            values = np.array(_joint(transform))
+            quaternion = values[3:]
+            if not np.isclose(np.linalg.norm(quaternion), 1.0, atol=1e-2):
+                continue  # no rotation, as an unset message
+            T_parent_child = se3(rotation_from_quaternion(quaternion), values[:3])
+            self._next.setdefault(parent, {})[child] = T_parent_child
+            self._next.setdefault(child, {})[parent] = se3_inverse(T_parent_child)
 
-def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
-    """Return the calibration that stands beside a topic of images, as ROS names it: in the same namespace."""
-    base = image.name.removesuffix(_COMPRESSED_SUFFIX)
-    infos = {topic.name: topic for topic in _of_types(usable, (CAMERA_INFO,))}
-    namespace = base
-    while namespace:
-        namespace = namespace.rpartition("/")[0]
-        for name in (f"{namespace}/camera_info", f"{namespace}/info/camera_info"):
-            if name in infos:
-                return infos[name]
-    return None
-
-
-def _truth(usable: Sequence[Topic]) -> Topic | None:
-    words = re.compile("|".join(map(_alone, _OF_TRUTH)), re.IGNORECASE)
-    return _most(topic for topic in _of_types(usable, _POSES) if words.search(topic.name))
-
-
-def _of_types(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:
-    return [topic for topic in topics if topic.type in types]
-
-
-def _most(topics: Iterable[Topic]) -> Topic | None:
-    """Return the topic with the most messages, the first by name of several."""
-    return max(sorted(topics, key=lambda topic: topic.name), key=lambda topic: topic.count, default=None)
-
-
-def _facts(topics: Sequence[Topic], chosen: Chosen, given: Given) -> tuple[str, ...]:
-    found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
-    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
-    used = {topic.name for topic in (*found.values(), *chosen.transforms)}
-    left_out = [str(topic) for topic in topics if topic.name not in used]
-    facts = [f"topics: {', '.join(named)}"]
-    if left_out:
-        facts.append(f"topics not used: {', '.join(left_out)}")
-    return tuple(facts)
+    def between(self, a: str, b: str) -> Array | None:
+        """Return T_a_b (4, 4); None where nothing connects the two."""
+        reached, waiting = {a: np.eye(4)}, deque([a])
+        while waiting:
+            at = waiting.popleft()
+            for near, T_at_near in self._next.get(at, {}).items():
+                if near not in reached:
+                    reached[near] = reached[at] @ T_at_near
+                    waiting.append(near)
+        return reached.get(b) if a and b else None

@@ -163,7 +163,7 @@ class Columns:
                 raise ValueError
             return values.astype(np.float64)
         except (TypeError, ValueError):
-            bad, value = next((i, value) for i, value in enumerate(given) if not _is_number(value))
+            bad, value = next((i, value) for i, value in enumerate(given) if not is_number(value))
             shown = printable(str(value).strip())[:50] or "empty"
             point = " with a decimal point" if "," in shown else ""
             raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}") from None
@@ -182,7 +182,8 @@ class Columns:
         return number
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Say whether a value is a number, or a text of one; Python takes 1_0 for ten, and no other program does."""
     try:
         float(value)
     except (TypeError, ValueError):
@@ -257,7 +258,7 @@ def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
 
 
 def _begins_with_number(line: str) -> bool:
-    return any(_is_number(_cells(line, separator)[0]) for separator in _SEPARATORS)
+    return any(is_number(_cells(line, separator)[0]) for separator in _SEPARATORS)
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -68,10 +68,9 @@ _VEHICLE_CONCENTRATION, _LEAST_GAIN = 0.9, 0.1
 class Rows:
     """What a table in a text file holds: the number and the cells of each line that is not empty or a comment.
 
-    There is at least one line; ``commas`` is True where commas separate the cells, and not blanks; ``underscored``
-    where a cell has an underscore, for Python takes 1_0 for ten and no other program does. ``heading`` are the names of
-    the columns, where a line above the first row has as many words as that has cells; ``header`` has all comments
-    before that row.
+    There is at least one line. ``commas``: they separate the cells, and not blanks. ``underscored``: a cell has an
+    underscore, and Python takes 1_0 for ten. ``heading``: the names of the columns, of a line above the first row with
+    as many words as that has cells. ``header``: all comments before that row.
     """
 
     path: Path
@@ -110,16 +109,14 @@ class Rows:
         return zip(self.line_numbers, self.cells, strict=True)
 
     def _numbers(self, line_number: int, cells: list[str], width: int, columns: str) -> list[float]:
+        what = f"{self.path}: line {line_number}"
         if len(cells) != width:
-            found = f"{self.path}: line {line_number} has {len(cells)} columns"
-            raise DataError(f"{found}, expected {width} ({columns})")
-        try:
-            return [_number(cell) for cell in cells]
-        except ValueError as error:
-            point = ", with a point in numbers" if any("," in cell for cell in cells) else ""
-            raise DataError(
-                f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}{point}"
-            ) from error
+            raise DataError(f"{what} has {len(cells)} columns, expected {width} ({columns})")
+        for cell in cells:
+            if not is_number(cell):
+                point = ", with a point in numbers" if any("," in cell for cell in cells) else ""
+                raise DataError(f"{what} is not numeric (could not convert {cell!r}); expected {columns}{point}")
+        return list(map(float, cells))
 
 
 def read_rows(path: Path, kind: str) -> Rows:
@@ -139,7 +136,7 @@ def read_rows(path: Path, kind: str) -> Rows:
     line_numbers = [n for n, of_line in enumerate(cells, start=1) if of_line]
     cells = [of_line for of_line in cells if of_line]
     headings = [_between(line, separator) if separator else line.split() for line in comments]
-    if cells and not _is_number(cells[0][0]) and (separator or named_columns(cells[0]) is not None):
+    if cells and not is_number(cells[0][0]) and (separator or named_columns(cells[0]) is not None):
         headings.append(cells[0])
         line_numbers, cells = line_numbers[1:], cells[1:]
     if not cells:
@@ -163,20 +160,6 @@ def _between(line: str, separator: str) -> list[str]:
     """Split a line, which has no cells where it is empty; some programs end theirs with a separator."""
     stripped = line.strip()
     return [cell.strip() for cell in stripped.removesuffix(separator).split(separator)] if stripped else []
-
-
-def _number(cell: str) -> float:
-    if "_" in cell:
-        raise ValueError(f"could not convert string to float: {cell!r}")
-    return float(cell)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 # The formats ---------------------------------------------------------------------------------------------------------
@@ -238,23 +221,6 @@ class PosesFile:
         if self.not_finite:
             raise DataError(f"{self.path}: {self.not_finite}")
         return self
-
-
-class TrajectoryFormat(Protocol):
-    """One format: ``columns`` names those of a line."""
-
-    @property
-    def columns(self) -> str:
-        """The columns of a line, as a message names them."""
-
-    def recognises(self, rows: Rows) -> bool:
-        """Say whether rows have the shape of this format; at most one has it."""
-
-    def parse(self, rows: Rows) -> PosesFile:
-        """Return the poses of rows; raise DataError, naming the line, where they are not of this format."""
-
-    def text(self, trajectory: Trajectory) -> str:
-        """Return the poses of a trajectory, and what else the format has but covariances, as the text of a file."""
 
 
 # Behind the columns of a format: no covariance, those of orientation and position apart, that of the pose or the state.
@@ -470,6 +436,7 @@ OPENVINS_COV = replace(
 _SAYS_SO: tuple[Stamped, ...] = (EUROC_COV, OPENVINS_COV)
 POSITIONS_ALONE = "t x y z"
 _MISNAMED = OtherOrder(-1, "w first", f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
+TrajectoryFormat = Stamped | Kitti
 FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
 _KIND = (
     f"there are {', '.join(f'{name} ({one.columns})' for name, one in FORMATS.items())}, positions "
