@@ -21,6 +21,7 @@ import numpy as np
 
 from toolkit.datasets.io.bag_reader import place_in_bag
 from toolkit.datasets.io.fields import exact_ns, probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.datasets.io.tables import is_number
 from toolkit.datasets.trajectories.covariances import (
     OPENVINS,
     OURS,
@@ -115,7 +116,9 @@ class Rows:
         for cell in cells:
             if not is_number(cell):
                 point = ", with a point in numbers" if any("," in cell for cell in cells) else ""
-                raise DataError(f"{what} is not numeric (could not convert {cell!r}); expected {columns}{point}")
+                raise DataError(
+                    f"{what} is not numeric (could not convert string to float: {cell!r}); expected {columns}{point}"
+                )
         return list(map(float, cells))
 
 
