@@ -18,7 +18,7 @@ WRONG: list[tuple[str, int, str]] = [
     ("", 2, "COMMAND"),
     ("compair", 2, "did you mean compare?"),
     ("compare --max-frames 1", 2, "at least 2"),
-    ("compare --max-frames many", 2, "expected a whole number, not 'many'"),
+    ("compare --max-frames many", 2, "expected a whole number, at least 2, not 'many'"),
     ("compare --seed -1", 2, "at least 0"),
     ("compare drive --workers 100000", 2, "at most 1024"),
     ("compare --estimators ,", 2, "expected names separated by commas"),

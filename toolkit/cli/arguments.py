@@ -5,14 +5,16 @@ import math
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, TypeVar
 
 from toolkit.errors import VislamError, did_you_mean, no_such, one_line
 from toolkit.threads import MOST_WORKERS
 
+Number = TypeVar("Number", int, float)
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
@@ -108,27 +110,15 @@ class Argument(NamedTuple):
         parser.add_argument(self.name, **self.how)
 
 
-class OneOf(NamedTuple):
-    """Arguments of which at most one can be given."""
-
-    arguments: tuple[Argument, ...]
-
-    def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add them as a group that excludes each other."""
-        group = parser.add_mutually_exclusive_group()
-        for one in self.arguments:
-            one.add_to(group)
-
-
 class Group(NamedTuple):
-    """Arguments under a title of their own in the help."""
+    """Arguments under a title of their own in the help, or without one such that at most one can be given."""
 
-    title: str
     arguments: tuple[Argument, ...]
+    title: str = ""
 
     def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add them under the title."""
-        group = parser.add_argument_group(self.title)
+        """Add them as a group."""
+        group = parser.add_argument_group(self.title) if self.title else parser.add_mutually_exclusive_group()
         for one in self.arguments:
             one.add_to(group)
 
@@ -157,7 +147,7 @@ class Command(NamedTuple):
 
     name: str
     summary: str
-    arguments: tuple[Argument | OneOf | Group, ...]
+    arguments: tuple[Argument | Group, ...]
     examples: tuple[str, ...]
     run: Callable[[argparse.Namespace], int]
 
@@ -171,7 +161,7 @@ class Command(NamedTuple):
 
 
 def command(
-    name: str, summary: str, *arguments: Argument | OneOf | Group, examples: tuple[str, ...]
+    name: str, summary: str, *arguments: Argument | Group, examples: tuple[str, ...]
 ) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
     """Make a subcommand of the function that runs it; its docstring is the description in the help.
 
@@ -198,58 +188,36 @@ def named_file(text: str) -> tuple[str, str]:
 
 def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
     """Return a parser of whole numbers from ``least`` to ``most``."""
-
-    def whole_number(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
-        if not least <= value <= most:
-            bound = f"at least {least}" if value < least else f"at most {most}"
-            raise argparse.ArgumentTypeError(f"expected {bound}, not {value}")
-        return value
-
-    return whole_number
+    bounds = f"at least {least}" + (f" and at most {most:g}" if most < math.inf else "")
+    return _read(int, lambda value: least <= value <= most, f"a whole number, {bounds}")
 
 
 def number_within(what: str, least: float, most: float) -> Callable[[str], float]:
     """Return a parser of numbers from ``least`` to ``most``, told as ``what``."""
-
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"expected {what} from {least:g} to {most:g}, not {text!r}")
-        return value
-
-    return number
+    return _read(float, lambda value: least <= value <= most, f"{what} from {least:g} to {most:g}")
 
 
-def positive_seconds(text: str) -> float:
-    """Parse a finite duration greater than zero, as in 10s, 500ms, 2min or 10."""
-    value = _seconds(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected seconds greater than zero, not {text}")
-    return value
+def _read(parse: Callable[[str], Number], fits: Callable[[Number], bool], expected: str) -> Callable[[str], Number]:
+    """Return a parser of numbers that says what is expected of one that does not fit."""
 
+    def read(text: str) -> Number:
+        with suppress(ValueError):
+            if fits(value := parse(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {expected}, not {text!r}")
 
-def seconds_from_start(text: str) -> float:
-    """Parse a time since a recording's start, written like a duration."""
-    value = _seconds(text)
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a time since the start, not {text}")
-    return value
+    return read
 
 
 def _seconds(text: str) -> float:
     number = text.strip()
     unit, factor = next(((unit, factor) for unit, factor in _TIMES.items() if number.endswith(unit)), ("", 1.0))
-    try:
-        return factor * float(number.removesuffix(unit))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
+    return factor * float(number.removesuffix(unit))
+
+
+# Parsers of a duration, and of a time since a recording's start: 10s, 500ms, 2min or 10.
+positive_seconds = _read(_seconds, lambda value: 0.0 < value < math.inf, "seconds greater than zero, as in 10s")
+seconds_from_start = _read(_seconds, lambda value: 0.0 <= value < math.inf, "seconds since the start, as in 10s")
 
 
 # Repeated from toolkit.datasets.bags (a test compares them), which would cost the help a third of a second.
@@ -277,9 +245,9 @@ def estimators(what: str) -> Argument:
     return arg("--estimators NAME,...", f"{what}; {default}", names)
 
 
-def output(as_json: str, quiet: str = "see the exit status") -> OneOf:
+def output(as_json: str, quiet: str = "see the exit status") -> Group:
     """Return --json, with what it prints, and --quiet, with where the answer is then."""
-    return OneOf((flag("--json", f"print {as_json}"), flag("--quiet", f"print nothing; {quiet}")))
+    return Group((flag("--json", f"print {as_json}"), flag("--quiet", f"print nothing; {quiet}")))
 
 
 _AFTER = "after the first frame, as in 10s"
@@ -305,7 +273,7 @@ FIGURES = (
     choice("--figures", ("few", "all", "none"), "figures to draw with --out (see docs/figures.md)", default="few"),
     choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
 )
-REPAIR = OneOf(
+REPAIR = Group(
     (
         flag("--no-repair", "report the faults of a recording, repair none"),
         arg("--keep FAULT,...", "do not repair these, see 'vislam list faults'", names),
@@ -328,12 +296,7 @@ TOPICS = setting(
 )
 TRACKS = setting(
     "frontend.tracks",
-    choice(
-        "--tracks",
-        ("auto", "images", "simulated"),
-        "of a recording with images and truth: made of the images, or simulated along the truth (default: auto, of "
-        "the images if nearly all of them exist)",
-    ),
+    choice("--tracks", ("auto", "images", "simulated"), "made of images, or simulated along the truth (default: auto)"),
 )
 RECORDING = (
     arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
@@ -357,20 +320,9 @@ class _Once(argparse.Action):
 
 SETTINGS = (
     arg("--config FILE", "settings in TOML, or the manifest.json of a run to repeat", Path, action=_Once),
-    setting(
-        "outliers.policy",
-        arg("--outliers POLICY", "how every estimator treats inconsistent measurements (see docs/settings.md)"),
-    ),
-    setting(
-        "window.lag_s",
-        arg("--window SECONDS", "length of the window of windowed filters and smoothers", positive_seconds),
-    ),
-    arg(
-        "--set KEY=VALUE",
-        "one setting, as in window.lag_s=3 (see 'vislam list settings'); may be repeated",
-        action="append",
-        default=[],
-    ),
+    setting("outliers.policy", arg("--outliers POLICY", "how outliers are treated (see docs/settings.md)")),
+    setting("window.lag_s", arg("--window SECONDS", "length of the windows of estimators", positive_seconds)),
+    arg("--set KEY=VALUE", "one setting (see 'vislam list settings'); may be repeated", action="append", default=[]),
 )
 
 

@@ -58,7 +58,6 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
         default=[],
     ),
     Group(
-        "baselines of another system's trajectories",
         (
             arg(
                 "--trajectories DIR|FILE",
@@ -70,6 +69,7 @@ _FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json
             arg("--bound PERCENT", "allowed growth of an error (default: 5)", number_within("percent", 0.0, 1000.0)),
             flag("--plan", "write nothing; say how large a growth would be found, and how many runs find it"),
         ),
+        "baselines of another system's trajectories",
     ),
     *SETTINGS,
     WORKERS,

@@ -13,7 +13,6 @@ from toolkit.cli.arguments import (
     SETTINGS,
     TOPICS,
     Group,
-    OneOf,
     UsageError,
     arg,
     at_least,
@@ -99,7 +98,7 @@ def card(options: argparse.Namespace) -> int:
     arg("images FOLDER|BAG", "a folder with images, as EuRoC's or KITTI's, or a bag"),
     TOPICS,
     arg("--out DIR", "directory of the stills", Path, required=True),
-    OneOf(
+    Group(
         (
             arg("--count N", "how many stills", at_least(1, _MOST_STILLS), default=10),
             flag("--video", "a video of every frame instead of stills"),
@@ -149,13 +148,13 @@ def _summary(tracks: ImageTracks) -> str:
     arg("--seed N", "seed of every error", at_least(0), default=0),
     arg("--duration S", "seconds (default: the scenario's)", positive_seconds),
     Group(
-        "images",
         (
             flag("--images", "render the images of a stereo pair (flight)"),
             choice("--lens", ("none", "radtan", "equidistant"), "distortion of the cameras (default: none, rectified)"),
             arg("--blur MS", "exposure (default: 0)", number_within("milliseconds", 0, _LONGEST_EXPOSURE_MS)),
             arg("--moving N", "moving crates (default: 0)", at_least(0, _MOST_CRATES)),
         ),
+        "images",
     ),
     examples=(
         "vislam simulate drive --out recordings/drive-seed-1 --seed 1 --duration 5",

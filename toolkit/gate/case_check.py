@@ -11,7 +11,7 @@ unchanged NEES shows that poses are the same, but a NEES is never called changed
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,7 +22,6 @@ from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
 
-_NOTHING = ("", "")
 _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
 SHOWN = 1e-6
 # Fewer timed runs than this scatter too much to be checked (docs/gate.md).
@@ -64,41 +63,32 @@ def check_case(
 ) -> CaseVerdicts:
     """Judge one case on the terms given."""
     collected = CaseVerdicts()
-    if now.unreadable:
-        collected.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
-        return collected
-    other = _other_measurements(case, before, now)
-    if other:
-        collected.verdicts.append(_missing(case, *_NOTHING, "sequence", other))
+    if wrong := now.unreadable or _other_measurements(case, before, now):
+        collected.verdicts.append(_missing(case, "", "sequence", wrong))
         return collected
     if before.hashes != now.hashes:
         collected.notes.append(
             f"{case.source}: the same measurements except for their last bits, which this processor rounds differently"
         )
     for estimator, was in before.runs.items():
-        if estimator in now.absent or estimator not in now.runs:
+        is_ = None if estimator in now.absent else now.runs.get(estimator)
+        if is_ is None:
             why = now.absent.get(estimator, "it was not run")
-            collected.verdicts.append(_missing(case, estimator, "", "estimator", why))
-        elif fewer := _fewer_seeds(was, now.runs[estimator]):
-            collected.verdicts.append(_missing(case, estimator, "", "seeds", fewer))
+            collected.verdicts.append(_missing(case, estimator, "estimator", why))
+        elif (runs := min(len(is_.status), len(is_.speed))) != len(was.status):
+            fewer = f"it has {runs} runs, the baseline has {len(was.status)}"
+            collected.verdicts.append(_missing(case, estimator, "seeds", fewer))
         else:
-            why = now.why.get(estimator, "")
-            collected.verdicts += _ends(case, estimator, was, now.runs[estimator], why, collected, terms)
-            _check_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
+            sides = _Sides(case, estimator, was, is_, bounds, terms, collected)
+            sides.check_ends(now.why.get(estimator, ""))
+            sides.check_metrics()
             if terms.speed:
-                collected.verdicts += check_speed(case, estimator, was, now.runs[estimator], bounds)
+                sides.check_speed()
     few = [name for name, was in before.runs.items() if _timed(was).size < FEWEST_TIMED]
     if terms.speed and few:
         of = f"{case.source}: the time of {', '.join(few)}"
         collected.notes.append(f"{of} is not checked: fewer than {FEWEST_TIMED} timed runs in the baseline")
     return collected
-
-
-def _fewer_seeds(before: SeriesRecord, now: SeriesRecord) -> str:
-    """Say that an estimator has another number of runs than in the baseline; empty where it has as many."""
-    if len(now.status) == len(now.speed) == len(before.status):
-        return ""
-    return f"it has {min(len(now.status), len(now.speed))} runs, the baseline has {len(before.status)}"
 
 
 def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
@@ -116,86 +106,120 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
     return f"other measurements than the baseline's{which}: the two cannot be compared, make a new baseline"
 
 
-def _check_series(
-    case: Case,
-    estimator: str,
-    before: SeriesRecord,
-    now: SeriesRecord,
-    collected: CaseVerdicts,
-    bounds: BoundsRecord,
-    terms: CheckTerms,
-) -> None:
-    """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
-    usable = [i for i, (was, is_) in enumerate(zip(before.status, now.status, strict=True)) if was == is_ == "ok"]
-    if not usable:
-        collected.notes.append(
-            f"{case.source}: {estimator} has no run that ended well on both sides, nothing is compared"
+def _missing(case: Case, estimator: str, what: str, why: str, output: str = "") -> Verdict:
+    return Verdict(case.source, estimator, output, what, "missing", " ".join(why.split()))
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """One estimator on a case in the baseline and now, as many runs on both sides; what is found is ``collected``."""
+
+    case: Case
+    estimator: str
+    before: SeriesRecord
+    now: SeriesRecord
+    bounds: BoundsRecord
+    terms: CheckTerms
+    collected: CaseVerdicts
+
+    def check_ends(self, why: str) -> None:
+        """Fail where runs end differently than before; where that is accepted, note those that end well now."""
+        pairs = list(zip(self.case.seeds, self.before.status, self.now.status, strict=True))
+        worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
+        if worse:
+            runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if self.case.simulated else ""
+            self._tell("status", "regressed", f"{worse[0][1]} {runs}".strip() + (f": {why}" if why else ""))
+        better = [seed for seed, was, is_ in pairs if _SEVERITY[is_] < _SEVERITY[was]]
+        words = f"ends better in {len(better)} runs than before"
+        if better and (worse or self.terms.accept_better):
+            self._note(f"{self.estimator} {words}")
+        elif better:
+            self._tell("status", "moved", words)
+
+    def check_metrics(self) -> None:
+        """Judge every metric where both sides ended well."""
+        ends = zip(self.before.status, self.now.status, strict=True)
+        usable = [i for i, (was, is_) in enumerate(ends) if was == is_ == "ok"]
+        if not usable:
+            self._note(f"{self.estimator} has no run that ended well on both sides, nothing is compared")
+            return
+        criteria = self.bounds.simulated if self.case.simulated else self.bounds.recorded
+        for output, metrics in self.before.outputs.items():
+            given = self.now.outputs.get(output, {})
+            lost = {key: why for key, values in metrics.items() if (why := _lost(values, given.get(key), usable))}
+            self.collected.verdicts += [
+                _missing(self.case, self.estimator, key, why, output) for key, why in lost.items()
+            ]
+            shared = {key: _shared(values, given[key], usable) for key, values in metrics.items() if key not in lost}
+            changed = changed_metrics(shared)
+            for key in criteria:
+                if key in changed:
+                    self._tell_changed(output, key, shared[key], changed[key])
+                elif key in shared and shared[key][0].size:
+                    where = Where(self.case.source, self.estimator, output, key)
+                    self._check_metric(Pairs(where, criteria[key], *shared[key]))
+            self._check_coverage(output, metrics.get(COVERAGE, ()), given.get(COVERAGE, ()))
+
+    def _check_metric(self, pairs: Pairs) -> None:
+        """Put a metric among the tests, or hold it to its bound: of one run no test can tell chance."""
+        now = pairs.after
+        if self.case.simulated and now.size > 1:
+            self.collected.tests.append(pairs)
+            return
+        if self.case.simulated:
+            self._note(
+                f"{self.estimator} has one seed to compare, too few to test; it is held to the margins as bounds"
+            )
+        if np.ptp(now) > SHOWN * np.abs(now).max():
+            self._note(f"{self.estimator}'s {pairs.where.metric} has changed in every run")
+        medians = float(np.median(pairs.before)), float(np.median(now))
+        accept_better = self.terms.accept_better
+        verdict = check_recorded(pairs.where, pairs.criterion, *medians, accept_better=accept_better)
+        self.collected.verdicts.append(verdict)
+
+    def _tell_changed(self, output: str, key: str, values: Sides, unchanged: str) -> None:
+        was, is_ = (float(np.median(side)) for side in values)
+        words = (
+            f"{was:.7g} became {is_:.7g} while {unchanged} is the same in every run: the poses did not change, "
+            "but how this is computed from them; make a new baseline if that is meant"
         )
-        return
-    criteria = bounds.simulated if case.simulated else bounds.recorded
-    for output, metrics in before.outputs.items():
-        given = now.outputs.get(output, {})
-        lost = {key: why for key, values in metrics.items() if (why := _lost(values, given.get(key), usable))}
-        collected.verdicts += [_missing(case, estimator, output, key, why) for key, why in lost.items()]
-        shared = {key: _shared(values, given[key], usable) for key, values in metrics.items() if key not in lost}
-        changed = changed_metrics(shared)
-        for key in criteria:
-            where = Where(case.source, estimator, output, key)
-            if key in changed:
-                collected.verdicts.append(_changed(where, shared[key], changed[key]))
-            elif key in shared and shared[key][0].size:
-                _check_metric(case, Pairs(where, criteria[key], *shared[key]), collected, terms)
-    collected.verdicts += check_coverage(case, estimator, before, now, bounds)
+        self._tell(key, "changed metric", words, was, is_, 100.0 * (is_ / was - 1.0) if was else None, output=output)
 
+    def _check_coverage(self, output: str, before: Values, now: Values) -> None:
+        """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
+        both = zip(before, now, strict=False)  # a lost one has a verdict of its own
+        pairs = [(was, is_) for was, is_ in both if was is not None and is_ is not None]
+        if not pairs:
+            return
+        lost, allowed = max(was - is_ for was, is_ in pairs), self.bounds.coverage_points
+        words = f"a run lost {lost:.1f} percent of its frames, {allowed:g} are allowed" if lost > allowed else ""
+        was, is_ = (float(np.mean(side)) for side in zip(*pairs, strict=True))
+        self._tell(COVERAGE, "regressed" if words else "same", words, was, is_, output=output)
 
-def _check_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: CheckTerms) -> None:
-    """Put a metric among the tests, or hold it to its bound: of one run no test can tell chance."""
-    where, now = pairs.where, pairs.after
-    if case.simulated and now.size > 1:
-        collected.tests.append(pairs)
-        return
-    if case.simulated:
-        one = f"{case.source}: {where.estimator} has one seed to compare, too few to test"
-        collected.notes.append(f"{one}; it is held to the margins as bounds")
-    if np.ptp(now) > SHOWN * np.abs(now).max():
-        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} has changed in every run")
-    was, is_ = float(np.median(pairs.before)), float(np.median(now))
-    collected.verdicts.append(check_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
+    def check_speed(self) -> None:
+        """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
+        was, is_ = _timed(self.before), _timed(self.now)
+        if was.size < FEWEST_TIMED:
+            return
+        if lost := sum(a is not None and b is None for a, b in zip(self.before.speed, self.now.speed, strict=True)):
+            words = f"{lost} of {was.size} runs have no time any more"
+            self.collected.verdicts.append(_missing(self.case, self.estimator, SPEED, words))
+        if is_.size < FEWEST_TIMED:
+            return
+        old, new, most = float(np.median(was)), float(np.median(is_)), self.bounds.speed_ratio
+        finding: Finding = "regressed" if new > most * old else "better" if old > most * new else "same"
+        words = {
+            "regressed": f"{new / old:.2f} times the time, over the reference's; {most:g} is allowed",
+            "better": f"{old / new:.2f} times as fast",
+        }.get(finding, "")
+        self._tell(SPEED, finding, words, old, new, 100.0 * (new / old - 1.0), 100.0 * (most - 1.0))
 
+    def _tell(self, metric: str, finding: Finding, words: str, *numbers: float | None, output: str = "") -> None:
+        verdict = Verdict(self.case.source, self.estimator, output, metric, finding, words, *numbers)
+        self.collected.verdicts.append(verdict)
 
-def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdict:
-    was, is_ = (float(np.median(side)) for side in values)
-    return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, "changed metric",
-        f"{was:.7g} became {is_:.7g} while {unchanged} is the same in every run: the poses did not change, "
-        "but how this is computed from them; make a new baseline if that is meant",
-        was, is_, 100.0 * (is_ / was - 1.0) if was else None,
-    )  # fmt: skip
-
-
-def _ends(
-    case: Case,
-    estimator: str,
-    before: SeriesRecord,
-    now: SeriesRecord,
-    why: str,
-    collected: CaseVerdicts,
-    terms: CheckTerms,
-) -> Iterator[Verdict]:
-    """Fail where runs end differently than before; where that is accepted, note those that end well now."""
-    pairs = list(zip(case.seeds, before.status, now.status, strict=True))
-    worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
-    if worse:
-        runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if case.simulated else ""
-        message = f"{worse[0][1]} {runs}".strip() + (f": {why}" if why else "")
-        yield Verdict(case.source, estimator, "", "status", "regressed", message)
-    better = [seed for seed, was, is_ in pairs if _SEVERITY[is_] < _SEVERITY[was]]
-    if better:
-        message = f"ends better in {len(better)} runs than before"
-        if worse or terms.accept_better:
-            collected.notes.append(f"{case.source}: {estimator} {message}")
-        else:
-            yield Verdict(case.source, estimator, "", "status", "moved", message)
+    def _note(self, words: str) -> None:
+        self.collected.notes.append(f"{self.case.source}: {words}")
 
 
 def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
@@ -208,14 +232,14 @@ def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
     return f"it has no value any more in {len(gone)} of {len(usable)} runs" if gone else ""
 
 
-def _shared(before: Values, now: Values, usable: list[int]) -> tuple[Array, Array]:
+def _shared(before: Values, now: Values, usable: list[int]) -> Sides:
     both = [(was, is_) for i in usable if (was := before[i]) is not None and (is_ := now[i]) is not None]
     table = np.array(both, dtype=float).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
 
-def _missing(case: Case, estimator: str, output: str, what: str, why: str) -> Verdict:
-    return Verdict(case.source, estimator, output, what, "missing", " ".join(why.split()))
+def _timed(series: SeriesRecord) -> Array:
+    return np.array([x for x in series.speed if x is not None])
 
 
 def check_recorded(
@@ -256,57 +280,6 @@ def _distance(before: float, after: float) -> float:
     if min(before, after) <= 0.0:
         return math.inf * (after != before)
     return math.expm1(abs(math.log(after / before)))
-
-
-def check_coverage(
-    case: Case, estimator: str, before: SeriesRecord, now: SeriesRecord, bounds: BoundsRecord
-) -> Iterator[Verdict]:
-    """Fail where any seed lost more of its frames than allowed: scores over fewer frames are not comparable."""
-    for output, metrics in before.outputs.items():
-        pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
-        if not pairs:
-            continue
-        lost = max(was - is_ for was, is_ in pairs)
-        was, is_ = (float(np.mean([pair[side] for pair in pairs])) for side in (0, 1))
-        too_much = lost > bounds.coverage_points
-        message = f"a run lost {lost:.1f} percent of its frames, {bounds.coverage_points:g} are allowed"
-        finding: Finding = "regressed" if too_much else "same"
-        yield Verdict(case.source, estimator, output, COVERAGE, finding, message if too_much else "", was, is_)
-
-
-def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
-    """Return the values before and now of the runs that have both; a lost one has a verdict of its own."""
-    return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
-
-
-def check_speed(
-    case: Case, estimator: str, before: SeriesRecord, now: SeriesRecord, bounds: BoundsRecord
-) -> Iterator[Verdict]:
-    """Check the median over the runs of the time over the reference workload's; few runs are not checked."""
-    was, is_ = _timed(before), _timed(now)
-    if was.size < FEWEST_TIMED:
-        return
-    lost = sum(old is not None and new is None for old, new in zip(before.speed, now.speed, strict=True))
-    if lost:
-        yield _missing(case, estimator, "", SPEED, f"{lost} of {was.size} runs have no time any more")
-    if is_.size < FEWEST_TIMED:
-        return
-    old, new = float(np.median(was)), float(np.median(is_))
-    finding: Finding = "same"
-    if new > bounds.speed_ratio * old:
-        finding = "regressed"
-    elif old > bounds.speed_ratio * new:
-        finding = "better"
-    message = {
-        "regressed": f"{new / old:.2f} times the time, over the reference's; {bounds.speed_ratio:g} is allowed",
-        "better": f"{old / new:.2f} times as fast",
-    }.get(finding, "")
-    allowed = 100.0 * (bounds.speed_ratio - 1.0)
-    yield Verdict(case.source, estimator, "", SPEED, finding, message, old, new, 100.0 * (new / old - 1.0), allowed)
-
-
-def _timed(series: SeriesRecord) -> Array:
-    return np.array([x for x in series.speed if x is not None])
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:
