@@ -363,7 +363,6 @@ class SweepResult:
 
 
 def _checked_columns(columns: tuple[str, ...]) -> Columns:
-    """Return the columns that names ask for; raises SettingsError for what is no name, VislamError for an unknown."""
     strange = [column for column in columns if not isinstance(column, str)]
     if strange:
         raise SettingsError(f"a column is {type_of(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
@@ -426,8 +425,6 @@ class ShownTable:
 
 
 class _NotThereError(VislamError, KeyError):
-    """What a mapping of a result does not hold, with what it holds."""
-
     __str__ = Exception.__str__  # a KeyError's would put it in quotes
 
 

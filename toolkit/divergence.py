@@ -172,5 +172,4 @@ def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Arra
 
 
 def _finite(covs: Array) -> Array:
-    """Return covariances (S, 6, 6), zero where one is not a number."""
     return np.where(np.isfinite(covs).all(axis=(1, 2), keepdims=True), covs, 0.0)

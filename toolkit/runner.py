@@ -143,7 +143,6 @@ def setup_of(
 
 
 def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
-    """Return the KeyboardInterrupt behind an error, if any: compiled code raises errors of its own from it."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error

@@ -14,7 +14,7 @@ import pytest
 
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
-from toolkit.evaluation.document import EvaluationRecord, read_evaluation
+from toolkit.evaluation.standings import EvaluationRecord, read_evaluation
 from toolkit.files.documents import schema
 from toolkit.geometry import quaternion_from_rotation, se3, se3_inverse, so3_exp
 

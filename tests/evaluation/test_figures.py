@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.evaluation.document import read_evaluation
 from toolkit.evaluation.gathering import gather
 from toolkit.evaluation.scoring import Terms
-from toolkit.evaluation.standings import EvaluatedSystems, evaluate
+from toolkit.evaluation.standings import EvaluatedSystems, evaluate, read_evaluation
 from toolkit.report.figures.trajectories import draw
 
 NAMES = ["boxes", "map_truth", "errors_truth", "positions_truth", "angles_truth"]

@@ -13,7 +13,7 @@ import pytest
 import toolkit
 from toolkit.datasets.trajectories import kitti
 from toolkit.estimate import Trajectory
-from toolkit.evaluation.document import read_evaluation
+from toolkit.evaluation.standings import read_evaluation
 from toolkit.geometry import Array, about_z, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp, so3_exp
 
 S = 10**9

@@ -136,8 +136,7 @@ def test_a_fault_that_a_recording_cannot_have_is_told_before_anything_runs(
 
 
 def test_stretches_of_two_runs_that_lack_frames_are_of_the_same_times() -> None:
-    from toolkit.experiment.stretches import drift_over_stretches
-    from toolkit.experiment.units import run_estimator
+    from toolkit.experiment.units import drift_over_stretches, run_estimator
     from toolkit.metrics import Evaluation
     from toolkit.progress import SILENT
 

@@ -192,7 +192,7 @@ def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_erro
     known = replace(over, outcomes=in_order((*reported, *over.rows[2].outcomes), ("honest", "astray"), over.seeds))
     assert "it states 1.00 ± 0.10 of its true variance" in " ".join(report_text(known, {}).split())
     ratio = ratio_of_means((1.2, 1.0, 1.1, 1.1), (1.1, 1.3, 0.9, 1.1))
-    assert ratio is not None and ratio.value == pytest.approx(1.0)
+    assert ratio is not None and ratio.mean == pytest.approx(1.0)
     assert ratio.error == pytest.approx(math.sqrt((0.1**2 + 0.3**2 + 0.2**2) / 3 / 4) / 1.1)
 
 
@@ -201,7 +201,7 @@ def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment() -> 
     below = rng.uniform(0.5, 1.5, (4000, 20))
     above = 2.0 * below + rng.normal(scale=0.3, size=below.shape)
     found = [ratio_of_means(a, b) for a, b in zip(above.tolist(), below.tolist(), strict=True)]
-    values, errors = np.array([(one.value, one.error) for one in found if one is not None]).T
+    values, errors = np.array([(one.mean, one.error) for one in found if one is not None]).T
     assert values.mean() == pytest.approx(2.0, abs=0.005)  # its standard error is 0.001
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(values.std(), rel=0.05)
     assert ratio_of_means([1.0, None], [None, 1.0]) is None

@@ -175,7 +175,6 @@ def _unexpected(error: Exception) -> int:
 
 
 def _defect(error: Exception) -> str:
-    """Return whose defect an error is, and what to do."""
     from toolkit.discovery import line_of_another_package  # slow for a help text
 
     told, how = f"{type(error).__name__}: {error}", f"set {_WITH_TRACEBACK}=1 to see where, and report it"
@@ -219,7 +218,6 @@ def _interrupted() -> int:
 
 
 def _give_up_output() -> None:
-    """Send what standard output still holds nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

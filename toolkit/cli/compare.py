@@ -288,7 +288,6 @@ def sweep(options: argparse.Namespace) -> int:
 
 
 def _print(document: Struct, text: str, target: Path, options: argparse.Namespace) -> None:
-    """Print what was found and is kept in a directory, as it is asked for."""
     from toolkit.cli.progress_display import print_above
     from toolkit.files.documents import to_line
 
@@ -334,7 +333,6 @@ def _kept_where(directories: Iterable[Path]) -> Iterator[None]:
 
 
 def _new_run() -> Path:
-    """Return a directory named by the local time that does not exist yet."""
     from datetime import datetime
 
     stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")

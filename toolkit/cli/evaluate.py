@@ -93,7 +93,7 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def _shown(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argparse.Namespace) -> str:
-    from toolkit.evaluation.document import evaluation_document
+    from toolkit.evaluation.standings import evaluation_document
     from toolkit.files.documents import to_text
     from toolkit.report import evaluation as texts
     from toolkit.report.text import width_of_output

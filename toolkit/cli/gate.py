@@ -144,7 +144,6 @@ def _command_to_keep(words: list[str]) -> str:
 
 
 def _cases(options: argparse.Namespace) -> list[Case]:
-    """Return the cases the command line asks for."""
     from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.gate.baseline import Case
     from toolkit.gate.measuring import located
@@ -184,7 +183,6 @@ def _with_duration(given: str) -> tuple[str, float | None]:
 
 
 def _bad_ends(baseline: Baseline) -> Iterator[str]:
-    """Yield every estimator that did not end well somewhere."""
     for case, measured in baseline.cases:
         for name, series in measured.runs.items():
             if bad := sum(status != "ok" for status in series.status):

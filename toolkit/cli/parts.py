@@ -64,13 +64,11 @@ def entries(kind: str) -> Mapping[str, str]:
 
 
 def _summary(kind: str, names: list[str]) -> str:
-    """Return a kind in one line: how many names it has, and a few of them."""
     more = ", ..." if len(names) > _EXAMPLES else ""
     return f"{len(names):>3} {kind:<{max(map(len, KINDS))}}  {', '.join(names[:_EXAMPLES])}{more}"
 
 
 def _listing(entries: Mapping[str, str]) -> str:
-    """Return names with their one-line summaries."""
     from toolkit.report.text import filled, width_of_output
 
     longest, width = max(map(len, entries), default=0), width_of_output()

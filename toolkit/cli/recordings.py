@@ -131,7 +131,6 @@ def tracks(options: argparse.Namespace) -> int:
 
 
 def _summary(tracks: ImageTracks) -> str:
-    """Return the tracks in one line: how many a frame, and how long they live."""
     import numpy as np
 
     a_frame = np.bincount(tracks.frame, minlength=tracks.t_ns.size)
@@ -187,7 +186,6 @@ def simulate(options: argparse.Namespace) -> int:
 
 
 def _film(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Render the images, with the time that is left, and say what was written."""
     from toolkit.cli.progress_display import of_this_process
     from toolkit.simulation.filming import Filming, check_filmable, film, pair_count, size_gb
 

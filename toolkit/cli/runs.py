@@ -157,7 +157,6 @@ def reproduce(options: argparse.Namespace) -> int:
 
 
 def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
-    """Do what vislam compare does with the bundle's manifest, and print nothing."""
     from toolkit.cli import parser
     from toolkit.report.run_directory import MANIFEST
 

@@ -16,10 +16,9 @@ import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
 
 from toolkit.errors import DataError, no_such, one_line, printable
-from toolkit.evaluation.document import EvaluationRecord, read_evaluation
 from toolkit.evaluation.gathering import files_by_sequence
 from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth, score_file
-from toolkit.evaluation.standings import RunRecord
+from toolkit.evaluation.standings import EvaluationRecord, RunRecord, read_evaluation
 from toolkit.files import documents
 from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, MetricValues, Percent, Values, json_text
 from toolkit.gate.case_check import check_recorded

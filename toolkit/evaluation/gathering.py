@@ -82,7 +82,6 @@ def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
 
 
 def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:
-    """Return an item for each file, and for each that is missing of ``runs``."""
     there = [Item(system, sequence, _name(file), file) for file in files]
     return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(runs - len(there))]
 
@@ -118,7 +117,6 @@ def _of_folders(given: Iterable[str]) -> _Found:
 
 
 def _systems_in(tree: Path) -> dict[str, Path]:
-    """Return the folders of a tree by their names; raises DataError where there are none."""
     folders = {printable(path.name): path for path in sorted(tree.iterdir()) if path.is_dir()}
     systems = {name: path for name, path in folders.items() if not name.startswith(".")}
     if not systems:
@@ -153,7 +151,6 @@ def _named(word: str) -> tuple[str | None, Path]:
 
 
 def _existing(path: Path) -> Path:
-    """Return the path; raises DataError where it does not exist: a mistyped name is no failure of a system."""
     place = place_in_bag(path)
     if not (path if place is None else place[0]).exists():
         raise DataError(f"{path}: there is no such file; check the path")
@@ -165,7 +162,6 @@ def _name(path: Path) -> str:
 
 
 def _unzipped(path: Path) -> Path:
-    """Return what a gzipped file is called without that, or the path itself."""
     return path.with_suffix("") if path.suffix == _ZIPPED else path
 
 

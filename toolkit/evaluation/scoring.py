@@ -9,7 +9,6 @@ then another estimate of the same run, and a difference is compared with the sum
 share cancel in it, so that this finds too little, and never too much.
 """
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -45,7 +44,6 @@ from toolkit.metrics import (
 )
 from toolkit.metrics.parts.against_truth import (
     STAMP_TOLERANCE_NS,
-    AgainstTruth,
     Matched,
     PairsAgainstTruth,
     changes,
@@ -114,6 +112,7 @@ _OFF = (
     "its orientations are off by one turn of {:.1f} deg, about which they scatter by {:.1f} deg: an extrinsic is off, "
     "and not the estimate alone"
 )
+_OTHER_AXES = "its poses are of a body with other axes than the truth's"
 _LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Of the hash of a truth: significant digits that are hashed, hexadecimal digits that are kept.
@@ -200,7 +199,7 @@ def read_truth(name: str, path: Path, cov_convention: CovConvention | None = Non
         raise DataError(f"{path}: a truth of {len(file)} pose; give at least two")
     if file.other_order is not None:
         check_order(path, file.T_world_imu, file.other_order)
-    t_ns = _lines_ns(len(file)) if file.t_ns is None else file.t_ns
+    t_ns = np.arange(len(file), dtype=np.int64) * _FRAME_NS if file.t_ns is None else file.t_ns
     cov = None if file.covariances is None else file.covariances.of(file.T_world_imu)
     return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None, file.not_finite, cov)
 
@@ -218,7 +217,6 @@ def _with_times(file: PosesFile) -> PosesFile:
 
 
 def _read(path: Path, truth: TruthFile, terms: Terms) -> tuple[PosesFile, Poses]:
-    """Return a trajectory file, and its poses on their stamps."""
     file = read_poses(path, terms.cov_convention)
     if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
         file = _with_times(file)
@@ -226,7 +224,7 @@ def _read(path: Path, truth: TruthFile, terms: Terms) -> tuple[PosesFile, Poses]
 
 
 def aligned_file(path: Path, truth: TruthFile, terms: Terms) -> Matched:
-    """Return the pairs of a trajectory file and the truth that are scored, after the fit of SE(3) to all positions.
+    """Return the pairs that are scored, after the fit of SE(3) to all positions.
 
     Raises DataError where the file cannot be used, Unavailable where nothing can be fitted.
     """
@@ -250,19 +248,16 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
     if turn is not None and turn.is_other_body:
-        axes = other_axes(turn.R_truth_body)
-        scores = scores.without(_OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {axes}")
+        scores = scores.without(_OF_THE_BODY, f"{_OTHER_AXES}: {other_axes(turn.R_truth_body)}")
     elif turn is not None and turn.is_told:
         off_deg, scatter_deg = np.degrees((turn.angle_rad, turn.scatter_rad))
         scores = scores.remarked(_OF_ORIENTATIONS, _OFF.format(off_deg, scatter_deg))
     if changes(matched.estimate[:, :3, 3]) and not changes(matched.truth[:, :3, 3]):
         scores = scores.remarked(_OF_POSITIONS, _STANDS)
     scores = _with_the_estimates_own(scores, matched)
-    paired = (
-        _how_matched(estimate, truth, terms.max_dt_s),
-        truth.left_out and f"left out of the truth: {truth.left_out}",
-    )
-    return scores.remarked([_PAIRS.key], "; ".join(filter(None, paired)))
+    left_out = truth.left_out and f"left out of the truth: {truth.left_out}"
+    paired = filter(None, (_how_matched(estimate, truth, terms.max_dt_s), left_out))
+    return scores.remarked([_PAIRS.key], "; ".join(paired))
 
 
 def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
@@ -343,10 +338,7 @@ def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched
     path_m = distance_along(truth.poses[:, :3, 3])
     estimate_is_longer = estimate.t_ns.size > truth.t_ns.size
     few, many = (truth.t_ns, estimate.t_ns) if estimate_is_longer else (estimate.t_ns, truth.t_ns)
-    after = np.clip(np.searchsorted(many, few), 0, many.size - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(many[after] - few < few - many[before], after, before)
-    nearest = np.where(after == 0, 0, nearest)
+    nearest = _nearest(many, few)
     met = np.flatnonzero(np.abs(many[nearest] - few) <= max_dt_s * NS_PER_S)
     rows, others = (nearest[met], met) if estimate_is_longer else (met, nearest[met])
     return Matched(estimate.t_ns[rows], truth.poses[others], estimate.poses[rows], path_m[others])
@@ -354,22 +346,12 @@ def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched
 
 def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile, terms: Terms) -> Scores:
     pairs = PairsAgainstTruth(matched, terms.level)
-    found: list[Scores] = []
-    with np.errstate(all="ignore"):  # a value that is not finite becomes None, with that as its reason
-        for file_of_metrics in (ate, rpe, kitti, drift, clock_offset):
-            found.append(_or_reason(file_of_metrics.score, pairs, file_of_metrics.METRICS))
-        found.append(_nees_scores(file, estimate, truth, level=terms.level))
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
-    found.append(Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)}))
-    values = {key: value for one in found for key, value in one.values.items()}
-    return Scores(values, {key: note for one in found for key, note in one.notes.items()})
-
-
-def _or_reason(score: Callable[[AgainstTruth], Scores], pairs: AgainstTruth, metrics: tuple[Metric, ...]) -> Scores:
-    try:
-        return score(pairs)
-    except Unavailable as reason:
-        return Scores.none([metric.key for metric in metrics], str(reason))
+    scores = Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)})
+    with np.errstate(all="ignore"):  # a value that is not finite becomes None, with that as its reason
+        for metrics in (ate, rpe, kitti, drift, clock_offset):
+            scores |= Scores.attempt(metrics.METRICS, partial(metrics.score, pairs))
+        return scores | _nees_scores(file, estimate, truth, level=terms.level)
 
 
 def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> str:
@@ -377,8 +359,7 @@ def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> s
     if not truth.is_timed:
         return "paired line by line, for the files have no stamps"
     few, many = sorted((estimate.t_ns, truth.t_ns), key=lambda t_ns: t_ns.size)
-    after = np.clip(np.searchsorted(many, few), 1, many.size - 1)
-    apart_ms = np.minimum(np.abs(many[after] - few), np.abs(few - many[after - 1])) / 1e6
+    apart_ms = np.abs(many[_nearest(many, few)] - few) / 1e6
     off = apart_ms > STAMP_TOLERANCE_NS / 1e6
     if not off.any():
         return ""
@@ -386,10 +367,6 @@ def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> s
     if max_dt_s is None:
         return f"{int(off.sum())} of {few.size} stamps lie {typical} off the other's, and poses are interpolated there"
     return f"paired with the nearest pose, {typical} off, and not interpolated"
-
-
-def _lines_ns(count: int) -> IntArray:
-    return np.arange(count, dtype=np.int64) * _FRAME_NS
 
 
 def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: bool) -> Scores:
@@ -457,6 +434,7 @@ def _is_in_the_truths_world(stated: StatedErrors) -> bool:
 
 
 def _nearest(t_ns: IntArray, at_ns: IntArray) -> IntArray:
-    """Return the indices (M,) of stamps (N,) nearest to others (M,)."""
-    after = np.clip(np.searchsorted(t_ns, at_ns), 1, t_ns.size - 1)
-    return np.asarray(np.where(at_ns - t_ns[after - 1] <= t_ns[after] - at_ns, after - 1, after))
+    """Return the indices (M,) of stamps (N,) nearest to others (M,), the earlier of two that are equally near."""
+    before = np.clip(np.searchsorted(t_ns, at_ns) - 1, 0, t_ns.size - 1)
+    after = np.minimum(before + 1, t_ns.size - 1)
+    return np.asarray(np.where(at_ns - t_ns[before] <= t_ns[after] - at_ns, before, after))

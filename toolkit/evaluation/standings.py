@@ -4,6 +4,9 @@ Over the runs of a system on a sequence: median and quartiles. Over sequences: r
 by Wilcoxon's signed-rank test on the logarithms of the ratios of their medians (Wilcoxon, Biometrics Bulletin 1, 1945),
 in its exact form for ties (Pratt and Gibbons, "Concepts of nonparametric theory", 1981, section 3.7), with Holm's
 correction over all pairs. A sequence on which one of two systems has no median is the largest difference there is.
+
+``evaluation.json``, the contract ``vislam.evaluation/1`` (docs/evaluate.md), holds all of it: an entry of ``runs`` is
+one of ``metrics.json`` with the sequence and the file it is of.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.answers import Status
 from toolkit.errors import DataError, one_line
@@ -22,6 +25,7 @@ from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import holm, quantiles_of_all
 from toolkit.experiment.workers import LostUnit, results_of
+from toolkit.files import documents
 from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.geometry import Array
@@ -294,7 +298,6 @@ def evaluated(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
 
 
 def _run(item: Item, scores: Scores | None, why: str = "") -> RunRecord:
-    """Return a run with its scores, if it has any; one with a reason failed."""
     scores = scores or Scores.none(METRIC_BY_KEY, why)
     values = {key: scores.values.get(key) for key in METRIC_BY_KEY}
     return RunRecord(
@@ -358,3 +361,87 @@ def _over_sequences(cells: Sequence[Cell], metric: Metric) -> Quartiles | None:
 def _quartiles(good: Iterable[float], bad: int, metric: Metric) -> Quartiles | None:
     found = quantiles_of_all(good, bad, metric.best or "most")
     return None if found is None else of_attributes(Quartiles, found)
+
+
+class TermsRecord(Struct, frozen=True, kw_only=True):
+    """How trajectories were scored."""
+
+    max_dt_s: Annotated[float | None, Meta(description="nearest poses no farther apart in time; null: interpolated")]
+    offset_s: Annotated[float, Meta(description="added to the stamps of the trajectories")]
+    gap_s: Annotated[float, Meta(description="the longest time between two poses that counts as covered", gt=0)]
+    level: Annotated[bool, Meta(description="whether the vertical is measured: first poses turn about it alone")]
+    least_coverage_percent: Annotated[float, Meta(description="of the time, below which a run counts as failed")]
+
+
+class SequenceScored(Struct, frozen=True, kw_only=True):
+    """The truth of a sequence."""
+
+    sequence: str
+    truth: Annotated[str, Meta(description="the truth's file, as it was given")]
+    truth_hash: Annotated[str, Meta(description="of the truth's stamps and poses, to nine digits")]
+    poses: Count
+    duration_s: Annotated[float, Meta(ge=0)]
+    path_m: Annotated[float, Meta(ge=0)]
+
+
+class OverRuns(Struct, frozen=True, kw_only=True):
+    """All runs of a system on a sequence."""
+
+    sequence: str
+    estimator: str
+    runs: Count
+    ok: Count
+    metrics: Annotated[dict[str, Quartiles | None], Meta(description="null where runs are ok and none has a value")]
+
+
+class EvaluationRecord(Struct, frozen=True, kw_only=True):
+    """Every run of every system, and what they say together."""
+
+    schema: Literal["vislam.evaluation/1"]
+    terms: TermsRecord
+    ranked_by: Annotated[str, Meta(description="key of the metric that ranks and tests")]
+    sequences: Annotated[tuple[SequenceScored, ...], Meta(min_length=1)]
+    runs: Annotated[tuple[RunRecord, ...], Meta(min_length=1)]
+    over_runs: tuple[OverRuns, ...]
+    leaderboard: tuple[StandingRecord, ...]
+    paired: Annotated[tuple[PairedRecord, ...], Meta(description="every pair of systems; empty for one sequence")]
+    notes: tuple[str, ...]
+    figures: Annotated[tuple[str, ...], Meta(description="files in the folder of figures")] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        known = {one.sequence for one in self.sequences}
+        for i, run in enumerate(self.runs):
+            if run.sequence not in known:
+                raise ValueError(f"runs[{i}].sequence is none of sequences")
+
+
+def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
+    """Return an evaluation as a record."""
+    return EvaluationRecord(
+        schema="vislam.evaluation/1",
+        terms=of_attributes(TermsRecord, evaluation.terms),
+        ranked_by=evaluation.ranked_by.key,
+        sequences=tuple(
+            SequenceScored(
+                sequence=name, truth=truth.path.as_posix(), truth_hash=truth.digest, poses=len(truth.poses),
+                duration_s=truth.duration_s, path_m=truth.path_m,
+            )
+            for name, truth in evaluation.truths.items()
+        ),
+        runs=evaluation.runs,
+        over_runs=tuple(
+            OverRuns(
+                sequence=cell.sequence, estimator=cell.system, runs=len(cell.runs), ok=cell.ok,
+                metrics={metric.key: cell.quantiles(metric) for metric in evaluation.scored_metrics},
+            )
+            for cell in evaluation.cells.values()
+        ),
+        leaderboard=evaluation.leaderboard,
+        paired=evaluation.paired,
+        notes=evaluation.notes,
+    )  # fmt: skip
+
+
+def read_evaluation(path: Path) -> EvaluationRecord:
+    """Read an ``evaluation.json``; raises DataError, in one line with the place, where it is not one."""
+    return documents.read(path, EvaluationRecord, remedy="make it with vislam evaluate --out")

@@ -88,7 +88,6 @@ class Cluster:
             raise ClusterError(f"the scheduler at {self._address} went away; repeat with the same --out") from error
 
     def _checked_workers(self) -> int:
-        """Return how many workers there are, all of which run this version on one thread each."""
         threads = self._client.nthreads()
         if not threads:
             raise ClusterError(f"the scheduler at {self._address} has no worker; start one: dask worker --nthreads 1")
@@ -124,13 +123,11 @@ def _version() -> Version:
 
 
 def _do(work: Callable[[T, Progress], R], unit: T, version: Version) -> R:
-    """Do a unit of work on a worker, which must run the same version as the client."""
     _check_version("that joined", _version(), version)
     return work(unit, SILENT)
 
 
 def _check_version(worker: str, theirs: Version, ours: Version) -> None:
-    """Raise ClusterError where a worker runs another version."""
     if theirs == ours:
         return
     packages = [

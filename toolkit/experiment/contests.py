@@ -23,7 +23,8 @@ from scipy.special import fdtri, stdtrit
 
 from toolkit.arrays import rows_of
 from toolkit.experiment.statistics import standard_error
-from toolkit.geometry import Array, se3_inverse
+from toolkit.experiment.units import drift_in_body
+from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES, jackknife_error
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.against_truth import Matched
@@ -230,8 +231,7 @@ def _ends(path_m: Array, count: int) -> Array:
 
 def _drift(truth: Array, estimate: Array) -> _Drift | None:
     """Return the drift between neighbouring poses (K + 1, 4, 4), or None where it is zero or overflows."""
-    true_step, step = (se3_inverse(poses[:-1]) @ poses[1:] for poses in (truth, estimate))
-    in_body_m = step[:, :3, 3] - true_step[:, :3, 3]
+    in_body_m = drift_in_body(truth, estimate)
     in_world_m = np.einsum("kij,kj->ki", truth[:-1, :3, :3], in_body_m)
     total = float(np.sum(in_body_m**2) ** 2)
     if not 0.0 < total < np.inf:

@@ -142,7 +142,6 @@ def _is_usable(entry: EstimatorEntry) -> bool:
 
 
 def _all(found: Pairings) -> tuple[Variant, ...]:
-    """Return every variant that is needed, each once."""
     edges = [edge for pair in found.edges.values() for edge in pair or ()]
     return tuple(dict.fromkeys([found.start, found.goal, *(one for edge in edges for one in (edge.less, edge.more))]))
 
@@ -190,7 +189,6 @@ def _tested(effects: Mapping[Edge, Contribution], measures: Iterable[str]) -> di
 
 
 def _found_by_holm(tests: Mapping[Key, Paired | None]) -> dict[Key, Paired]:
-    """Return those of several differences that are more than chance."""
     known = {key: one for key, one in tests.items() if one is not None}
     adjusted = holm(np.array([one.p for one in known.values()])).tolist()
     return {key: one for (key, one), p in zip(known.items(), adjusted, strict=True) if p <= LEVEL}

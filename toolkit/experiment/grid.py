@@ -144,7 +144,6 @@ def _all_that_it_depends_on(unit: Unit) -> Hashable:
 
 
 def _plan_of(plan: Plan, trial: Trial) -> Plan:
-    """Return the plan of one trial; raises SettingsError or EstimatorError where it cannot be run."""
     values = with_changes(as_values(plan.settings), dict(trial.changes))
     settings = settings_of(values, f"{trial.estimator} {trial}")
     entry = _entry(plan, trial)

@@ -91,14 +91,12 @@ def variants_of(entry: EstimatorEntry, settings: Settings, case: Prepared) -> It
 
 
 def _full_keys(estimator: str, taking: Mapping[str, Scalar]) -> dict[str, Scalar]:
-    """Return settings with the full keys of an estimator's own options."""
     return {
         key if "." in key or key == OUTPUT else f"estimators.{estimator}.{key}": value for key, value in taking.items()
     }
 
 
 def _are_set(values: Mapping[str, Any], taking: Mapping[str, Scalar]) -> bool:
-    """Say whether all settings of one ingredient have the values already that take it away."""
     return all(value_at(values, key) == value for key, value in taking.items())
 
 

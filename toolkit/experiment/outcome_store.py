@@ -91,7 +91,6 @@ class FilesRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vi
 
 
 def _line_of(record: OutcomeRecord) -> bytes:
-    """Return the line of an outcome with its checksum."""
     line = msgspec.json.encode(record)
     return line[:-2] + hashlib.sha256(line).hexdigest().encode() + line[-2:]
 

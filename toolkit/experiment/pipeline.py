@@ -152,7 +152,6 @@ def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress
 
 
 def _with_references(plan: Plan, case: Prepared, files: Mapping[str, ExternalFile]) -> Prepared:
-    """Return a prepared source with what other systems estimated from it."""
     source, sequence = case.source, case.sequence
     brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
     check_names(brought, files)
@@ -177,7 +176,6 @@ def store_of(plan: Plan, case: Prepared, directory: Path) -> OutcomeStore:
 
 
 def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
-    """Return the SHA-256 of each estimator that is a file of the user's own, by name."""
     return {name: entry.own_digest for name, entry in entries.items() if entry.own_digest}
 
 

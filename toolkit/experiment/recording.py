@@ -149,7 +149,6 @@ def prepare_once(recording: Recording) -> Prepared:
 
 
 def _for_audit(recording: Recording) -> Recording:
-    """Return what the audit of a recording depends on."""
     others = {name: getattr(_NO_RECORDING, name) for name in ("noise", "tracks", "start", "card", "faults")}
     return replace(recording, **others)
 
@@ -364,12 +363,10 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
-    """Return the audit's findings, with the tracks tested against the noise that the settings state instead."""
     return checked_again(audited, "track-scatter", used)
 
 
 def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:
-    """Return the whole recording and the card of the tracks that are used, or a fact that says why there is none."""
     try:
         return whole, card_of(used)
     except DataError as error:

@@ -170,17 +170,8 @@ def jackknife_interval(estimate: Callable[..., float], *rows: Array) -> Interval
     return Paired(STRETCHES, estimate(*rows), jackknife_error(estimate, *rows)).interval
 
 
-@dataclass(frozen=True)
-class Ratio:
-    """A ratio of two means over n seeds, with its standard error."""
-
-    n: int
-    value: float
-    error: float
-
-
-def ratio_of_means(above: Iterable[float | None], below: Iterable[float | None]) -> Ratio | None:
-    """Return the mean of the first over that of the second; None with fewer than two common seeds.
+def ratio_of_means(above: Iterable[float | None], below: Iterable[float | None]) -> Paired | None:
+    """Return the mean of the first over that of the second, paired by seed; None with fewer than two common seeds.
 
     Its error is that of ``above - ratio * below``, whose mean is zero (Cochran, "Sampling techniques", 1977, section
     2.11): a mean of the seeds' own ratios would be biased.
@@ -191,7 +182,7 @@ def ratio_of_means(above: Iterable[float | None], below: Iterable[float | None])
     over, under = np.array(common).T
     value = over.mean() / under.mean()
     error = np.std(over - value * under, ddof=1) / np.sqrt(len(common)) / under.mean()
-    return Ratio(len(common), float(value), float(error))
+    return Paired(len(common), float(value), float(error))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
 from toolkit.estimator import Build
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
-from toolkit.experiment.stretches import drift_over_stretches, held_out_over_stretches, no_stretches
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.metrics import Evaluation, Scores, repeated, scores_of
 from toolkit.metrics.parts.consistency import body_errors, nees_over_time, nis_over_time
 from toolkit.metrics.parts.scores import Unavailable
@@ -23,6 +22,8 @@ from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
 
 OUTPUTS: tuple[Output, ...] = ("causal", "final")
+# Equal stretches of time that a recording is divided into.
+STRETCHES = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,11 @@ class Unit:
     def requested(self) -> Recording:
         """Return the recording as it is asked for."""
         return self.recording.recording if isinstance(self.recording, Prepared) else self.recording
+
+
+def no_stretches() -> Array:
+    """Return errors over no stretch (40,): NaN."""
+    return np.full(STRETCHES, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +120,6 @@ def run_unit(unit: Unit, progress: Progress) -> Outcome:
 
 
 def _trajectory_texts(run: Run) -> dict[Output, str]:
-    """Return the trajectories of a run as the texts of TUM files."""
     given = {output: run.trajectory(output) for output in OUTPUTS}
     return {output: tum.text(trajectory) for output, trajectory in given.items() if trajectory is not None}
 
@@ -181,3 +186,34 @@ def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) ->
     """Enter values (n,) at stamps (n,) into a series (K,) by frame; stamps of no frame are left out."""
     row, is_frame = rows_of(t_ns, frames_t_ns)
     series[row[is_frame]] = values[is_frame]
+
+
+def drift_over_stretches(evaluation: Evaluation) -> Array:
+    """Return how far an estimate drifts against the truth over each stretch (40,) m, NaN where it lacks an end of it.
+
+    That is the error of the motion from its first pose to its last, for which nothing is aligned.
+    """
+    try:
+        pairs = evaluation.compared
+    except Unavailable:
+        return no_stretches()
+    first_ns, last_ns = evaluation.sequence.frames_t_ns[[0, -1]].tolist()
+    ends_ns = np.linspace(first_ns, last_ns, STRETCHES + 1)
+    row = np.rint(np.interp(ends_ns, pairs.t_ns, np.arange(len(pairs)))).astype(int)
+    near = np.abs(pairs.t_ns[row] - ends_ns) < 0.5 * (ends_ns[1] - ends_ns[0])
+    drift_m = np.linalg.norm(drift_in_body(pairs.truth[row], pairs.estimate[row]), axis=1)
+    return np.where(near[:-1] & near[1:], drift_m, np.nan)
+
+
+def drift_in_body(truth: Array, estimate: Array) -> Array:
+    """Return how far the motion between neighbouring poses (K + 1, 4, 4) is off, (K, 3) m in the body at its begin."""
+    true_step, step = (se3_inverse(poses[:-1]) @ poses[1:] for poses in (truth, estimate))
+    return np.asarray(step[:, :3, 3] - true_step[:, :3, 3])
+
+
+def held_out_over_stretches(evaluation: Evaluation) -> Array:
+    """Return the median error of withheld tracks in each stretch (40,) px, NaN where there is none."""
+    rows, errors_px = evaluation.held_out_errors
+    t_s = evaluation.sequence.frames_s
+    stretch = (STRETCHES * t_s[evaluation.sequence.held_out.frame[rows]] / t_s[-1]).astype(int).clip(max=STRETCHES - 1)
+    return np.array([np.median(errors_px[of]) if (of := stretch == k).any() else np.nan for k in range(STRETCHES)])

@@ -256,7 +256,6 @@ class _HandingOut(Generic[R]):
             yield place, self._retry_alone(place, meanwhile)
 
     def _retry_alone(self, place: int, meanwhile: Callable[[], None]) -> R | LostUnit:
-        """Try a task once more, in a process of its own."""
         process = WorkerProcess()
         try:
             future: Future[R] = process.submit(*self._tasks[place])
@@ -314,7 +313,6 @@ class _Board:
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
-    """Do a unit of work in a process of its own."""
     entries = np.memmap(board, dtype=_ENTRY, mode="r+")
     entries[place] = (0, 1, 0, b"")
     try:

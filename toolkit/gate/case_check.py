@@ -223,7 +223,6 @@ class _Sides:
 
 
 def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
-    """Say which values are there no more; nothing where all are."""
     if now is None:
         return "it has no value any more"
     if len(now) != len(before):
@@ -276,7 +275,6 @@ def _worsening(criterion: Criterion, before: float, after: float) -> float:
 
 
 def _distance(before: float, after: float) -> float:
-    """Return how far a value moved, up or down, as a fraction."""
     if min(before, after) <= 0.0:
         return math.inf * (after != before)
     return math.expm1(abs(math.log(after / before)))

@@ -131,7 +131,6 @@ def _beyond_p(differences: Array) -> float:
 
 
 def _scale(differences: Array) -> float:
-    """Return the standard deviation of differences (n,), from their 10 % and 90 % quantiles."""
     return float(np.ptp(np.percentile(differences, _TAILS_PERCENT))) / (2.0 * _TAILS_OF_NORMAL)
 
 
@@ -202,7 +201,6 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def _estimators_of(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[set[str]]:
-    """Return which estimators each side has; raises BaselineError where both sides are the same code."""
     found = [side.request("where", estimators=names) for side in sides]
     if found[0] == found[1]:
         raise BaselineError(f"{version} does not contain the code that runs here ({found[0]['toolkit']}); name another")

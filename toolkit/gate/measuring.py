@@ -156,7 +156,6 @@ def _why_absent(name: str) -> str:
 
 
 def _timed(result: TimedOutcome | LostUnit, unit: Unit) -> TimedOutcome:
-    """Return the result of a unit; of one whose process died only the status."""
     if isinstance(result, LostUnit):
         return TimedOutcome(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
     return result
@@ -213,7 +212,6 @@ def _small_updates(roots: Array, jacobians: Array) -> None:
 
 
 def _joint_updates(joint: Array) -> None:
-    """Correct a joint state of 150 by 30 measurements."""
     rows = joint[:30]
     for _ in range(_JOINT):
         gain = np.linalg.solve(rows[:, :30] + np.eye(30), rows)

@@ -234,7 +234,6 @@ def check_metrics(tests: Sequence[Pairs | Repeats], rate: float, *, accept_bette
 
 
 def _is_nearer(one: Compared) -> bool:
-    """Say whether a metric is nearer to its ideal value than before."""
     was, is_ = float(log_of(one.before).mean()), float(log_of(one.after).mean())
     return is_ < was if one.criterion.worse == "larger" else abs(is_) < abs(was)
 

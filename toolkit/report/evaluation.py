@@ -15,9 +15,16 @@ import numpy as np
 from msgspec.structs import replace
 
 from toolkit.errors import DataError
-from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE
-from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedRecord, Quartiles, StandingRecord
+from toolkit.evaluation.standings import (
+    Cell,
+    EvaluatedSystems,
+    PairedRecord,
+    Quartiles,
+    StandingRecord,
+    evaluation_document,
+    read_evaluation,
+)
 from toolkit.experiment.statistics import mean_interval
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory, with_folders

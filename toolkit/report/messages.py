@@ -239,7 +239,7 @@ def _stated_over_true(row: Row) -> str:
     """Say how much of its true variance an output states, the bound and its excess over it, where both are known."""
     true = [None if excess is None else 1.0 + excess for excess in row.good_values("excess_variance")]
     found = ratio_of_means(row.good_values("claimed_variance"), true)
-    return "" if found is None else f"; it states {found.value:.2f} ± {found.error:.2f} of its true variance"
+    return "" if found is None else f"; it states {found.mean:.2f} ± {found.error:.2f} of its true variance"
 
 
 def paired_lines(comparison: Comparison) -> Iterator[str]:

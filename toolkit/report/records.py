@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from toolkit.evaluation.against_baseline import TrajectoryBaselineRecord
-from toolkit.evaluation.document import EvaluationRecord
+from toolkit.evaluation.standings import EvaluationRecord
 from toolkit.files.documents import reader, schema
 from toolkit.files.writing import write_text
 from toolkit.gate.baseline import BaselineRecord

@@ -133,7 +133,6 @@ def arrays_of(value: object) -> Iterator[Array]:
 
 
 def _named_arrays(value: object, name: str) -> Iterator[tuple[str, Array]]:
-    """Yield every array with the name of the innermost field that has it."""
     if isinstance(value, np.ndarray):
         yield name, value
     elif isinstance(value, tuple):

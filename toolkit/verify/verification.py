@@ -207,7 +207,6 @@ def _of_runs(watched: list[Watched]) -> Iterator[CheckedPromise]:
 
 
 def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
-    """Return the first complaint about any of the runs, with its scenario."""
     for one in watched:
         if found := broken(one):
             return f"{one.sequence.name}: {found}"
