@@ -39,7 +39,7 @@ import gate_pool
 from toolkit.experiment.statistics import holm
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
-from toolkit.gate.case_check import changed_metrics
+from toolkit.gate.case_check import CaseVerdicts, changed_metrics
 from toolkit.gate.significance import Pairs, Where
 from toolkit.progress import silent
 
@@ -225,7 +225,7 @@ def measure_turns(times: Path, revision: str) -> None:
     cases = [Case(source, True, (0,), ESTIMATORS, seconds) for source, seconds in CASES.items()]
     baseline = Baseline({}, tuple((case, Measured((), (), {})) for case in cases))
     with patch.object(interleaved, "pairs_needed", lambda _differences: MOST_TIMED):
-        found = interleaved.timed_in_turn(baseline, revision, silent).timed
+        found = interleaved.timed_in_turn(baseline, revision, silent, CaseVerdicts())
     lines = [json.dumps([one.case, one.estimator, one.cpu_s.tolist()]) for one in found]
     times.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

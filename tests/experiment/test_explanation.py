@@ -7,8 +7,7 @@ import pytest
 
 from toolkit.audit import Audit
 from toolkit.experiment import Plan, recording
-from toolkit.experiment.explanation import ERROR, Explanation, run_explanation
-from toolkit.experiment.ingredients import GATE
+from toolkit.experiment.explanation import ERROR, GATE, Explanation, run_explanation
 from toolkit.report.explanation import explanation_document
 from toolkit.settings.reading import settings_of
 

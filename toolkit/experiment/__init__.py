@@ -3,8 +3,8 @@
 Reading order: recording (the data) -> units (one run of one estimator) -> workers, cluster (where units run) ->
 outcome_store (results on disk, under a key that code_version is part of) -> references (estimates of other systems) ->
 pipeline -> comparison (the result, with verdicts on stated uncertainty) -> contests (who wins, or that nobody does);
-grid (many settings and planted faults at once) -> sweep (along axes); ingredients (in what estimators differ) ->
-explanation (what each of these brings); statistics; disagreement (estimators that contradict the measured
+grid (many settings and planted faults at once) -> sweep (along axes), explanation (in what
+estimators differ, and what each of these brings); statistics; disagreement (estimators that contradict the measured
 motion). configuration: a comparison as a file. Names of the package are imported when first used, because its
 statistics need neither estimators nor GTSAM.
 """

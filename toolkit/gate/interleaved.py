@@ -15,7 +15,7 @@ import sys
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
-from toolkit.progress import Progress, ProgressFor
+from toolkit.progress import ProgressFor
 from toolkit.settings import changes_of
 from toolkit.threads import THREAD_VARIABLES
 
@@ -60,45 +60,37 @@ class TimedPairs:
         return logs[:, 1] - logs[:, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class Turns:
-    """The times, what the other version could be timed on and this one cannot, and remarks."""
-
-    timed: tuple[TimedPairs, ...]
-    missing: tuple[Verdict, ...]
-    notes: tuple[str, ...]
-
-
 def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> CaseVerdicts:
     """Judge the time of a baseline's estimators, the installed code's against another version's.
 
     Raises BaselineError where the version cannot be found or cannot be timed.
     """
-    turns = timed_in_turn(baseline, version, progress_for)
-    return CaseVerdicts([*turns.missing, *check_speeds(turns.timed, version, rate)], notes=list(turns.notes))
+    found = CaseVerdicts()
+    found.verdicts += check_speeds(timed_in_turn(baseline, version, progress_for, found), version, rate)
+    return found
 
 
-def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
-    """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
+def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor, found: CaseVerdicts) -> list[TimedPairs]:
+    """Time the estimators of a baseline in both versions; what only the other could be timed on is found missing."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    timed: list[TimedPairs | Verdict | str] = []
+    timed = list[TimedPairs]()
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
         there, here = _estimators_of(version, sides, names)
-        new = [name for name in names if name not in there]
-        if new:
-            timed.append(f"{', '.join(new)}: not in {version}, and not timed")
+        if new := [name for name in names if name not in there]:
+            found.notes.append(f"{', '.join(new)}: not in {version}, and not timed")
         for case in cases:
             known = [name for name in case.estimators if name in there]
-            timed += [_not_timed(case.source, name, "is not there any more") for name in known if name not in here]
+            found.verdicts += [
+                _not_timed(case.source, name, "is not there any more") for name in known if name not in here
+            ]
+            both = [name for name in known if name in here]
             with progress_for(f"{case.source}: speed against {version}") as progress:
                 _prepare(sides, case, baseline)
-                timed += _timed(sides, case.source, [name for name in known if name in here], progress)
-    return Turns(
-        tuple(one for one in timed if isinstance(one, TimedPairs)),
-        tuple(one for one in timed if isinstance(one, Verdict)),
-        tuple(one for one in timed if isinstance(one, str)),
-    )
+                for done, name in enumerate(both):
+                    progress.advance(done, len(both))
+                    timed += _times(sides, case.source, name, found)
+    return timed
 
 
 def _not_timed(case: str, estimator: str, why: str) -> Verdict:
@@ -220,32 +212,23 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
         )
 
 
-def _timed(
-    sides: Sequence[Process], source: str, estimators: Sequence[str], progress: Progress
-) -> Iterator[TimedPairs | Verdict | str]:
-    """Yield the times of each estimator on the recording that is ready, or why it has none."""
-    for done, name in enumerate(estimators):
-        progress.advance(done, len(estimators))
-        yield _time(sides, source, name)
-
-
-def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | Verdict | str:
-    """Time both sides in turn; where a run does not end well return why, as a failure if it did in the other code."""
-    first = [side.request("run", estimator=estimator) for side in sides]  # warms up, and is not counted
-    if first[0]["status"] == "ok" != first[1]["status"]:
-        return _not_timed(source, estimator, f"ends {first[1]['status']} here and ended well there")
-    if first[0]["status"] != "ok":
-        return f"{source}: {estimator} ends {first[0]['status']} there and {first[1]['status']} here, and is not timed"
-    pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
-    more = pairs_needed(TimedPairs(source, estimator, pairs).differences)
-    further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
-    return TimedPairs(source, estimator, np.array([*pairs.tolist(), *further]))
+def _times(sides: Sequence[Process], source: str, estimator: str, found: CaseVerdicts) -> Iterator[TimedPairs]:
+    """Time both sides in turn; a run that does not end well is found, as a failure if it did in the other code."""
+    there, here = (side.request("run", estimator=estimator)["status"] for side in sides)  # warms up, and is not counted
+    if there == here == "ok":
+        pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
+        more = pairs_needed(TimedPairs(source, estimator, pairs).differences)
+        further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
+        yield TimedPairs(source, estimator, np.array([*pairs.tolist(), *further]))
+    elif there == "ok":
+        found.verdicts.append(_not_timed(source, estimator, f"ends {here} here and ended well there"))
+    else:
+        found.notes.append(f"{source}: {estimator} ends {there} there and {here} here, and is not timed")
 
 
 def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, float]:
     """Return the seconds of the old and the new code; every second time the new code goes first."""
-    order: Mapping[int, Process] = dict(enumerate(sides))
-    times = {side: float(order[side].request("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
+    times = {side: float(sides[side].request("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
     return times[0], times[1]
 
 

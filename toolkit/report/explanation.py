@@ -12,8 +12,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
-from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation
-from toolkit.experiment.ingredients import Variant, called
+from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation, Variant, called
 from toolkit.experiment.statistics import Paired
 from toolkit.files.documents import Count, reader, rounded, to_text
 from toolkit.files.writing import check_replaceable

@@ -101,60 +101,51 @@ class Verification:
         return all(check.result != "failed" for check in self.checks)
 
 
-# Promises checked on one watched run, each with the function that finds a violation.
-_OF_A_RUN: Mapping[str, Callable[[Watched], str]] = {
-    "poses, velocities and biases are numbers": promises.not_finite,
-    "rotations are rotations": promises.no_rotation,
-    "an answer at each frame, with its stamp": promises.wrong_stamps,
-    "causal: later packets change no earlier answer": promises.look_ahead,
-    "deterministic: a second run gives the same bits": promises.other_answers,
-    "an answer does not change after it was given": promises.changed_later,
-    "setup and packets stay untouched": promises.touched,
+# Promises checked on one watched run: the function that finds a violation, and what to do about it.
+_OF_A_RUN: Mapping[str, tuple[Callable[[Watched], str], str]] = {
+    "poses, velocities and biases are numbers": (
+        promises.not_finite,
+        "look for a division by zero, a logarithm or square root of less than zero, an inverse of a singular "
+        "matrix; raise EstimatorError where it cannot go on",
+    ),
+    "rotations are rotations": (
+        promises.no_rotation,
+        "compose with se3_exp, so3_exp and products of rotations; project onto SO(3) after many of them",
+    ),
+    "an answer at each frame, with its stamp": (
+        promises.wrong_stamps,
+        "answer with packet.frame.t_ns at every step, or with None at every one; finish() has a state for each frame",
+    ),
+    "causal: later packets change no earlier answer": (
+        promises.look_ahead,
+        "use what step() was given so far alone: no packets kept from another run, no base of an array that reaches"
+        " into later frames",
+    ),
+    "deterministic: a second run gives the same bits": (
+        promises.other_answers,
+        "seed every random number in build(); keep nothing in the module or the class between runs",
+    ),
+    "an answer does not change after it was given": (
+        promises.changed_later,
+        "return a copy of the state, not the array that the next step writes into",
+    ),
+    "setup and packets stay untouched": (promises.touched, "copy an array before writing into it"),
 }
 _RUNS, _COVARIANCE = "it runs to the end", "covariances are finite, symmetric, positive definite"
 _NEES, _THREADS = f"consistent: pose NEES over {SEEDS} seeds", "one thread and two give the same bits"
 _TROUBLE = "it goes on through every planted fault"
 _NO_COVARIANCE = "it states no covariance"
 # What to do where a promise is broken.
-_REMEDIES: Mapping[str, str] = {
-    "poses, velocities and biases are numbers": (
-        "look for a division by zero, a logarithm or square root of less than zero, an inverse of a singular "
-        "matrix; raise EstimatorError where it cannot go on"
-    ),
-    "rotations are rotations": (
-        "compose with se3_exp, so3_exp and products of rotations; project onto SO(3) after many of them"
-    ),
-    "an answer at each frame, with its stamp": (
-        "answer with packet.frame.t_ns at every step, or with None at every one; finish() has a state for each frame"
-    ),
-    "causal: later packets change no earlier answer": (
-        "use what step() was given so far alone: no packets kept from another run, no base of an array that reaches"
-        " into later frames"
-    ),
-    "deterministic: a second run gives the same bits": (
-        "seed every random number in build(); keep nothing in the module or the class between runs"
-    ),
-    "an answer does not change after it was given": (
-        "return a copy of the state, not the array that the next step writes into"
-    ),
-    "setup and packets stay untouched": "copy an array before writing into it",
-    _RUNS: (
-        "see the line named; raise EstimatorError, with the reason, where it cannot go on, and in build() for an "
-        "input that it is not made for (setup.motion_kind)"
-    ),
-    _COVARIANCE: (
-        "symmetrise after every update, P = (P + P^T) / 2, and look for a subtraction that may leave less than "
-        "nothing; the pose comes first, rotation before position, in the body frame"
-    ),
-    _NEES: (
-        "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "
-        "Jacobians at first estimates; below it, assume less noise; see docs/metrics.md"
-    ),
+_REMEDIES: Mapping[str, str] = {name: remedy for name, (_, remedy) in _OF_A_RUN.items()} | {
+    _RUNS: "see the line named; raise EstimatorError, with the reason, where it cannot go on, and in build() for an "
+    "input that it is not made for (setup.motion_kind)",
+    _COVARIANCE: "symmetrise after every update, P = (P + P^T) / 2; look for a subtraction that may leave less than "
+    "nothing; the pose comes first, rotation before position, in the body frame",
+    _NEES: "above the band it is overconfident: add process noise, correlate landmarks with the pose, or take "
+    "Jacobians at first estimates; below it, assume less noise; see docs/metrics.md",
     _THREADS: "sum in a fixed order; leave no result to which thread is first",
-    _TROUBLE: (
-        "expect frames without sightings, negative disparities, gross outliers; recover and report it in "
-        "Finished(log=...)"
-    ),
+    _TROUBLE: "expect frames without sightings, negative disparities, gross outliers; recover and report it in "
+    "Finished(log=...)",
 }
 
 
@@ -198,7 +189,7 @@ def _runs(raised: str, declined: Mapping[str, str]) -> CheckedPromise:
 
 
 def _of_runs(watched: list[Watched]) -> Iterator[CheckedPromise]:
-    for name, broken in _OF_A_RUN.items():
+    for name, (broken, _) in _OF_A_RUN.items():
         yield _check(name, partial(_first, watched, broken))
     if any(promises.states_covariance(one) for one in watched):
         yield _check(_COVARIANCE, lambda: _first(watched, promises.unsound_covariance))
