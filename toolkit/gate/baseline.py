@@ -129,12 +129,8 @@ class SeriesRecord(Struct, frozen=True, kw_only=True):
     @property
     def outputs(self) -> dict[Output, dict[str, Values]]:
         """Return the metrics by kind of output."""
-        found: dict[Output, dict[str, Values]] = {}
-        if self.causal is not UNSET:
-            found["causal"] = self.causal
-        if self.final is not UNSET:
-            found["final"] = self.final
-        return found
+        given: dict[Output, dict[str, Values] | UnsetType] = {"causal": self.causal, "final": self.final}
+        return {output: metrics for output, metrics in given.items() if metrics is not UNSET}
 
 
 @dataclass(frozen=True)
@@ -248,7 +244,7 @@ def load_baseline(path: Path) -> Baseline:
     if path.is_dir():
         return _of_these_releases(path)
     try:
-        return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+        return _of_record(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
     except BaselineError as error:
         if "'vislam.trajectory-baseline/" not in str(error):
             raise
@@ -280,24 +276,17 @@ def check_releases(baseline: Baseline, name: str) -> None:
 
 def to_text(baseline: Baseline) -> str:
     """Return the document; refuses NaN and infinity, which are not JSON."""
-    return json_text(to_builtins(document(baseline)))
-
-
-def document(baseline: Baseline) -> BaselineRecord:
-    """Return a baseline as a record."""
-    return BaselineRecord(
+    record = documents.of_attributes(
+        BaselineRecord,
+        baseline,
         schema="vislam.baseline/1",
-        made_by=dict(baseline.made_by),
-        releases=dict(baseline.releases),
-        false_alarm_rate=baseline.false_alarm_rate,
-        bounds=baseline.bounds,
         settings=changes_of(baseline.settings) or UNSET,
         sequences=tuple(_case_record(case, measured) for case, measured in baseline.cases),
     )
+    return json_text(to_builtins(record))
 
 
-def from_document(record: BaselineRecord) -> Baseline:
-    """Return the baseline of a record."""
+def _of_record(record: BaselineRecord) -> Baseline:
     return Baseline(
         record.releases,
         tuple(_case(case) for case in record.sequences),
@@ -309,27 +298,14 @@ def from_document(record: BaselineRecord) -> Baseline:
 
 
 def _case_record(case: Case, measured: Measured) -> CaseRecord:
-    return CaseRecord(
-        source=case.source,
-        kind="simulated" if case.simulated else "recorded",
-        duration_s=case.duration_s,
-        truth=case.truth,
-        seeds=case.seeds,
-        hashes=measured.hashes,
-        fingerprints=measured.fingerprints,
-        runs=dict(measured.runs),
-    )
+    of_case = {name: getattr(case, name) for name in ("source", "duration_s", "truth", "seeds")}
+    kind: Literal["simulated", "recorded"] = "simulated" if case.simulated else "recorded"
+    return documents.of_attributes(CaseRecord, measured, kind=kind, **of_case)
 
 
 def _case(record: CaseRecord) -> tuple[Case, Measured]:
-    case = Case(
-        source=record.source,
-        simulated=record.kind == "simulated",
-        seeds=record.seeds,
-        estimators=tuple(record.runs),
-        duration_s=record.duration_s,
-        truth=record.truth,
-    )
+    simulated, estimators = record.kind == "simulated", tuple(record.runs)
+    case = Case(record.source, simulated, record.seeds, estimators, record.duration_s, record.truth)
     return case, Measured(record.hashes, record.fingerprints, record.runs)
 
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from toolkit.experiment.recording import prepare
-from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
+from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, installed_releases
 from toolkit.gate.case_check import USUAL_TERMS, CaseVerdicts, CheckTerms, check_case
 from toolkit.gate.interleaved import compare_speed
-from toolkit.gate.measuring import measure, metrics_of, recordings_of
+from toolkit.gate.measuring import measure, recordings_of
 from toolkit.gate.significance import check_metrics
 from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
@@ -33,9 +33,7 @@ def new_baseline(
         for entry in find_all(case.estimators).values():
             entry.check_usable(settings)
         prepare(recordings_of(case, settings)[0])
-    measured = tuple(
-        (case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), settings, workers, progress_for)) for case in cases
-    )
+    measured = tuple((case, measure(case, DEFAULT_BOUNDS, settings, workers, progress_for)) for case in cases)
     return Baseline(installed_releases(), measured, made_by=made_by, settings=settings)
 
 
@@ -57,7 +55,7 @@ def check(
         terms = replace(terms, speed=False)
         collected.add(compare_speed(baseline, speed_against, baseline.false_alarm_rate, progress_for))
     for case, before in baseline.cases:
-        now = _measured(case, metrics_of(case, baseline.bounds), baseline.settings, workers, progress_for)
+        now = measure(case, baseline.bounds, baseline.settings, workers, progress_for)
         collected.add(check_case(case, before, now, baseline.bounds, terms))
     return check_all(collected, baseline, name, time.monotonic() - began, terms)
 
@@ -73,21 +71,6 @@ def check_all(
         for k, name in enumerate(("", *before.runs))
     }
     verdicts = sorted([*collected.verdicts, *tested], key=lambda v: (places[v.sequence, v.estimator], v.output))
-    return Check(
-        name,
-        tuple(verdicts),
-        tuple(dict.fromkeys(collected.notes)),
-        baseline.false_alarm_rate,
-        len(tested),
-        installed_releases(),
-        seconds,
-        terms.accept_better,
-    )
-
-
-def _measured(
-    case: Case, metrics: Sequence[str], settings: Settings, workers: int, progress_for: ProgressFor
-) -> Measured:
-    runs = len(case.seeds) * len(case.estimators)
-    with progress_for(f"{case.source}: {runs} runs") as progress:
-        return measure(case, metrics, settings, workers, progress)
+    notes, rate = tuple(dict.fromkeys(collected.notes)), baseline.false_alarm_rate
+    releases = installed_releases()
+    return Check(name, tuple(verdicts), notes, rate, len(tested), releases, seconds, terms.accept_better)

@@ -17,7 +17,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from toolkit.answers import Output, Run, Status
+from toolkit.answers import Output
 from toolkit.datasets import is_built_in
 from toolkit.errors import EstimatorError, VislamError
 from toolkit.experiment.recording import Recording, prepare
@@ -33,7 +33,7 @@ from toolkit.experiment.units import (
 from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import COVERAGE, BoundsRecord, Case, Measured, SeriesRecord, Values
 from toolkit.geometry import Array
-from toolkit.progress import Progress
+from toolkit.progress import Progress, ProgressFor
 from toolkit.registry import find
 from toolkit.sequence import Sequence
 from toolkit.settings import Settings
@@ -75,8 +75,8 @@ def place_of(path: str) -> Path | None:
     return next((place for place in places if place.exists()), None)
 
 
-def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int, progress: Progress) -> Measured:
-    """Run every estimator of a case under every seed.
+def measure(case: Case, bounds: BoundsRecord, settings: Settings, workers: int, progress_for: ProgressFor) -> Measured:
+    """Run every estimator of a case under every seed, for the metrics that have bounds.
 
     An estimator that is not there is ``absent``, a sequence that cannot be read ``unreadable``; neither is raised as an
     error, because a check reports everything that is missing.
@@ -93,13 +93,20 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
     try:
         if units:
             prepare(recordings[0])
-        with closing(results_of(units, workers, timed, progress, recording_to_prepare)) as coming:
-            found = [_timed(result, units[place]) for place, result in coming]
+        with (
+            progress_for(f"{case.source}: {len(case.seeds) * len(case.estimators)} runs") as progress,
+            closing(results_of(units, workers, timed, progress, recording_to_prepare)) as coming,
+        ):
+            found = [
+                _failed(units[place].estimator, units[place].seed, one.why) if isinstance(one, LostUnit) else one
+                for place, one in coming
+            ]
     except EstimatorError:
         raise
     except VislamError as error:
         return Measured((), (), {}, absent, unreadable=str(error))
-    return gathered(present, found, tuple(metrics), absent)
+    metrics = (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
+    return gathered(present, found, metrics, absent)
 
 
 def timed(unit: Unit, progress: Progress) -> TimedOutcome:
@@ -110,7 +117,9 @@ def timed(unit: Unit, progress: Progress) -> TimedOutcome:
     run = run_estimator(unit, prepared, progress)
     reference = (before_s + reference_s()) / 2.0
     outcome = replace(outcome_of(run, prepared.sequence, unit.seed), run=None)
-    return TimedOutcome(outcome, _over(run, reference), fingerprint(prepared.sequence))
+    timings = run.timings if run.status in ("ok", "diverged") else None  # one that failed ended early
+    speed = None if timings is None else timings.cpu_s / reference
+    return TimedOutcome(outcome, speed, fingerprint(prepared.sequence))
 
 
 def fingerprint(sequence: Sequence) -> str:
@@ -124,11 +133,6 @@ def fingerprint(sequence: Sequence) -> str:
     return sequence.content_hash(_DIGITS)[:_LENGTH]
 
 
-def metrics_of(case: Case, bounds: BoundsRecord) -> tuple[str, ...]:
-    """Return the metrics a case is checked by."""
-    return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
-
-
 def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], absent: dict[str, str]) -> Measured:
     """Arrange outcomes, which come in any order, by estimator and seed; keep the metrics of interest."""
     by_run = {(one.outcome.estimator, one.outcome.seed): one for one in found}
@@ -136,15 +140,16 @@ def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], a
     hashes = tuple(read[seed].outcome.sequence_hash if seed in read else "" for seed in case.seeds)
     prints = tuple(read[seed].fingerprint if seed in read else "" for seed in case.seeds)
     by_name = {
-        name: [by_run.get((name, seed)) or _not_run(name, seed) for seed in case.seeds] for name in case.estimators
+        name: [by_run.get((name, seed)) or _failed(name, seed, "it was not run") for seed in case.seeds]
+        for name in case.estimators
     }
     runs = {name: _series(ended, metrics) for name, ended in by_name.items()}
     why = {name: next(filter(None, (one.outcome.why for one in ended)), "") for name, ended in by_name.items()}
     return Measured(hashes, prints, runs, absent, why=why)
 
 
-def _not_run(estimator: str, seed: int) -> TimedOutcome:
-    return TimedOutcome(Outcome(seed, estimator, "failed", log=("it was not run",)))
+def _failed(estimator: str, seed: int, why: str) -> TimedOutcome:
+    return TimedOutcome(Outcome(seed, estimator, "failed", log=(why,)))
 
 
 def _why_absent(name: str) -> str:
@@ -155,22 +160,13 @@ def _why_absent(name: str) -> str:
     return ""
 
 
-def _timed(result: TimedOutcome | LostUnit, unit: Unit) -> TimedOutcome:
-    if isinstance(result, LostUnit):
-        return TimedOutcome(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
-    return result
-
-
-def _over(run: Run, reference: float) -> float | None:
-    """Return a run's processor time over the reference's; None for a run that ended early."""
-    ended: tuple[Status, ...] = ("ok", "diverged")
-    return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
-
-
 def _series(found: Several[TimedOutcome], metrics: Several[str]) -> SeriesRecord:
     """Return the series of one estimator; a final output that only repeats the causal one is left out."""
     outcomes = [one.outcome for one in found]
-    outputs = [{o: s.scores.values for o, s in one.outputs.items() if o not in _repeated(one)} for one in outcomes]
+    outputs = [
+        {o: s.scores.values for o, s in one.outputs.items() if not (o == "final" and one.final_is_causal)}
+        for one in outcomes
+    ]
     given: list[Output] = [output for output in OUTPUTS if any(output in one for one in outputs)]
     values: dict[Output, dict[str, Values]] = {
         output: {key: tuple(one.get(output, {}).get(key) for one in outputs) for key in metrics} for output in given
@@ -179,10 +175,6 @@ def _series(found: Several[TimedOutcome], metrics: Several[str]) -> SeriesRecord
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
     status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
     return SeriesRecord(status=status, speed=speed, **kept)
-
-
-def _repeated(outcome: Outcome) -> tuple[Output, ...]:
-    return ("final",) if outcome.final_is_causal else ()
 
 
 def reference_s() -> float:
