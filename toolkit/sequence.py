@@ -212,6 +212,10 @@ class Sequence:
         kept = self.observations.select(self.observations.frame < max_frames)
         return replace(self, frames_t_ns=self.frames_t_ns[:max_frames], observations=kept)
 
+    def with_facts(self, *facts: str) -> Self:
+        """Return the sequence with more facts that a reader of its results must know."""
+        return replace(self, provenance=replace(self.provenance, facts=(*self.provenance.facts, *facts)))
+
     def with_frames(self, kept: IntArray) -> Self:
         """Return the sequence with the frames ``kept`` (M,), in that order, without the sightings of the others.
 

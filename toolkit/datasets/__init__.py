@@ -12,7 +12,6 @@ A package of another distribution is found where it is announced under the entry
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import cache
 from itertools import islice
 from numbers import Real
@@ -227,7 +226,7 @@ def told_of_both(sequence: Sequence, source: str) -> Sequence:
     other = f"the built-in sequence {source} is read: what is called so here is no recording"
     if not is_built_in(source):
         other = f"the recording here is read, and not the built-in sequence {source}, which is read elsewhere"
-    return replace(sequence, provenance=replace(sequence.provenance, facts=(*sequence.provenance.facts, other)))
+    return sequence.with_facts(other)
 
 
 def check_built_in(source: str, frontend: Frontend) -> None:

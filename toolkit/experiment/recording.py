@@ -272,8 +272,7 @@ def _with_usable_ids(sequence: Sequence) -> Sequence:
         return sequence
     anew = replace(sequence.observations, track_id=np.unique(ids, return_inverse=True)[1])
     fact = f"tracks are numbered anew, in the order of their ids: some of these are not in 0 ... {_LARGEST_ID}"
-    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
-    return replace(sequence, observations=anew, provenance=provenance)
+    return replace(sequence, observations=anew).with_facts(fact)
 
 
 def _cut(sequence: Sequence, recording: Recording) -> Sequence:
@@ -298,9 +297,7 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
             f"{sequence.name}: {part} it has {kept.size} frame(s), and two are needed; it has {sequence.frame_count} "
             f"in {sequence.duration_s:g} s"
         )
-    provenance = sequence.provenance
-    extended = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
-    taken = replace(sequence.with_frames(kept), provenance=extended)
+    taken = sequence.with_frames(kept).with_facts(f"a part of the recording: {part}")
     return taken if part.every == 1 else _with_truth_at_frames(taken)
 
 
@@ -357,9 +354,8 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
     given = len(thinned.visible) / max(len(sequence.visible), 1)
     if given == 1.0:
         return sequence
-    fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
-    facts = (*sequence.provenance.facts, fact)
-    return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
+    of = f"{given:.0%} of the sightings"
+    return thinned.with_facts(f"estimators are given at most {budget} tracks a frame (tracks.budget): {of}")
 
 
 def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
@@ -370,5 +366,4 @@ def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:
     try:
         return whole, card_of(used)
     except DataError as error:
-        fact = f"no card of its tracks: {str(error).removeprefix(f'{used.name}: ')}"
-    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, fact))), None
+        return whole.with_facts(f"no card of its tracks: {str(error).removeprefix(f'{used.name}: ')}"), None

@@ -49,8 +49,7 @@ def with_gap_twists(sequence: Sequence) -> Sequence:
         f"in {len(found.begin_t_ns)} intervals no track leads from one frame to the next; there the measured twist is "
         "improved by what vision saw before and after (noise.bridge_gaps)"
     )
-    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
-    return replace(sequence, gap_twists=found, provenance=provenance)
+    return replace(sequence, gap_twists=found).with_facts(fact)
 
 
 def _improved(sequence: Sequence, gaps: BoolArray, noise: TwistNoise) -> GapTwists | None:

@@ -105,8 +105,7 @@ def with_truth(sequence: Sequence, truth: Truth, facts: tuple[str, ...] = ()) ->
     # Only the order: the recording is not audited yet, and mixed axes of its own would look like a camera's.
     readings = (in_other_order(tum.other_order),)
     check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
-    source = replace(sequence.provenance, facts=(*sequence.provenance.facts, *facts))
-    return replace(sequence, truth=truth, provenance=source)
+    return replace(sequence, truth=truth).with_facts(*facts)
 
 
 def stamps_within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
