@@ -21,14 +21,14 @@ def build(setup):
 '''
 
 
-def test_every_estimator_and_every_format_of_recorded_data_says_what_to_cite() -> None:
+def test_every_estimator_and_every_format_of_recorded_data_says_what_to_cite():
     # What these hold was published by nobody, or is the user's own.
     own = {"vislam-recording", "own-tables", "bags", "course-npy"}
     names = {*discover(), *formats()} - own
     assert not [name for name in names if not any(one.entries for one in citations([name]))]
 
 
-def test_every_reference_is_used_and_whole() -> None:
+def test_every_reference_is_used_and_whole():
     used = {key for one in citations([]) for key in one.entries}
     assert used == references().keys()
     for key, text in references().items():
@@ -36,7 +36,7 @@ def test_every_reference_is_used_and_whole() -> None:
         assert re.search(r"^  title = ", text, re.MULTILINE), key
 
 
-def test_an_estimator_stays_one_file(tmp_path: Path) -> None:
+def test_an_estimator_stays_one_file(tmp_path):
     path = tmp_path / "my_filter.py"
     path.write_text(MINE)
     text = bibtex(citations([str(path)]))
@@ -44,20 +44,20 @@ def test_an_estimator_stays_one_file(tmp_path: Path) -> None:
     assert "% my-filter\n@misc{mine2026" in text
 
 
-def test_an_entry_that_several_rest_on_stands_once() -> None:
+def test_an_entry_that_several_rest_on_stands_once():
     text = bibtex(citations(["msckf", "msckf-fej"]))
     assert text.count("mourikis2007msckf") == 1
     assert "% msckf, msckf-fej\n@inproceedings{mourikis2007msckf" in text
     assert "% the toolkit\n@software{vislam_toolkit" in text
 
 
-def test_a_run_directory_stands_for_what_it_compared(tmp_path: Path) -> None:
+def test_a_run_directory_stands_for_what_it_compared(tmp_path):
     documents = Path(__file__).parents[1] / "report" / "documents"
     (tmp_path / "manifest.json").write_text((documents / "manifest.json").read_text())
     assert [one.name for one in citations([str(tmp_path)])][:2] == ["dead-reckoning", "ekf"]
 
 
-def test_a_reference_that_there_is_not_is_reported_in_one_line(tmp_path, monkeypatch, capsys) -> None:
+def test_a_reference_that_there_is_not_is_reported_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text('CITES = ("li2013hihg",)')
     assert main(["cite", "mine.py"]) == 5

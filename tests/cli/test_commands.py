@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from toolkit.cli import progress_display
 from toolkit.experiment import recording
 from toolkit.report.records import read_metrics, read_seeds
 
-Vislam = Callable[..., int]
 Captured = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
@@ -31,7 +29,7 @@ def payload_of(page: Path) -> list[dict[str, Any]]:
     return cases
 
 
-def test_several_sequences_get_a_directory_each_and_take_the_place_of_an_earlier_run(vislam: Vislam) -> None:
+def test_several_sequences_get_a_directory_each_and_take_the_place_of_an_earlier_run(vislam):
     for _ in range(2):
         assert vislam("compare", "drive", "drive-imu", "drive", *QUICK, "--out", "all") == 0
     assert sorted(path.name for path in Path("all").iterdir()) == ["drive", "drive-2", "drive-imu"]
@@ -41,13 +39,13 @@ def test_several_sequences_get_a_directory_each_and_take_the_place_of_an_earlier
     assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "file") == 4
 
 
-def test_results_go_to_a_new_directory_each_time(vislam: Vislam) -> None:
+def test_results_go_to_a_new_directory_each_time(vislam):
     for _ in range(2):
         assert vislam("compare", "drive", *QUICK) == 0
     assert len(list(Path("runs").iterdir())) == 2
 
 
-def test_the_command_and_a_start_from_the_truth_are_labelled(vislam: Vislam, capsys: Captured) -> None:
+def test_the_command_and_a_start_from_the_truth_are_labelled(vislam, capsys):
     assert vislam("compare", "drive", *QUICK, "--start", "truth", "--out", "with space", "--seed", "2") == 0
     manifest = json.loads(Path("with space/manifest.json").read_text())
     assert manifest["command"].endswith("--out 'with space' --seed 2")
@@ -56,7 +54,7 @@ def test_the_command_and_a_start_from_the_truth_are_labelled(vislam: Vislam, cap
 
 
 @pytest.mark.parametrize("form", ["csv", "latex", "markdown"])
-def test_a_table_is_printed_in_the_form_that_was_asked_for(vislam: Vislam, capsys: Captured, form: str) -> None:
+def test_a_table_is_printed_in_the_form_that_was_asked_for(vislam, capsys, form):
     assert vislam("compare", "drive", *QUICK, "--format", form) == 0
     text = capsys.readouterr().out
     if form == "csv":
@@ -70,7 +68,7 @@ def test_a_table_is_printed_in_the_form_that_was_asked_for(vislam: Vislam, capsy
         assert "results:" not in text
 
 
-def test_json_prints_the_document_and_quiet_nothing(vislam: Vislam, capsys: Captured) -> None:
+def test_json_prints_the_document_and_quiet_nothing(vislam, capsys):
     assert vislam("compare", "drive", *QUICK, "--json", "--out", "run") == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line) == json.loads(Path("run/metrics.json").read_text())
@@ -78,7 +76,7 @@ def test_json_prints_the_document_and_quiet_nothing(vislam: Vislam, capsys: Capt
     assert capsys.readouterr().out == ""
 
 
-def test_a_run_directory_over_seeds(vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_directory_over_seeds(vislam, capsys, monkeypatch):
     monkeypatch.setattr(progress_display, "LOG_EVERY_S", float("inf"))  # work that is soon done leaves no line
     words = ("--estimators", "dead-reckoning", "--max-frames", "10", "--seeds", "3", "--seed", "1", "--workers", "1")
     assert vislam("compare", "drive", *words, "--out", "run") == 0
@@ -96,9 +94,7 @@ def test_a_run_directory_over_seeds(vislam: Vislam, capsys: Captured, monkeypatc
     assert all(name in Path("run/report.md").read_text() for name in figures)
 
 
-def test_the_table_has_the_change_of_each_rung_once(
-    vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_table_has_the_change_of_each_rung_once(vislam, capsys, monkeypatch):
     lowest = registry.ladder()[:2]
     monkeypatch.setattr(registry, "ladder", lambda: lowest)
     words = ("--estimators", "ladder", "--max-frames", "10", "--workers", "1", "--figures", "none", "--out", "run")
@@ -109,18 +105,7 @@ def test_the_table_has_the_change_of_each_rung_once(
         assert re.search(rf"^- {entry.name} +{re.escape(entry.change())}$", report, flags=re.MULTILINE)
 
 
-def test_the_page_goes_into_the_run_directory(vislam: Vislam, short_run: Path, capsys: Captured) -> None:
-    capsys.readouterr()
-    assert vislam("report", "run") == 0
-    assert capsys.readouterr().out == "report: run/report.html\n"
-    assert [case["title"] for case in payload_of(short_run / "report.html")] == ["drive"]
-    assert vislam("compare", "drive", *QUICK, "--out", "run") == 0  # the run directory is still one of ours
-    (short_run / "report.json").unlink()  # as of an earlier version
-    assert vislam("report", "run") == 3
-    assert "repeat it: vislam compare drive" in capsys.readouterr().err
-
-
-def test_several_runs_and_runs_over_seeds_make_one_page_beside_them(vislam: Vislam) -> None:
+def test_several_runs_and_runs_over_seeds_make_one_page_beside_them(vislam):
     assert vislam("compare", "drive", "drive-imu", *QUICK, "--out", "all") == 0
     assert vislam("report", "all/drive", "all/drive-imu", "all/drive") == 0
     titles = [case["title"] for case in payload_of(Path("report.html"))]
@@ -134,7 +119,7 @@ def test_several_runs_and_runs_over_seeds_make_one_page_beside_them(vislam: Visl
     assert vislam("report", "all") == 3
 
 
-def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: Captured) -> None:
+def test_list_counts_every_kind_and_names_all_of_one(vislam, capsys):
     assert vislam("list") == 0
     counts = re.findall(r"^ *(\d+) (\w+)", capsys.readouterr().out, flags=re.MULTILINE)
     listed = {kind: (vislam("list", kind), capsys.readouterr().out)[1] for _, kind in counts}
@@ -146,16 +131,8 @@ def test_list_counts_every_kind_and_names_all_of_one(vislam: Vislam, capsys: Cap
         assert {*some} <= {line.split()[0] for line in listed[kind].splitlines()}
 
 
-def test_a_simulated_recording_can_be_compared(vislam: Vislam) -> None:
-    assert vislam("simulate", "flight", "--out", "recordings/flight", "--seed", "3", "--duration", "2") == 0
-    assert vislam("check-data", "recordings/flight") == 0
-    assert vislam("compare", "recordings/flight", *QUICK, "--out", "run") == 0
-
-
 @pytest.mark.parametrize(("repaired", "blocking", "status"), [(True, False, 0), (False, True, 1), (False, False, 0)])
-def test_check_data_fails_on_a_fault_that_stays(
-    vislam: Vislam, capsys: Captured, monkeypatch: pytest.MonkeyPatch, *, repaired: bool, blocking: bool, status: int
-) -> None:
+def test_check_data_fails_on_a_fault_that_stays(vislam, capsys, monkeypatch, *, repaired, blocking, status):
     finding = Finding("time-gap", 2, repaired, "two frames are 3 s apart", blocking)
     monkeypatch.setattr(recording, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
     assert vislam("check-data", "drive") == status
@@ -165,7 +142,7 @@ def test_check_data_fails_on_a_fault_that_stays(
     assert ("not repaired" in messages) == blocking
 
 
-def test_check_data_says_what_was_done_to_read_the_recording(vislam: Vislam, capsys: Captured) -> None:
+def test_check_data_says_what_was_done_to_read_the_recording(vislam, capsys):
     """Images that cannot be used are left out, and tracks simulated where there are none: no fault, and to be known."""
     assert vislam("simulate", "flight", "--images", "--duration", "0.4", "--out", "film") == 0
     sorted(Path("film/mav0/cam0/data").iterdir())[3].write_bytes(b"")
@@ -173,7 +150,7 @@ def test_check_data_says_what_was_done_to_read_the_recording(vislam: Vislam, cap
     assert "1 of 9 image pairs could not be used and are left out" in " ".join(capsys.readouterr().out.split())
 
 
-def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keep_reaches_the_audit(vislam, monkeypatch):
     kept: list[frozenset[str]] = []
     first, second = list(audit.faults())[:2]
 

@@ -23,7 +23,7 @@ OFFERED = {
 
 
 @pytest.mark.parametrize("line", OFFERED)
-def test_what_is_offered_for_the_last_word_of_a_line(line: str, tmp_path: Path) -> None:
+def test_what_is_offered_for_the_last_word_of_a_line(line, tmp_path):
     (tmp_path / "notes.txt").touch()
     asked = {"COMP_LINE": f"vislam {line}", "COMP_POINT": str(len(f"vislam {line}")), "_ARGCOMPLETE": "1"}
     asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "offered"), "_ARGCOMPLETE_IFS": "\n"}
@@ -33,7 +33,7 @@ def test_what_is_offered_for_the_last_word_of_a_line(line: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_of_a_shell_is_whole(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_script_of_a_shell_is_whole(shell, capsys):
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     assert "vislam" in script

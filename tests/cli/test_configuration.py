@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,6 @@ import pytest
 from toolkit.cli import parser
 from toolkit.metrics import cost, known_metrics
 from toolkit.settings import POLICIES
-
-Vislam = Callable[..., int]
-OneLine = Callable[[], str]
 
 pytestmark = pytest.mark.usefixtures("unrendered", "one_process")
 QUICK = ("--max-frames", "10", "--workers", "1", "--figures", "none")
@@ -34,7 +30,7 @@ def metrics(run: str) -> list[dict[str, Any]]:
     return runs
 
 
-def test_a_file_says_what_is_compared_and_with_which_settings(vislam: Vislam) -> None:
+def test_a_file_says_what_is_compared_and_with_which_settings(vislam):
     Path("run.toml").write_text(
         'start = "truth"\nfirst_seed = 7\n'
         "[window]\nlag_s = 3.0\n[noise]\npixel_sigma_px = 0.7\n"
@@ -51,7 +47,7 @@ def test_a_file_says_what_is_compared_and_with_which_settings(vislam: Vislam) ->
     assert json.loads(Path("run/metrics.json").read_text())["sequence"]["frames"] == 8
 
 
-def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vislam) -> None:
+def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam):
     words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK)
     assert vislam(*words, "--outliers", "none", "--set", "outliers.filter_huber=3", "--out", "one") == 0
     document = json.loads(Path("one/manifest.json").read_text())["settings"]["outliers"]
@@ -63,7 +59,7 @@ def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vis
     assert settings["window"]["lag_s"] == 1.5
 
 
-def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vislam: Vislam) -> None:
+def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vislam):
     Path("run.toml").write_text(
         'start = "truth"\nfirst_seed = 7\n[window]\nlag_s = 3.0\nmost_states = 9\n'
         '[compare]\nsequences = ["drive-imu"]\nestimators = ["batch"]\nmax_frames = 8\n'
@@ -80,7 +76,7 @@ def test_what_the_command_line_says_by_options_or_by_set_goes_before_the_file(vi
     assert document["compare"]["max_frames"] == 5
 
 
-def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
+def test_a_run_is_repeated_from_its_manifest(vislam):
     """With whatever changed the first: settings, start, seed, cut."""
     words = ("--estimators", "dead-reckoning,ekf", "--max-frames", "12", "--seed", "3", "--start", "truth")
     changed = ("--set", "noise.pixel_sigma_px=0.7", "--no-repair")
@@ -100,9 +96,7 @@ def table(reported: str) -> list[str]:
 
 
 @pytest.mark.parametrize("width", ["40", "400"])
-def test_piped_output_is_never_wrapped_or_cut(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: str
-) -> None:
+def test_piped_output_is_never_wrapped_or_cut(vislam, capsys, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", width)
     words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run", "--columns", "all")
     assert vislam(*words) == 0
@@ -118,14 +112,14 @@ def test_piped_output_is_never_wrapped_or_cut(
 @pytest.mark.parametrize(
     ("text", "seconds"), [("3", 3.0), ("3s", 3.0), (" 500ms ", 0.5), ("2min", 120.0), ("1e-1s", 0.1)]
 )
-def test_every_option_in_seconds_reads_the_same_words(text: str, seconds: float) -> None:
+def test_every_option_in_seconds_reads_the_same_words(text, seconds):
     options = parser().parse_args(["compare", "drive", "--window", text, "--from", text, "--to", text])
     read = [vars(options)["--window=window.lag_s"], options.from_s, options.to_s]
     read.append(parser().parse_args(["simulate", "drive", "--out", "s", "--duration", text]).duration)
     assert read == pytest.approx([seconds] * 4)
 
 
-def test_what_is_no_duration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_duration_is_refused(capsys):
     for text in ("3m", "s", "3 s s", "nan", "inf", "-1s", "0"):
         with pytest.raises(SystemExit):
             parser().parse_args(["simulate", "drive", "--out", "s", f"--duration={text}"])
@@ -140,9 +134,7 @@ def test_what_is_no_duration_is_refused(capsys: pytest.CaptureFixture[str]) -> N
         ({"noise": {"pixel_sigma_px": 1e-5}}, "noise.pixel_sigma_px: expected number >= 0.001"),
     ],
 )
-def test_a_manifest_of_another_version_is_refused_with_its_command(
-    vislam: Vislam, one_line: OneLine, settings: dict[str, Any] | None, why: str
-) -> None:
+def test_a_manifest_of_another_version_is_refused_with_its_command(vislam, one_line, settings, why):
     command = "vislam compare drive --out old"
     given = {"schema": "vislam.manifest/1", "command": command} | ({} if settings is None else {"settings": settings})
     Path("manifest.json").write_text(json.dumps(given))

@@ -18,8 +18,6 @@ from toolkit import runner
 from toolkit.experiment import workers
 from toolkit.threads import THREAD_VARIABLES
 
-Vislam = Callable[..., int]
-OneLine = Callable[[], str]
 ROOT = Path(__file__).parents[2]
 # What hangs is ended after this: a machine under load takes ten times as long to start a process as an idle one.
 PATIENCE_S = 300.0
@@ -49,8 +47,8 @@ def raiser(error: BaseException) -> Callable[..., None]:
 
 @pytest.mark.usefixtures("unrendered")
 def test_a_diverged_estimator_is_1_and_its_results_are_written_but_a_mark_changes_no_status(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    vislam, capsys, monkeypatch
+):
     assert vislam("compare", "drive", "--estimators", "ekf", "--max-frames", "60", "--workers", "1") == 0
     assert "overconfident: ekf" in capsys.readouterr().out
     real = runner.run
@@ -60,9 +58,7 @@ def test_a_diverged_estimator_is_1_and_its_results_are_written_but_a_mark_change
     assert "dead-reckoning diverged" in capsys.readouterr().out
 
 
-def test_nothing_but_results_is_written_and_the_table_does_not_wait_for_figures(
-    vislam: Vislam, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_but_results_is_written_and_the_table_does_not_wait_for_figures(vislam, monkeypatch, capsys):
     shown: list[str] = []
 
     def draw_nothing(*_: object) -> dict[str, str]:
@@ -100,8 +96,8 @@ def hidden(lack: Exception) -> Exception:
     ],
 )
 def test_whatever_nobody_foresaw_is_one_line_with_a_documented_status(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, error: BaseException, status: int, says: str
-) -> None:
+    vislam, one_line, monkeypatch, error, status, says
+):
     monkeypatch.setattr(runner, "run", raiser(error))
     monkeypatch.delenv("VISLAM_TRACEBACK", raising=False)
     assert vislam(*QUICK) == status
@@ -109,9 +105,7 @@ def test_whatever_nobody_foresaw_is_one_line_with_a_documented_status(
     assert list(Path().iterdir()) == []
 
 
-def test_an_interpreter_that_fails_within_a_limit_of_memory_lacks_it(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interpreter_that_fails_within_a_limit_of_memory_lacks_it(vislam, one_line, monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     monkeypatch.setattr(resource, "getrlimit", lambda _which: (2**40, -1))
     monkeypatch.setattr(runner, "run", raiser(SystemError("returned NULL without setting an exception")))
@@ -119,18 +113,14 @@ def test_an_interpreter_that_fails_within_a_limit_of_memory_lacks_it(
     assert "out of memory" in one_line()
 
 
-def test_the_place_of_a_defect_is_shown_when_requested(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_place_of_a_defect_is_shown_when_requested(vislam, capsys, monkeypatch):
     monkeypatch.setattr(runner, "run", raiser(ZeroDivisionError()))
     monkeypatch.setenv("VISLAM_TRACEBACK", "1")
     assert vislam(*QUICK) == 70
     assert "in _raise" in capsys.readouterr().err
 
 
-def test_an_interrupt_that_comes_out_as_another_error_is_130(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_that_comes_out_as_another_error_is_130(vislam, one_line, monkeypatch):
     """As of a library whose compiled code answers one with an error of its own."""
 
     def interrupted(*_: object) -> None:
@@ -143,7 +133,7 @@ def test_an_interrupt_that_comes_out_as_another_error_is_130(
     assert "interrupted" in one_line()
 
 
-def test_a_directory_that_is_gone_is_reported(vislam: Vislam, one_line: OneLine) -> None:
+def test_a_directory_that_is_gone_is_reported(vislam, one_line):
     Path("gone").mkdir()
     os.chdir("gone")
     Path("../gone").rmdir()
@@ -151,9 +141,7 @@ def test_a_directory_that_is_gone_is_reported(vislam: Vislam, one_line: OneLine)
     assert "the current directory is no longer there; change to another one" in one_line()
 
 
-def test_a_full_shared_memory_is_not_taken_for_a_full_output(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_shared_memory_is_not_taken_for_a_full_output(vislam, one_line, monkeypatch):
     monkeypatch.setattr(workers, "_executor", raiser(OSError(28, "No space left on device")))
     assert vislam(*QUICK, "--workers", "2") == 71
     messages = one_line()
@@ -163,7 +151,7 @@ def test_a_full_shared_memory_is_not_taken_for_a_full_output(
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_a_reader_that_goes_away_costs_no_results(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_goes_away_costs_no_results(vislam, monkeypatch):
     monkeypatch.setattr("toolkit.cli._give_up_output", lambda: None)
     monkeypatch.setattr("toolkit.cli.progress_display.print_above", raiser(BrokenPipeError()))
     monkeypatch.setattr("toolkit.report.card.card_text", raiser(BrokenPipeError()))
@@ -173,7 +161,7 @@ def test_a_reader_that_goes_away_costs_no_results(vislam: Vislam, monkeypatch: p
     assert Path("card.json").exists()
 
 
-def test_a_closed_pipe_and_a_full_disk_have_their_statuses() -> None:
+def test_a_closed_pipe_and_a_full_disk_have_their_statuses():
     read_end, write_end = os.pipe()
     os.close(read_end)
     with os.fdopen(write_end, "w") as closed_pipe:  # as in ``vislam list | head -0``
@@ -186,13 +174,13 @@ def test_a_closed_pipe_and_a_full_disk_have_their_statuses() -> None:
         assert (messages.stderr.count("\n"), messages.returncode) == (1, 4)
 
 
-def test_closed_streams_are_no_trouble_to_processes_either(tmp_path: Path) -> None:
+def test_closed_streams_are_no_trouble_to_processes_either(tmp_path):
     words = "compare drive --estimators dead-reckoning,mapping --max-frames 4 --workers 2 --figures none --out run"
     program = f"exec {sys.executable} -m toolkit.cli {words} <&- >&- 2>&-"
     assert in_a_process("sh", "-c", program, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 0
 
 
-def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once() -> None:
+def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once():
     environment = {name: value for name, value in os.environ.items() if name not in THREAD_VARIABLES}
     program = f"ulimit -v 200000; exec {sys.executable} -m toolkit.cli list"
     messages = in_a_process("sh", "-c", program, env=environment)
@@ -202,7 +190,7 @@ def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once() -> None
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_a_name_that_is_no_text_is_reported_in_any_encoding(encoding: str, tmp_path: Path) -> None:
+def test_a_name_that_is_no_text_is_reported_in_any_encoding(encoding, tmp_path):
     path = str(tmp_path / os.fsdecode(b"caf\xe9 \xe2\x82\xac.npz"))
     environment = {**os.environ, "LC_ALL": "C", "PYTHONIOENCODING": encoding}
     messages = in_a_process("-m", "toolkit.cli", "check-data", path, env=environment)
@@ -210,9 +198,7 @@ def test_a_name_that_is_no_text_is_reported_in_any_encoding(encoding: str, tmp_p
     assert "caf\\udce9" in messages.stderr
 
 
-def test_signals_leave_no_file_and_no_process(
-    tmp_path: Path, starts_group: Callable[..., subprocess.Popen[str]]
-) -> None:
+def test_signals_leave_no_file_and_no_process(tmp_path, starts_group):
     words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "deep/down")
     running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
     wait_until(lambda: len(living(running.pid)) > 2)
@@ -244,13 +230,13 @@ def wait_until(reached: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_a_signal_at_the_end_of_the_interpreter_changes_no_status() -> None:
+def test_a_signal_at_the_end_of_the_interpreter_changes_no_status():
     program = "import os, signal, sys; from toolkit.cli import main; status = main(); "
     program += "os.kill(os.getpid(), signal.SIGTERM); sys.exit(status)"
     assert in_a_process("-c", program, "list").returncode == 0
 
 
-def test_an_interrupt_inside_text_that_is_executed_is_130_as_well(tmp_path: Path) -> None:
+def test_an_interrupt_inside_text_that_is_executed_is_130_as_well(tmp_path):
     """As where a dataclass is being made: CPython would then end ``python -m`` by the signal, caught or not."""
     (tmp_path / "interrupted.py").write_text(
         "import sys\n"

@@ -5,7 +5,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -34,7 +33,7 @@ def help_of(command: str) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_imports_nothing_slow(command: str) -> None:
+def test_help_imports_nothing_slow(command):
     """The 0.3 s that help may take are kept on any machine if nothing slow is imported on the way."""
     assert help_of(command).stderr.strip() == "[]"
 
@@ -42,7 +41,7 @@ def test_help_imports_nothing_slow(command: str) -> None:
 @pytest.mark.usefixtures("one_process", "unrendered", "own_cache")
 # An estimator is verified in tests/verify, which takes longer than all others here.
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command != "verify"])
-def test_examples_in_help_run(command: str, vislam: Callable[..., int], kitti_drive: Path) -> None:
+def test_examples_in_help_run(command, vislam, kitti_drive):
     if command == "import":
         write_tables(Path())
     if command == "tracks":
@@ -57,7 +56,6 @@ def write_tables(folder: Path) -> None:
     """Write a few frames of the drive as tables of one's own."""
     drive = load_sequence("drive").truncated(4)
     rig, seen, motion, truth = drive.rig, drive.observations, drive.motion, drive.truth
-    assert truth is not None
     tracks = np.column_stack([drive.frames_t_ns[seen.frame], seen.track_id, seen.uv_px]).tolist()
     twists = np.column_stack([motion.t_ns, motion.values]).tolist()
     tables = {"tracks": ("t_ns,track_id,uL,uR,v", tracks), "twist": ("t_ns,vx,vy,vz,wx,wy,wz", twists)}
@@ -70,7 +68,7 @@ def write_tables(folder: Path) -> None:
     (folder / "truth.tum").write_text(tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
 
 
-def test_what_the_help_repeats_is_what_there_is() -> None:
+def test_what_the_help_repeats_is_what_there_is():
     """Their own modules take too long to import for a help text."""
     from toolkit.datasets.trajectories import FORMATS
     from toolkit.simulation import SCENARIOS
@@ -79,6 +77,6 @@ def test_what_the_help_repeats_is_what_there_is() -> None:
     assert tuple(FORMATS) == runs.FORMATS
 
 
-def test_version_is_printed(vislam: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed(vislam, capsys):
     assert vislam("--version") == 0
     assert re.fullmatch(r"vislam \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -4,20 +4,18 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from toolkit.report.text import in_markdown
 
-Vislam = Callable[..., int]
 RECORDING = Path(__file__).parents[2] / "data" / "drive_small"
 HOSTILE = "a\x1b[2J\u202eb|c <img src=x> [click](http://x) $\\frac$ \udcff"
 QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
 
-def test_names_act_neither_on_the_terminal_nor_in_the_report(vislam: Vislam, capfd: pytest.CaptureFixture[str]) -> None:
+def test_names_act_neither_on_the_terminal_nor_in_the_report(vislam, capfd):
     folder = Path(shutil.copytree(RECORDING, "hostile"))
     text = json.loads((folder / "recording.json").read_text())
     text["name"], text["provenance"]["facts"] = HOSTILE, [f"# {HOSTILE}\n\n---"]
@@ -35,13 +33,11 @@ def test_names_act_neither_on_the_terminal_nor_in_the_report(vislam: Vislam, cap
 
 
 @pytest.mark.parametrize("text", ["plain words, 3.5 m", "kitti_t_percent at -0.5", "a (b) c: d; 1e-05 = 2"])
-def test_plain_text_is_the_same_in_markdown(text: str) -> None:
+def test_plain_text_is_the_same_in_markdown(text):
     assert in_markdown(text) == text
 
 
-def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(
-    vislam: Vislam, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(vislam, capfd):
     folder = shutil.copytree(RECORDING, os.fsdecode(b"caf\xe9"))
     assert vislam("compare", folder, *QUICK, "--out", os.fsdecode(b"r\xe9sultats")) == 0
     assert "results: r\\udce9sultats" in capfd.readouterr().out

@@ -24,7 +24,7 @@ def my_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(my_filter: Path, capsys) -> None:
+def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(my_filter, capsys):
     for workers in ("1", "2"):
         words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--workers", workers]
         assert main([*words, "--json"]) == 0
@@ -37,7 +37,7 @@ def test_a_file_is_compared_beside_names_and_gives_what_its_code_gives(my_filter
     assert callable(entry.load())  # what was read runs, whatever becomes of the file
 
 
-def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path, capsys) -> None:
+def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter, capsys):
     words = ["compare", "drive", "--estimators", "dead-reckoning,my_filter.py", *SHORT, "--seeds", "2", "--out", "over"]
     found = []
     for change in ("", "", "# another filter\n"):
@@ -53,7 +53,7 @@ def test_over_seeds_runs_are_found_again_until_the_file_changes(my_filter: Path,
     ]
 
 
-def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter: Path, capsys) -> None:
+def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter, capsys):
     made = ["baseline", "drive:1", "--estimators", "my_filter.py", "--seeds", "5", "--out", "base.json"]
     check = ["check", "--baseline", "base.json", "--workers", "1"]
     assert main([*made, "--workers", "1"]) == main(check) == 0
@@ -62,7 +62,7 @@ def test_a_baseline_of_a_file_is_checked_with_the_file(my_filter: Path, capsys) 
     assert "my_filter.py: there is no such file" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter: Path, capsys) -> None:
+def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter, capsys):
     assert main(["compare", "drive", "--estimators", "my_filter.py", *SHORT, "--workers", "1", "--out", "run"]) == 0
     assert main(["export", "run", "--bundle", "run.zip"]) == main(["reproduce", "run.zip", "--workers", "1"]) == 0
     my_filter.unlink()
@@ -79,7 +79,7 @@ def test_a_run_of_a_file_is_reproduced_from_the_file(my_filter: Path, capsys) ->
         ("my_filter.py,deeper/my_filter.py", "def build(setup): ...\n", "give the file another name"),
     ],
 )
-def test_a_file_that_is_no_estimator_is_reported_in_one_line(capsys, estimators: str, text: str, told: str) -> None:
+def test_a_file_that_is_no_estimator_is_reported_in_one_line(capsys, estimators, text, told):
     Path("deeper").mkdir()
     if text:
         Path(estimators.rsplit(",", maxsplit=1)[-1]).write_text(text)

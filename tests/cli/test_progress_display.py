@@ -3,8 +3,6 @@
 import io
 import itertools
 
-import pytest
-
 from toolkit.cli import progress_display as progress
 
 
@@ -22,11 +20,11 @@ def work(stream: io.StringIO) -> str:
     return stream.getvalue()
 
 
-def test_short_work_leaves_nothing_in_a_log() -> None:
+def test_short_work_leaves_nothing_in_a_log():
     assert work(io.StringIO()) == ""
 
 
-def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch):
     monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
     lines = work(io.StringIO()).splitlines()
     assert len(lines) == 6
@@ -34,7 +32,7 @@ def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch: pytest.
     assert lines[-1].startswith("drive: batch, iteration 5 % [")
 
 
-def test_the_time_left_is_not_reported_from_the_first_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_left_is_not_reported_from_the_first_steps(monkeypatch):
     monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
     stream = io.StringIO()
     with progress.on_stream(stream)("drive") as watched:
@@ -43,7 +41,7 @@ def test_the_time_left_is_not_reported_from_the_first_steps(monkeypatch: pytest.
     assert ["left" in line for line in stream.getvalue().splitlines()] == [False, False, True]
 
 
-def test_lines_of_long_work_are_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_of_long_work_are_ever_more_seldom(monkeypatch):
     clock_s = itertools.count()
     monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock_s)))
     stream = io.StringIO()
@@ -58,7 +56,7 @@ def test_lines_of_long_work_are_ever_more_seldom(monkeypatch: pytest.MonkeyPatch
     assert 11 <= last_hour <= 12  # one every five minutes in the end
 
 
-def test_a_terminal_sees_a_bar_that_is_gone_at_the_end() -> None:
+def test_a_terminal_sees_a_bar_that_is_gone_at_the_end():
     written = work(Terminal())
     assert "drive: batch" in written and "drive: batch, iteration" in written
     assert "\n" not in written

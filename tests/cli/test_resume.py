@@ -3,10 +3,8 @@
 import json
 import os
 import signal
-import subprocess
 import textwrap
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -16,9 +14,6 @@ from toolkit.experiment.units import Outcome, Unit, run_unit
 from toolkit.progress import Progress
 from toolkit.report.records import read_manifest
 
-Vislam = Callable[..., int]
-OneLine = Callable[[], str]
-Starts = Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]
 # To read what is compiled takes a process longer than these runs.
 QUICK = ("--max-frames", "10", "--figures", "none")
 SWEEP = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--seeds", "3", *QUICK)
@@ -41,9 +36,7 @@ def lines(run: str) -> list[bytes]:
     return file.read_bytes().split(b"\n")[:-1] if file.exists() else []
 
 
-def test_killed_in_the_middle_and_repeated_equals_uninterrupted(
-    vislam: Vislam, starts_group: Starts, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_killed_in_the_middle_and_repeated_equals_uninterrupted(vislam, starts_group, tmp_path, capsys):
     words = (*SWEEP, "--workers", "1")
     # The third run lasts until it is killed, however slow the machine.
     program = textwrap.dedent(f"""
@@ -71,7 +64,7 @@ def test_killed_in_the_middle_and_repeated_equals_uninterrupted(
     assert "outcomes.jsonl" in read_manifest(Path("run/manifest.json")).files
 
 
-def test_an_interrupt_says_where_to_go_on(vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_says_where_to_go_on(vislam, one_line, monkeypatch):
     def interrupted(unit: Unit, progress: Progress) -> Outcome:
         if unit.seed == 1:
             raise KeyboardInterrupt
@@ -85,9 +78,7 @@ def test_an_interrupt_says_where_to_go_on(vislam: Vislam, one_line: OneLine, mon
     assert "run is of a comparison that has not ended; repeat its command" in one_line()
 
 
-def test_outcomes_stay_whatever_replaces_the_run_and_files_of_others_are_refused(
-    vislam: Vislam, one_line: OneLine
-) -> None:
+def test_outcomes_stay_whatever_replaces_the_run_and_files_of_others_are_refused(vislam, one_line):
     assert vislam(*SWEEP, "--seeds", "2", "--workers", "1", "--out", "run", "--keep-trajectories") == 0
     kept = lines("run")
     trajectories = sorted(path.as_posix() for path in Path("run/trajectories").rglob("*.tum"))

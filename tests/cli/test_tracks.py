@@ -17,15 +17,11 @@ def folder(kitti_drive: Path, vislam: Vislam) -> Path:
     return Path(shutil.copytree(kitti_drive, "06"))
 
 
-def test_stills_show_both_images_with_the_tracks(
-    folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stills_show_both_images_with_the_tracks(folder, vislam, capsys):
     assert vislam("tracks", "06", "--out", "stills", "--count", "3") == 0
     written = sorted(path.name for path in Path("stills").iterdir())
     assert len(written) == 3
-    still, plain = (cv2.imread(str(path)) for path in (Path("stills") / written[-1], folder / "image_0/000007.png"))
-    assert still is not None
-    assert plain is not None
+    still = cv2.imread(str(Path("stills") / written[-1]))
     assert still.shape == (200, 640, 3)
     coloured = (still.max(axis=2).astype(int) - still.min(axis=2)) > 60
     assert coloured[:, :320].sum() > 200
@@ -37,9 +33,7 @@ def test_stills_show_both_images_with_the_tracks(
     assert cv2.VideoCapture("film/tracks.avi").get(cv2.CAP_PROP_FRAME_COUNT) == 8
 
 
-def test_stills_replace_stills_and_nothing_else(
-    folder: Path, vislam: Vislam, one_line: Callable[[], str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stills_replace_stills_and_nothing_else(folder, vislam, one_line, capsys):
     assert vislam("tracks", str(folder), "--out", "stills", "--count", "2") == 0
     (folder / "image_1/000004.png").write_bytes(b"")
     assert vislam("tracks", str(folder), "--out", "stills", "--count", "2") == 0
@@ -51,9 +45,7 @@ def test_stills_replace_stills_and_nothing_else(
 
 
 @pytest.mark.parametrize("words", [("--count", "2"), ("--video",)])
-def test_pictures_on_a_full_disk_are_4_and_none_is_left(
-    folder: Path, vislam: Vislam, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
-) -> None:
+def test_pictures_on_a_full_disk_are_4_and_none_is_left(folder, vislam, capfd, words):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
     try:
@@ -64,18 +56,14 @@ def test_pictures_on_a_full_disk_are_4_and_none_is_left(
     assert not Path("stills").exists()
 
 
-def test_images_are_neither_simulated_nor_repeated_over_seeds(
-    folder: Path, vislam: Vislam, one_line: Callable[[], str]
-) -> None:
+def test_images_are_neither_simulated_nor_repeated_over_seeds(folder, vislam, one_line):
     for words, complaint in ((("--tracks", "simulated"), "EuRoC folders only"), (("--seeds", "2"), "under every seed")):
         assert vislam("compare", str(folder), *words) == 3
         assert complaint in one_line()
 
 
 @pytest.mark.usefixtures("one_process", "unrendered")
-def test_images_alone_are_compared_and_labelled(
-    folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_images_alone_are_compared_and_labelled(folder, vislam, capsys):
     assert vislam("compare", str(folder), "--estimators", "ekf,batch", "--out", "run") == 0
     table = capsys.readouterr().out
     assert "no motion measured (smooth motion assumed)" in table

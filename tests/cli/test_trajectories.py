@@ -14,8 +14,6 @@ from toolkit.cli import main
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.report.records import read_metrics, read_report
 
-Vislam = Callable[..., int]
-OneLine = Callable[[], str]
 WithoutPixels = Callable[[], AbstractContextManager[None]]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20", "--workers", "1")
 # What an export with covariances is written as.
@@ -60,7 +58,7 @@ def again(run: Path, without_pixels: WithoutPixels) -> Path:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_an_export_scores_as_what_it_is_an_export_of(again: Path, name: str) -> None:
+def test_an_export_scores_as_what_it_is_an_export_of(again, name):
     by_row = {(run.estimator, run.output): run for run in read_metrics(again / "metrics.json").runs}
     ours, theirs = by_row["ekf", "final"].metrics, by_row[f"by {name}", "final"]
     for key in ("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "pairs"):
@@ -73,7 +71,7 @@ def test_an_export_scores_as_what_it_is_an_export_of(again: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("name", [*(f"cov {name}" for name in COVARIANCES), "unsaid"])
-def test_an_export_with_covariances_has_the_nees_of_the_run(again: Path, name: str) -> None:
+def test_an_export_with_covariances_has_the_nees_of_the_run(again, name):
     by_row = {(run.estimator, run.output): run for run in read_metrics(again / "metrics.json").runs}
     ours, theirs = by_row["ekf", "causal"].metrics, by_row[name, "final" if name == "unsaid" else "causal"].metrics
     keys = ["nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "log_score_pose", "energy_pos_m"]
@@ -81,7 +79,7 @@ def test_an_export_with_covariances_has_the_nees_of_the_run(again: Path, name: s
         assert theirs[key] == pytest.approx(ours[key], rel=1e-9)
 
 
-def test_the_state_of_a_run_is_exported_whole(run: Path, tmp_path: Path) -> None:
+def test_the_state_of_a_run_is_exported_whole(run, tmp_path):
     target = tmp_path / "state.txt"
     words = ("export", str(run), "--estimator", "ekf", "--format", "openvins", "--out", str(target))
     assert main([*words]) == 0
@@ -91,7 +89,7 @@ def test_the_state_of_a_run_is_exported_whole(run: Path, tmp_path: Path) -> None
     assert main(["export", str(run), "--estimator", "truth", *words[4:], "--cov-convention", "rot-pos/right"]) == 3
 
 
-def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> None:
+def test_another_system_is_in_everything_a_comparison_leaves(again):
     report = (again / "report.md").read_text()
     assert "| by euroc | final | ok |" in re.sub(" +", " ", report)
     assert "scored: coverage 100 %, pairs 20." in report
@@ -123,9 +121,7 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
         ("seeds", (), "over seeds and holds no trajectories"),
     ],
 )
-def test_what_cannot_be_exported_is_reported_with_what_can(
-    vislam: Vislam, one_line: OneLine, run: Path, again: Path, of: str, words: tuple[str, ...], why: str
-) -> None:
+def test_what_cannot_be_exported_is_reported_with_what_can(vislam, one_line, run, again, of, words, why):
     if of == "gaps":
         path = Path(shutil.copytree(run, "gaps"), "trajectories/ekf_final.tum")
         path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
@@ -137,7 +133,7 @@ def test_what_cannot_be_exported_is_reported_with_what_can(
     assert not Path("out").exists()
 
 
-def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) -> None:
+def test_the_truth_and_either_output_can_be_exported(vislam, run):
     for words in (("truth",), ("ekf", "--output", "causal"), ("ekf", "--output", "final")):
         assert vislam("export", str(run), "--estimator", *words, "--format", "euroc", "--out", "out.csv") == 0
         assert len(read_poses(Path("out.csv"))) == 20

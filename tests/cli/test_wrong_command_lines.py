@@ -9,7 +9,6 @@ import pytest
 from toolkit import runner
 
 Vislam = Callable[..., int]
-OneLine = Callable[[], str]
 RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
 ENDLESS = "n" * 300
 
@@ -106,6 +105,13 @@ WRONG: list[tuple[str, int, str]] = [
     ("report nowhere", 3, "nowhere is not a directory"),
     ("report t", 3, "t is not a run directory"),
     ("export run --format tum", 2, "give --format and --out"),
+    ("evaluate gt.tum gt.tum --runs 1000000000", 2, "at most 10000"),  # counts beyond any use took all memory
+    ("tracks film --count 1000000000 --out x", 2, "at most 10000"),
+    ("simulate flight --images --moving 1000000000 --out d", 2, "at most 1000,"),
+    # Sweeps; what else cannot be swept is in tests/experiment/test_sweep.py.
+    ("sweep drive --out d", 2, "there is nothing to sweep over"),
+    ("sweep drive --over fault:blackout", 2, "expected KEY=V1,V2,... or fault:NAME=D1,D2,..., not 'fault:blackout'"),
+    ("sweep drive --over fault:blackout=1 --over fault:blackout=2", 2, "give all its values at once"),
     # Outputs that cannot be written.
     ("compare drive --estimators dead-reckoning --out taken", 4, "taken exists and is not a directory"),
     ("compare drive --estimators dead-reckoning --out taken/run", 4, "taken/run"),
@@ -139,8 +145,8 @@ def files(vislam: Vislam) -> None:
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize(("words", "status", "why"), WRONG, ids=[one[0][:80] for one in WRONG])
 def test_a_wrong_command_line_is_answered_in_one_line_before_anything_runs(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, words: str, status: int, why: str
-) -> None:
+    vislam, one_line, monkeypatch, words, status, why
+):
     monkeypatch.setattr(runner, "run", None)
     before = sorted(Path().rglob("*"))
     assert vislam(*words.split()) == status
@@ -149,9 +155,7 @@ def test_a_wrong_command_line_is_answered_in_one_line_before_anything_runs(
     assert sorted(Path().rglob("*")) == before
 
 
-def test_a_cluster_needs_a_package_that_is_named(
-    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_needs_a_package_that_is_named(vislam, one_line, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert vislam("compare", "drive", "--estimators", "dead-reckoning", "--scheduler", "tcp://host:8786") == 71
     assert "a cluster needs the package distributed: pip install 'vislam-toolkit[cluster]'" in one_line()

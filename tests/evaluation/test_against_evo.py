@@ -66,7 +66,7 @@ def assert_equal(ours: dict[str, float | None], theirs: dict[str, float]) -> Non
         assert value > 0.01, key
 
 
-def test_kitti_files_are_paired_line_by_line_as_in_evo(tmp_path: Path) -> None:
+def test_kitti_files_are_paired_line_by_line_as_in_evo(tmp_path):
     t_ns = START_NS + np.arange(600) * (S // 10)
     for name, poses in (("truth.txt", poses_at(t_ns)), ("other.txt", drifted(t_ns))):
         (tmp_path / name).write_text(kitti.text(Trajectory(t_ns, poses)))
@@ -93,7 +93,7 @@ def evo_pair(truth: Path, other: Path, max_dt_s: float, offset_s: float = 0.0):
     return sync.associate_trajectories(reference, estimate, max_diff=max_dt_s, offset_2=offset_s)
 
 
-def test_euroc_stamps_that_coincide_up_to_rounding_are_not_interpolated(tmp_path: Path) -> None:
+def test_euroc_stamps_that_coincide_up_to_rounding_are_not_interpolated(tmp_path):
     """Camera stamps of EuRoC differ from those of its truth by some hundred nanoseconds."""
     t_ns = START_NS + np.arange(20, 580) * (S // 10) + np.random.default_rng(0).integers(-400, 400, 560)
     truth, other = euroc_files(tmp_path, t_ns)
@@ -103,7 +103,7 @@ def test_euroc_stamps_that_coincide_up_to_rounding_are_not_interpolated(tmp_path
 
 
 @pytest.mark.parametrize("keyframes", [1, 9])
-def test_with_max_dt_the_nearest_poses_are_paired_as_in_evo(tmp_path: Path, keyframes: int) -> None:
+def test_with_max_dt_the_nearest_poses_are_paired_as_in_evo(tmp_path, keyframes):
     """Stamps lie anywhere between those of the truth, on a clock of their own; some have none near enough."""
     t_ns = START_NS + np.arange(600) * (S // 10) + np.random.default_rng(1).integers(0, S // 200, 600)
     truth, other = euroc_files(tmp_path, t_ns[::keyframes], S // 4)
@@ -115,7 +115,7 @@ def test_with_max_dt_the_nearest_poses_are_paired_as_in_evo(tmp_path: Path, keyf
     assert "paired with the nearest pose" in ours.notes["pairs"]
 
 
-def test_a_truth_sparser_than_the_trajectory_has_the_roles_exchanged(tmp_path: Path) -> None:
+def test_a_truth_sparser_than_the_trajectory_has_the_roles_exchanged(tmp_path):
     sparse, dense = START_NS + np.arange(60) * S, START_NS + np.arange(1200) * (S // 20) + 7_000_000
     truth, other = tmp_path / "truth.csv", tmp_path / "other.tum"
     truth.write_text(euroc.text(Trajectory(sparse, poses_at(sparse))))

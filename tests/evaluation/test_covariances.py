@@ -42,7 +42,7 @@ def run_of(vislam, *words: str) -> dict:
     return run
 
 
-def test_a_consistent_estimate_is_found_so_in_every_score(scene, vislam) -> None:
+def test_a_consistent_estimate_is_found_so_in_every_score(scene, vislam):
     written(estimate(scene))
     run = run_of(vislam)
     # 1200 independent poses: three standard deviations of a mean NEES over 6, and of a share.
@@ -52,7 +52,7 @@ def test_a_consistent_estimate_is_found_so_in_every_score(scene, vislam) -> None
     assert "nees_pose_mean" not in run["notes"]
 
 
-def test_over_runs_the_scores_have_intervals_and_the_nees_its_band(scene, vislam, capsys) -> None:
+def test_over_runs_the_scores_have_intervals_and_the_nees_its_band(scene, vislam, capsys):
     for seed in range(4):
         Path(f"run{seed}.tum").write_text(tum.text_with_covariances(estimate(scene, seed)))
     assert vislam("evaluate", "truth.tum", *(f"est=run{seed}.tum" for seed in range(4)), "--out", "out") == 0
@@ -77,14 +77,14 @@ def test_over_runs_the_scores_have_intervals_and_the_nees_its_band(scene, vislam
         ("pos-rot/fixed", "rot-pos/mixed"),
     ],
 )
-def test_a_wrong_convention_is_named_with_the_right_one(scene, vislam, said: str, meant: str) -> None:
+def test_a_wrong_convention_is_named_with_the_right_one(scene, vislam, said, meant):
     written(estimate(scene), said, meant)
     note = run_of(vislam)["notes"]["nees_pose_mean"]
     assert note.startswith(f"the covariances are said to be {said} and fit the errors only as ")
     assert meant in note.partition(": ")[0]
 
 
-def test_errors_that_are_those_of_the_start_show_the_convention_as_well(scene, vislam) -> None:
+def test_errors_that_are_those_of_the_start_show_the_convention_as_well(scene, vislam):
     """Placed by its first pose such an estimate would have no errors, which fit any covariance."""
     t_ns = scene.stamps(20.0)
     error = se3_exp(ROOT @ np.array([1.0, -1.0, 0.8, 1.2, -0.9, 1.0]))
@@ -96,14 +96,14 @@ def test_errors_that_are_those_of_the_start_show_the_convention_as_well(scene, v
     assert "nees_pose_mean" not in run_of(vislam)["notes"]
 
 
-def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam) -> None:
+def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam):
     written(estimate(scene, times=0.01))
     run = run_of(vislam)
     assert run["metrics"]["nees_pose_mean"] > 50.0
     assert "said to be" not in run["notes"].get("nees_pose_mean", "")
 
 
-def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam, capsys) -> None:
+def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam, capsys):
     written(estimate(scene), "", "pos-rot/fixed")
     run = run_of(vislam)
     assert run["metrics"]["nees_pose_mean"] is None
@@ -140,7 +140,7 @@ def write_bag(path: Path, trajectory: Trajectory, topics: tuple[str, ...], conve
                 writer.write(connection, t_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
 
 
-def test_odometry_of_a_bag_is_scored_with_the_covariances_of_ros(scene, vislam, capsys) -> None:
+def test_odometry_of_a_bag_is_scored_with_the_covariances_of_ros(scene, vislam, capsys):
     given = estimate(scene)
     written(given)
     by_file = run_of(vislam)["metrics"]
@@ -155,7 +155,7 @@ def test_odometry_of_a_bag_is_scored_with_the_covariances_of_ros(scene, vislam, 
     assert "no topic of poses is called /odm (did you mean /odom?)" in capsys.readouterr().err
 
 
-def test_a_bag_whose_program_writes_another_convention_is_named(scene, vislam) -> None:
+def test_a_bag_whose_program_writes_another_convention_is_named(scene, vislam):
     write_bag(Path("est.bag"), estimate(scene), ("/odom",), "rot-pos/mixed")
     assert vislam("evaluate", "truth.tum", "est.bag", "--out", "out", "--quiet") == 0
     (run,) = json.loads(Path("out/evaluation.json").read_text())["runs"]
@@ -167,7 +167,7 @@ def test_a_bag_whose_program_writes_another_convention_is_named(scene, vislam) -
 
 
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 0.9, 1.1), (0.25, 1.4, 1.8)])
-def test_two_estimates_of_one_run_are_compared_without_a_truth(scene, vislam, times: float, low, high) -> None:
+def test_two_estimates_of_one_run_are_compared_without_a_truth(scene, vislam, times, low, high):
     """With a quarter of its covariance stated, (1 + 1) / (1 + 1/4) = 1.6 of one is left."""
     Path("truth.tum").write_text(tum.text_with_covariances(estimate(scene, 1)))
     written(estimate(scene, 2, times))

@@ -23,7 +23,7 @@ def evaluation(scene, vislam) -> EvaluatedSystems:
     return evaluate(gather(Path("truth.tum"), ["a=a", "b.tum"]), Terms())
 
 
-def test_lines_are_the_pairs_of_the_run_of_the_middle_error(evaluation) -> None:
+def test_lines_are_the_pairs_of_the_run_of_the_middle_error(evaluation):
     figures = {one.name: one.figure for one in draw(evaluation)}
     assert list(figures) == NAMES
     by_run = {run.run: run.metrics for run in evaluation.runs if run.estimator == "a"}
@@ -39,7 +39,7 @@ def test_lines_are_the_pairs_of_the_run_of_the_middle_error(evaluation) -> None:
     assert sorted(dots[0].get_ydata()) == sorted(metrics["ate_se3_m"] for metrics in by_run.values())
 
 
-def test_they_are_kept_with_the_evaluation_and_shown_in_the_page(evaluation, vislam) -> None:
+def test_they_are_kept_with_the_evaluation_and_shown_in_the_page(evaluation, vislam):
     words = ("evaluate", "truth.tum", "b.tum", "--out", "out", "--quiet")
     assert vislam(*words, "--figures", "few") == 0
     files = [f"{name}.png" for name in NAMES]

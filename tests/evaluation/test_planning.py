@@ -32,7 +32,7 @@ def position(plan, sequence: str):
     return next(one for one in plan if one.where.metric == "ate_se3_m" and one.where.sequence == sequence)
 
 
-def test_a_growth_is_found_as_often_as_was_planned() -> None:
+def test_a_growth_is_found_as_often_as_was_planned():
     runs = 8
     rng = np.random.default_rng(runs)
     made = [baseline(Runs(runs, rng)) for _ in range(30)]
@@ -47,7 +47,7 @@ def test_a_growth_is_found_as_often_as_was_planned() -> None:
         assert chance - 0.2 <= found <= chance + 0.25
 
 
-def test_all_sequences_together_need_fewer_runs_than_one() -> None:
+def test_all_sequences_together_need_fewer_runs_than_one():
     plan = planned(baseline(Runs(10, np.random.default_rng(1), sequences=9)))
     together, alone = position(plan, "all sequences"), position(plan, "S0")
     assert together.scatter_percent == pytest.approx(8.0 / 3.0, rel=0.3)
@@ -57,7 +57,7 @@ def test_all_sequences_together_need_fewer_runs_than_one() -> None:
     assert together.seen[1] > 0.9
 
 
-def test_what_is_within_the_bound_is_never_found_and_no_scatter_finds_all_else() -> None:
+def test_what_is_within_the_bound_is_never_found_and_no_scatter_finds_all_else():
     still = new_trajectory_baseline(Runs(3, np.random.default_rng(2)), "se3", 5.0, {}, bound_percent=7.0)
     angle = next(one for one in planned(still) if one.where.metric == "ate_se3_deg")
     assert angle.seen == (0.0, 1.0, 1.0)
@@ -65,7 +65,7 @@ def test_what_is_within_the_bound_is_never_found_and_no_scatter_finds_all_else()
     assert angle.is_allowed(0)
 
 
-def test_a_change_of_the_system_is_found_on_all_sequences_where_few_alone_show_it() -> None:
+def test_a_change_of_the_system_is_found_on_all_sequences_where_few_alone_show_it():
     rng = np.random.default_rng(3)
     check = check_trajectories(baseline(Runs(12, rng, sequences=8)), "", Runs(12, rng, 1.08, sequences=8))
     failed = {v.sequence for v in check.failures if v.metric == "ate_se3_m"}
@@ -73,6 +73,6 @@ def test_a_change_of_the_system_is_found_on_all_sequences_where_few_alone_show_i
     assert len(failed) <= 3
 
 
-def test_without_repeated_runs_there_is_no_plan() -> None:
+def test_without_repeated_runs_there_is_no_plan():
     with pytest.raises(DataError, match="no sequence has 3 runs"):
         planned(baseline(Runs(2, np.random.default_rng(4))))

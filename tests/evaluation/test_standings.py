@@ -19,7 +19,7 @@ def by_enumeration(differences: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_without_ties_it_is_the_textbook_test(seed: int) -> None:
+def test_without_ties_it_is_the_textbook_test(seed):
     differences = np.random.default_rng(seed).normal(0.3, 1.0, 15)
     from scipy.stats import wilcoxon  # its import takes a sixth of what all tests take to be found
 
@@ -27,21 +27,14 @@ def test_without_ties_it_is_the_textbook_test(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_with_ties_and_failures_it_counts_every_sign(seed: int) -> None:
+def test_with_ties_and_failures_it_counts_every_sign(seed):
     rng = np.random.default_rng(seed)
     differences = rng.integers(-3, 4, 9).astype(float)
     differences[rng.integers(0, 9, 3)] = [np.inf, np.inf, -np.inf]
     assert signed_rank_p(differences) == pytest.approx(by_enumeration(differences))
 
 
-def test_no_difference_is_no_evidence() -> None:
+def test_no_difference_is_no_evidence():
     assert signed_rank_p(np.zeros(5)) == 1.0
     assert signed_rank_p(np.array([1.0])) == 1.0
     assert signed_rank_p(np.full(10, np.inf)) == pytest.approx(2.0 / 1024.0)
-
-
-def test_false_alarms_are_no_more_than_stated() -> None:
-    rng = np.random.default_rng(0)
-    alarms = np.mean([signed_rank_p(rng.standard_normal(12)) <= 0.05 for _ in range(2000)])
-    # At most 5 %; three standard deviations above.
-    assert 0.03 < alarms < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 2000)

@@ -49,6 +49,5 @@ def over() -> Comparison:
             Outcome(seed, "honest", "ok", {"causal": honest, "final": honest}, sequence_hash=f"hash{seed}"),
         ]
     sequence = load_sequence("drive").truncated(FRAMES)
-    assert sequence.prior is not None
     ordered = in_order(outcomes, ("honest", "astray", "broken"), SEEDS)
     return Comparison("drive", sequence, (), sequence.prior, SEEDS, ordered, workers=2)

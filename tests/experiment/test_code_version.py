@@ -8,7 +8,7 @@ from toolkit.experiment import code_version
 PROJECT = Path(__file__).parents[2]
 
 
-def test_all_parts_above_the_experiment_and_no_others_change_no_result() -> None:
+def test_all_parts_above_the_experiment_and_no_others_change_no_result():
     contracts = tomllib.loads((PROJECT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     layers = next(one["layers"] for one in contracts if one["type"] == "layers")
     above = [part for layer in layers[: layers.index("experiment")] for part in layer.split(" | ")]

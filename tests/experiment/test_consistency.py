@@ -51,19 +51,19 @@ def verdict(*runs: Scored) -> str | None:
     ("nees", "expected"),
     [(0.19, "timid"), (0.22, "consistent"), (1.0, "consistent"), (2.3, "consistent"), (2.5, "overconfident")],
 )
-def test_one_run_is_checked_by_the_band_of_one_pose(nees: float, expected: str) -> None:
+def test_one_run_is_checked_by_the_band_of_one_pose(nees, expected):
     """A textbook's quantiles of six degrees of freedom, 1.237 and 14.449, over 6: 0.206 and 2.408."""
     assert verdict(run_of(nees)) == expected
 
 
-def test_many_seeds_see_what_one_cannot() -> None:
+def test_many_seeds_see_what_one_cannot():
     assert verdict(run_of(1.5)) == "consistent"
     assert verdict(*[run_of(1.5)] * 20) == "overconfident"
     assert verdict(*[run_of(0.6)] * 20) == "timid"
     assert verdict(*[run_of(1.1)] * 20) == "consistent"
 
 
-def test_the_errors_decide_where_there_are_any_and_else_the_innovations() -> None:
+def test_the_errors_decide_where_there_are_any_and_else_the_innovations():
     assert verdict(run_of(nees=1.0, nis=1.5, nis_dof=900.0)) == "consistent"
     assert verdict(run_of(nis=1.5, nis_dof=900.0)) == "overconfident"
     assert verdict(run_of(nis=0.8, nis_dof=900.0)) == "timid"
@@ -72,7 +72,7 @@ def test_the_errors_decide_where_there_are_any_and_else_the_innovations() -> Non
     assert verdict(run_of()) is None
 
 
-def test_corrections_that_lean_one_way_are_reported_unless_errors_tell_of_too_much_certainty() -> None:
+def test_corrections_that_lean_one_way_are_reported_unless_errors_tell_of_too_much_certainty():
     assert verdict(leaning(5.1, 4.0)) == "contradicted"
     assert verdict(leaning(5.1, 4.0, nees_pose_mean=1.0)) == "contradicted"
     assert verdict(leaning(5.1, 4.0, nis_mean=0.5)) == "contradicted"
@@ -81,20 +81,20 @@ def test_corrections_that_lean_one_way_are_reported_unless_errors_tell_of_too_mu
     assert verdict(leaning(3.9, 4.0)) is None
 
 
-def test_over_seeds_the_mean_trend_is_held_against_the_mean_limit() -> None:
+def test_over_seeds_the_mean_trend_is_held_against_the_mean_limit():
     assert verdict(leaning(5.0, 4.0), leaning(2.0, 4.0)) is None
     assert verdict(leaning(7.0, 4.0), leaning(2.0, 4.0)) == "contradicted"
 
 
 @pytest.mark.parametrize("alike", [1, 10, 100])
-def test_five_percent_of_consistent_runs_are_marked_at_most_however_long_their_errors_last(alike: int) -> None:
+def test_five_percent_of_consistent_runs_are_marked_at_most_however_long_their_errors_last(alike):
     """Errors of 100 poses that change every 1, 10 or 100 poses, drawn from the covariance that is stated."""
     drawn = np.random.default_rng(alike).chisquare(6, (4000, 100 // alike)) / 6.0
     marked = np.mean([verdict(run_of(float(run.mean()))) != "consistent" for run in drawn])
     assert marked <= 0.05 + 4.0 * np.sqrt(0.05 * 0.95 / 4000)  # four standard errors of the share
 
 
-def test_innovations_that_share_one_error_count_once_a_frame(make_evaluation: Callable[..., Evaluation]) -> None:
+def test_innovations_that_share_one_error_count_once_a_frame(make_evaluation):
     """100 frames of 30 sightings each whose NIS is that of one: the mean scatters as 300 degrees of freedom say."""
     one = np.random.default_rng(5).chisquare(3, (2000, 100))
     means, dof = (30.0 * one).sum(axis=1) / (90.0 * 100), nis_over_time(make_evaluation(100, dof=90.0)).independent_dof
@@ -113,7 +113,7 @@ def share_above_and_below(nis: np.ndarray, dof: float, expected: float) -> np.nd
     return np.mean(shares, axis=0)
 
 
-def test_the_band_of_a_frame_holds_95_percent_behind_a_gate_and_where_frames_share_an_error() -> None:
+def test_the_band_of_a_frame_holds_95_percent_behind_a_gate_and_where_frames_share_an_error():
     """100 runs of 100 frames of 60 sightings: the share in the band is known to 0.3 %, the band itself scatters."""
     rng = np.random.default_rng(6)
     sightings = rng.chisquare(3, (100, 100, 60))
@@ -129,9 +129,7 @@ def test_the_band_of_a_frame_holds_95_percent_behind_a_gate_and_where_frames_sha
     assert share_above_and_below(alone[:, :10], 180.0, 180.0).sum() == pytest.approx(0.05, abs=0.02)  # chi-square's
 
 
-def test_without_truth_innovations_mark_a_filter_that_is_given_half_the_noise(
-    run_estimator: Callable[..., Run],
-) -> None:
+def test_without_truth_innovations_mark_a_filter_that_is_given_half_the_noise(run_estimator):
     sequence = replace(load_sequence("drive", seed=1).truncated(60), truth=None)
     rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 / 4.0)
     for name, wanted, expected in (("sound", sequence, ""), ("told", replace(sequence, rig=rig), "overconfident")):

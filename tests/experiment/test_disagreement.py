@@ -39,12 +39,10 @@ def drawn(seed: int, sigma: Array = SIGMA) -> Array:
 
 
 def apart(mine: Array, other: Array, cov: Array) -> FarthestPose:
-    found = farthest(row("other", other, cov, trend=1.0), Trajectory(STAMPS_NS, mine, cov=cov))
-    assert found is not None
-    return found
+    return farthest(row("other", other, cov, trend=1.0), Trajectory(STAMPS_NS, mine, cov=cov))
 
 
-def test_poses_drawn_from_what_is_stated_never_part_and_a_shift_of_ten_sigmas_does() -> None:
+def test_poses_drawn_from_what_is_stated_never_part_and_a_shift_of_ten_sigmas_does():
     cov = np.tile(np.diag(SIGMA**2), (40, 1, 1))
     squared = [apart(drawn(seed), drawn(1000 + seed), cov).squared for seed in range(200)]
     assert 1.5 < np.median(squared) < max(squared) < FARTHEST
@@ -55,12 +53,12 @@ def test_poses_drawn_from_what_is_stated_never_part_and_a_shift_of_ten_sigmas_do
     assert messages.distance_m == pytest.approx(2.0, abs=4.0 * SIGMA[5])
 
 
-def test_where_the_pose_is_known_for_certain_rounding_parts_nobody() -> None:
+def test_where_the_pose_is_known_for_certain_rounding_parts_nobody():
     same = drawn(0)
     assert apart(same, same @ se3_exp(np.full(6, 1e-9)), np.zeros((40, 6, 6))).squared < 1e-3
 
 
-def test_without_a_covariance_or_over_seeds_nobody_parts() -> None:
+def test_without_a_covariance_or_over_seeds_nobody_parts():
     poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
     far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
     motion = row("dead-reckoning", poses, cov)
@@ -80,7 +78,7 @@ def _row_of(name: str, prepared: Prepared) -> Row:
     return Row("causal", (outcome_of(run, prepared.sequence, 0),))
 
 
-def test_an_odometer_that_slips_parts_from_estimators_that_see_it_and_a_sound_one_from_nobody() -> None:
+def test_an_odometer_that_slips_parts_from_estimators_that_see_it_and_a_sound_one_from_nobody():
     sound, as_stated = simulate(replace(DRIVE, duration_s=8.0), 5), Noise(motion_scale=1.0)
     assert not any(too_far(rows_of(sound, noise)) for noise in (Noise(), as_stated))
     slipping = rows_of(faults.disturbed_motion(sound, 0.8, 5), as_stated)

@@ -77,19 +77,17 @@ def explanation_of(folder: Path, planted: str) -> Explanation:
 
 
 @pytest.mark.parametrize("planted", PLANTED)
-def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted: str, folders: dict[str, Path]) -> None:
+def test_a_planted_ingredient_is_found_with_its_size_and_no_other_is(planted, folders):
     found = explanation_of(folders[planted], planted)
     assert {part.ingredient for part in found.parts} == {planted, "water", GATE}
     for part in found.parts:
         for effect in (part.first, part.last):
-            assert effect is not None
-            assert effect.on_error is not None
             (_, low, high), direct = effect.on_error.interval, PLANTED[planted] if part.ingredient == planted else 0.0
             assert low <= direct <= high, part.ingredient
             assert (ERROR in effect.shown) == (part.ingredient == planted)
 
 
-def test_a_second_run_finds_every_outcome_and_tells_the_same(folders: dict[str, Path]) -> None:
+def test_a_second_run_finds_every_outcome_and_tells_the_same(folders):
     first = explanation_document(explanation_of(folders["salt"], "salt"))
     kept = (folders["salt"] / "kept" / "outcomes.jsonl").read_bytes()
     again = explanation_document(explanation_of(folders["salt"], "salt"))

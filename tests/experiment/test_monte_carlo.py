@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, in_order
-from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means, spread_of
+from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means
 from toolkit.experiment.units import Outcome
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
@@ -24,26 +23,11 @@ from toolkit.report.scores import Seeds, seeds_document
 Document = dict[str, Any]
 
 
-def test_spread_is_numpys():
-    values = [3.0, 1.0, 2.0, 10.0]
-    spread = spread_of(values)
-    assert (spread.n, spread.mean, spread.median) == (4, 4.0, 2.5)
-    assert spread.std == pytest.approx(np.std(values, ddof=1))
-    assert (spread.least, spread.lower_quartile, spread.upper_quartile, spread.most) == (1.0, 1.75, 4.75, 10.0)
-
-
 @pytest.mark.parametrize("seeds", [1, 5, 40])
 def test_the_mean_nees_of_consistent_runs_is_in_its_band_at_95_percent(seeds):
     frames = 20_000
     nees = np.random.default_rng(7).chisquare(6, (seeds, frames)) / 6
     assert mean_nees(nees).in_band_percent == pytest.approx(95.0, abs=4.0 * 100.0 * np.sqrt(0.95 * 0.05 / frames))
-
-
-def test_many_seeds_find_a_covariance_that_one_seed_does_not():
-    nees = 1.5 * np.random.default_rng(8).chisquare(6, (40, 2000)) / 6
-    assert mean_nees(nees[:1]).in_band_percent > 75.0
-    assert mean_nees(nees).in_band_percent < 10.0
-    assert mean_nees(nees).too_sure_percent > 90.0
 
 
 def test_the_band_is_for_the_runs_that_are_there():
@@ -57,7 +41,7 @@ def test_the_band_is_for_the_runs_that_are_there():
     assert averaged.in_band_percent == 100.0
 
 
-def test_a_seed_that_diverged_is_counted_and_in_no_mean(over: Comparison) -> None:
+def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
     astray = over.rows[2]
     assert (astray.estimator, astray.counts) == ("astray", {"ok": 3, "diverged": 1, "failed": 0})
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
@@ -76,7 +60,7 @@ def test_a_bad_run_spoils_the_quartiles_it_reaches():
     assert quantiles_of_all([1.0], 1, "") is quantiles_of_all([], 0, "least") is None
 
 
-def test_runs_that_ended_badly_are_reported_beside_the_means(over: Comparison, document: Document) -> None:
+def test_runs_that_ended_badly_are_reported_beside_the_means(over, document):
     astray, broken = (document["runs"][i] for i in (2, 3))
     assert (astray["ok_share"], broken["ok_share"]) == (0.75, 0.0)
     # Under the seeds 3, 5 and 6 its ATE is 3, 5 and 6 m; seed 4 diverged.
@@ -109,7 +93,7 @@ def test_equal_estimators_are_distinguished_at_5_percent_and_others_by_the_seeds
         assert reported == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
 
 
-def test_under_the_table_stands_who_differs_from_the_best(over: Comparison) -> None:
+def test_under_the_table_stands_who_differs_from_the_best(over):
     honest, astray = over.rows[0].outcomes, over.rows[2].outcomes
     worse = [_with_ate(one, 0.3 + 0.01 * one.seed) for one in astray]
     lines = list(paired_lines(replace(over, outcomes=(*honest, *worse))))
@@ -131,7 +115,7 @@ def _with_values(outcome: Outcome, values: dict[str, float | None]) -> Outcome:
     return replace(outcome, outputs={"causal": replace(scored, scores=scores)})
 
 
-def test_an_estimator_without_any_answer_keeps_a_line(over: Comparison) -> None:
+def test_an_estimator_without_any_answer_keeps_a_line(over):
     assert [(g.estimator, g.output) for g in over.rows] == [
         ("honest", "causal"),
         ("honest", "final"),
@@ -148,7 +132,7 @@ def document(over: Comparison) -> Document:
     return read
 
 
-def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> None:
+def test_seeds_json_obeys_its_contract(over, document):
     assert parse(to_text(seeds_document(over)), Seeds) == seeds_document(over)
     assert list(document["runs"][0]["metrics"]) == list(describe())
     assert document["runs"][2]["status"] == ["ok", "diverged", "ok", "ok"]
@@ -166,15 +150,13 @@ def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> 
         (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed"),
     ],
 )
-def test_a_broken_document_is_refused_with_the_place(
-    document: Document, spoil: Callable[[Document], object], expected: str
-) -> None:
+def test_a_broken_document_is_refused_with_the_place(document, spoil, expected):
     spoil(document)
     with pytest.raises(DataError, match=re.escape(expected)):
         parse(json.dumps(document), Seeds)
 
 
-def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) -> None:
+def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
     for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5 and 6: failed after 0 estimates: no gauge" in text
@@ -182,7 +164,7 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) 
     assert max(map(len, comparison_text(over).splitlines())) <= 100
 
 
-def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_error(over: Comparison) -> None:
+def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_error(over):
     honest = over.rows[0].outcomes
     claims, excesses = (1.2, 1.0, 1.1, 1.1), (0.1, 0.3, -0.1, 0.1)
     reported = [
@@ -196,7 +178,7 @@ def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_erro
     assert ratio.error == pytest.approx(math.sqrt((0.1**2 + 0.3**2 + 0.2**2) / 3 / 4) / 1.1)
 
 
-def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment() -> None:
+def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment():
     rng = np.random.default_rng(6)
     below = rng.uniform(0.5, 1.5, (4000, 20))
     above = 2.0 * below + rng.normal(scale=0.3, size=below.shape)

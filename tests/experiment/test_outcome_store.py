@@ -90,9 +90,7 @@ def _is_time(key: str) -> bool:
 
 
 @pytest.mark.parametrize(("ended", "torn"), [(0, b""), (1, b'{"schema":"vislam.outcome/2","unit":{"da'), (3, b"{")])
-def test_interrupted_and_continued_equals_uninterrupted(
-    sweep: Sweep, ran: Ran, tmp_path: Path, ended: int, torn: bytes
-) -> None:
+def test_interrupted_and_continued_equals_uninterrupted(sweep, ran, tmp_path, ended, torn):
     ran.until = ended
     with pytest.raises(KeyboardInterrupt):
         sweep()
@@ -107,7 +105,7 @@ def test_interrupted_and_continued_equals_uninterrupted(
     assert len((tmp_path / "run" / OUTCOMES).read_bytes().splitlines()) == 4
 
 
-def test_what_is_requested_in_addition_is_all_that_runs(sweep: Sweep, ran: Ran) -> None:
+def test_what_is_requested_in_addition_is_all_that_runs(sweep, ran):
     sweep(("ekf",))
     sweep(("ekf",), seeds=3)
     assert ran == [(2, "ekf")]
@@ -120,7 +118,7 @@ def test_what_is_requested_in_addition_is_all_that_runs(sweep: Sweep, ran: Ran) 
     assert answers(whole) == answers(sweep(TWO, directory="other", seeds=4))
 
 
-def test_other_settings_are_other_runs_and_none_is_lost(sweep: Sweep, ran: Ran) -> None:
+def test_other_settings_are_other_runs_and_none_is_lost(sweep, ran):
     first = answers(sweep())
     sweep(outliers={"gate_probability": 0.9})
     assert len(ran) == 4
@@ -128,7 +126,7 @@ def test_other_settings_are_other_runs_and_none_is_lost(sweep: Sweep, ran: Ran) 
     assert ran == []
 
 
-def test_the_options_of_another_estimator_change_no_run(drive_key: Callable[..., bytes]) -> None:
+def test_the_options_of_another_estimator_change_no_run(drive_key):
     plain = drive_key("ekf")
     assert drive_key("ekf", estimators={"batch": {"rounds": 2}}) == plain
     assert drive_key("ekf", estimators={"ekf": {"rounds": 2}}) != plain
@@ -145,14 +143,14 @@ def drive_key() -> Callable[..., bytes]:
 
 
 @pytest.mark.parametrize("changed", ["code_digest", "numeric_versions"])
-def test_another_version_is_another_run(sweep: Sweep, ran: Ran, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
+def test_another_version_is_another_run(sweep, ran, monkeypatch, changed):
     sweep()
     monkeypatch.setattr(outcome_store, changed, lambda: "0" if changed == "code_digest" else {"numpy": "0"})
     sweep()
     assert len(ran) == 4
 
 
-def test_other_data_under_the_same_name_are_other_runs(store: OutcomeStore, tmp_path: Path) -> None:
+def test_other_data_under_the_same_name_are_other_runs(store, tmp_path):
     store.keep(UNIT, OUTCOME)
     store.close()
     for conditions in (Conditions("another hash"), Conditions("hash", frozenset({"stale_frames"}))):
@@ -161,7 +159,7 @@ def test_other_data_under_the_same_name_are_other_runs(store: OutcomeStore, tmp_
         other.close()
 
 
-def test_a_metric_on_request_is_had_where_it_is_missing_and_left_out_where_nobody_asks(sweep: Sweep, ran: Ran) -> None:
+def test_a_metric_on_request_is_had_where_it_is_missing_and_left_out_where_nobody_asks(sweep, ran):
     plain = answers(sweep(seeds=2))
     with_bound = {"metrics": {"bound": True}}
     assert sweep(seeds=2, **with_bound).rows[0].value("bound_position_m") is not None
@@ -172,7 +170,7 @@ def test_a_metric_on_request_is_had_where_it_is_missing_and_left_out_where_nobod
     assert ran == []
 
 
-def test_kept_trajectories_are_made_where_they_are_missing_or_changed(sweep: Sweep, ran: Ran, tmp_path: Path) -> None:
+def test_kept_trajectories_are_made_where_they_are_missing_or_changed(sweep, ran, tmp_path):
     sweep()
     kept = sweep(keep=True)
     assert len(ran) == 4
@@ -197,7 +195,7 @@ def store(tmp_path: Path) -> OutcomeStore:
 
 
 @pytest.mark.parametrize("seed", range(8))  # each of the special numbers once as the degrees of freedom
-def test_every_number_is_found_again_to_the_bit(store: OutcomeStore, tmp_path: Path, seed: int) -> None:
+def test_every_number_is_found_again_to_the_bit(store, tmp_path, seed):
     bits = np.random.default_rng(seed).integers(0, 2**64, 200, dtype=np.uint64).view(np.float64)
     numbers = np.concatenate([[0.0, -0.0, 5e-324, np.inf, -np.inf, np.nan, 1e22, 3.0], bits])
     finite = numbers[np.isfinite(numbers)][: len(describe())].tolist()
@@ -207,7 +205,6 @@ def test_every_number_is_found_again_to_the_bit(store: OutcomeStore, tmp_path: P
     store.close()
     requested = replace(UNIT, settings=Settings())
     found = OutcomeStore(tmp_path, Conditions("hash")).find(requested)
-    assert found is not None
     one = found.outputs["final"]
     np.testing.assert_array_equal(one.nees_pose, numbers)
     np.testing.assert_array_equal(one.position_m, numbers[::-1])
@@ -225,7 +222,7 @@ def test_every_number_is_found_again_to_the_bit(store: OutcomeStore, tmp_path: P
 BOUND = ("bound_", "efficiency", "excess_", "claimed_", "error_over_bound")
 
 
-def test_two_processes_do_not_write_into_one_another(store: OutcomeStore, tmp_path: Path) -> None:
+def test_two_processes_do_not_write_into_one_another(store, tmp_path):
     store.keep(UNIT, OUTCOME)
     with pytest.raises(OutputError, match="being written by another run"):
         OutcomeStore(tmp_path, Conditions("hash"))
@@ -233,7 +230,7 @@ def test_two_processes_do_not_write_into_one_another(store: OutcomeStore, tmp_pa
     OutcomeStore(tmp_path, Conditions("hash")).close()
 
 
-def test_a_damaged_line_is_reported_with_its_number(store: OutcomeStore, tmp_path: Path) -> None:
+def test_a_damaged_line_is_reported_with_its_number(store, tmp_path):
     for seed in (0, 1):
         store.keep(replace(UNIT, seed=seed), replace(OUTCOME, seed=seed))
     store.close()
@@ -254,7 +251,7 @@ def test_a_damaged_line_is_reported_with_its_number(store: OutcomeStore, tmp_pat
         (b'"sequence_hash":"hash"', b'"sequence_hash":""'),
     ],
 )
-def test_a_line_that_was_edited_is_refused(store: OutcomeStore, tmp_path: Path, was: bytes, becomes: bytes) -> None:
+def test_a_line_that_was_edited_is_refused(store, tmp_path, was, becomes):
     scored = Scored(Scores({**dict.fromkeys(describe()), "ate_se3_m": 0.5}), np.zeros(2), np.zeros(2), 3.0)
     store.keep(UNIT, OUTCOME)
     store.keep(replace(UNIT, seed=3), replace(OUTCOME, seed=3, outputs={"final": scored}))
@@ -267,7 +264,7 @@ def test_a_line_that_was_edited_is_refused(store: OutcomeStore, tmp_path: Path, 
         OutcomeStore(tmp_path, Conditions("hash"))
 
 
-def test_a_line_of_an_earlier_version_is_read_and_never_found(store: OutcomeStore, tmp_path: Path) -> None:
+def test_a_line_of_an_earlier_version_is_read_and_never_found(store, tmp_path):
     """It has no checksum, and is of other code in any case."""
     store.keep(UNIT, OUTCOME)
     store.close()
@@ -281,12 +278,12 @@ def test_a_line_of_an_earlier_version_is_read_and_never_found(store: OutcomeStor
 
 
 @pytest.mark.parametrize("name", ["../notes.txt", "notes.txt", "/etc/hosts", "trajectories/../notes.txt"])
-def test_a_line_makes_no_file_elsewhere_ours(tmp_path: Path, name: str) -> None:
+def test_a_line_makes_no_file_elsewhere_ours(tmp_path, name):
     (tmp_path / OUTCOMES).write_text(f'{{"schema":"vislam.outcome-files/1","files":["{name}"]}}\n')
     assert files_of_ours(tmp_path) == {OUTCOMES}
 
 
 @pytest.mark.parametrize(("content", "ours"), [(b"", True), (b'{"sche', True), (b"{}\n", False), (b"notes", False)])
-def test_a_file_of_that_name_is_ours_by_its_beginning(tmp_path: Path, content: bytes, ours: bool) -> None:
+def test_a_file_of_that_name_is_ours_by_its_beginning(tmp_path, content, ours):
     (tmp_path / OUTCOMES).write_bytes(content)
     assert files_of_ours(tmp_path) == ({OUTCOMES} if ours else set())

@@ -1,6 +1,5 @@
 """What the estimators read: the noise, the start, the seeds and the cut that the settings ask for."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, recording, run
 from toolkit.experiment.recording import Part, Recording, prepare
-from toolkit.measurements import ImuNoise, MotionNoise, TwistMotion, TwistNoise
+from toolkit.measurements import MotionNoise
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse
 from toolkit.settings.reading import settings_of
@@ -28,14 +27,14 @@ def messages(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
 
 
 @pytest.mark.parametrize("source", ["drive", "drive-imu"])
-def test_without_settings_the_noise_is_the_recordings(source: str) -> None:
+def test_without_settings_the_noise_is_the_recordings(source):
     recorded = load_sequence(source)
     cov_uv_px2, noise = messages(source)
     np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
     assert noise == recorded.noise
 
 
-def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results() -> None:
+def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results():
     slipping = faults.disturbed_motion(simulate(replace(SCENARIOS["drive"], duration_s=12.0), 0), 2.0)  # at 5 to 10 s
     for part, concerned in ((Part(), True), (Part(to_s=4.0), False), (Part(from_s=9.0), True)):
         (conflict,) = (f for f in prepare(Recording(slipping, part=part)).findings if f.fault == "conflict")
@@ -43,14 +42,14 @@ def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results() -> No
         assert ("none of it is in the part that is run" in conflict.detail) is not concerned
 
 
-def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion() -> None:
+def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion():
     recorded = load_sequence("drive").rig.cov_uv_px2
     cov_uv_px2, _ = messages("drive", pixel_sigma_px=0.7)
     np.testing.assert_allclose(np.diag(cov_uv_px2)[:2], 0.49, rtol=1e-12)
     np.testing.assert_allclose(cov_uv_px2 / cov_uv_px2[0, 0], recorded / recorded[0, 0], rtol=1e-12)
 
 
-def test_a_pixel_sigma_that_the_tracks_refute_is_reported() -> None:
+def test_a_pixel_sigma_that_the_tracks_refute_is_reported():
     """The audit reads the recording's own noise; estimators are told the one of the settings."""
     for sigma_px, expected in ((1.0, None), (30.0, "30 times too large"), (0.1, "9.99 times too small")):
         requested = Recording("drive", duration_s=5.0, noise=Noise(pixel_sigma_px=sigma_px))
@@ -59,30 +58,26 @@ def test_a_pixel_sigma_that_the_tracks_refute_is_reported() -> None:
         assert expected is None or expected in reported["track-scatter"]
 
 
-def test_a_factor_on_twists_scales_both_densities() -> None:
+def test_a_factor_on_twists_scales_both_densities():
     before, (_, after) = load_sequence("drive").noise, messages("drive", motion_scale=3.0)
-    assert isinstance(before, TwistNoise)
-    assert isinstance(after, TwistNoise)
     np.testing.assert_array_equal(after.velocity_noise_density, 3.0 * before.velocity_noise_density)
     np.testing.assert_array_equal(after.gyro_noise_density, 3.0 * before.gyro_noise_density)
 
 
-def test_a_factor_on_an_imu_leaves_its_random_walks() -> None:
+def test_a_factor_on_an_imu_leaves_its_random_walks():
     before, (_, after) = load_sequence("drive-imu").noise, messages("drive-imu", motion_scale=3.0)
-    assert isinstance(before, ImuNoise)
     densities = ("gyro_noise_density", "accel_noise_density")
     assert after == replace(before, **{name: 3.0 * getattr(before, name) for name in densities})
 
 
-def test_a_start_from_the_truth_is_the_truth_and_says_so() -> None:
+def test_a_start_from_the_truth_is_the_truth_and_says_so():
     from_truth = prepare(Recording(load_sequence("drive").truncated(20), start="truth"))
-    assert from_truth.sequence.truth is not None
     np.testing.assert_allclose(from_truth.prior.T_world_imu, from_truth.sequence.truth.T_world_imu[0], atol=1e-12)
     assert "truth" in from_truth.prior.source
     assert prepare(Recording(load_sequence("drive").truncated(20))).prior.source != from_truth.prior.source
 
 
-def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
+def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept():
     whole = load_sequence("drive").truncated(40)  # soon audited
     frames = prepare(Recording(whole, max_frames=7))
     assert (frames.sequence.frame_count, frames.whole.frame_count) == (7, whole.frame_count)
@@ -102,8 +97,8 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     ],
 )
 def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_something_is_found(
-    requested: Recording, findings: tuple[Finding, ...], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    requested, findings, audited_s, monkeypatch
+):
     lengths_s: list[float] = []
     undecided = {"lever-arm": "too little rotation"}
 
@@ -120,13 +115,13 @@ def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_something_i
 
 
 @pytest.mark.parametrize("name", [name for name, scenario in SCENARIOS.items() if scenario.audited_s is not None])
-def test_the_beginning_of_a_simulation_leaves_no_more_undecided_than_the_whole(name: str) -> None:
+def test_the_beginning_of_a_simulation_leaves_no_more_undecided_than_the_whole(name):
     beginning, whole = (prepare(Recording(name, max_frames=frames)) for frames in (7, None))
     assert beginning.findings == whole.findings == ()
     assert beginning.undecided.keys() <= whole.undecided.keys()
 
 
-def test_a_part_is_what_lies_between_its_times_thinned_and_is_reported() -> None:
+def test_a_part_is_what_lies_between_its_times_thinned_and_is_reported():
     whole = load_sequence("drive").truncated(40)  # 10 Hz
     prepared = prepare(Recording(whole, part=Part(1.0, 3.0, 3), max_frames=5))
     np.testing.assert_array_equal(prepared.sequence.frames_t_ns, whole.frames_t_ns[10:31:3][:5])
@@ -138,42 +133,36 @@ def test_a_part_is_what_lies_between_its_times_thinned_and_is_reported() -> None
     assert prepared.prior.source != prepare(Recording(whole)).prior.source
 
 
-def test_the_motion_between_thinned_frames_is_whole() -> None:
+def test_the_motion_between_thinned_frames_is_whole():
     whole = load_sequence("drive").truncated(9)
     packets = list(whole.packets())
     thinned = list(prepare(Recording(whole, part=Part(every=2))).sequence.packets())
     for k in range(1, 5):
         one, two = packets[2 * k - 1].motion, packets[2 * k].motion
         both = thinned[k].motion
-        assert isinstance(one, TwistMotion)
-        assert isinstance(two, TwistMotion)
-        assert isinstance(both, TwistMotion)
         np.testing.assert_array_equal(both.v_mps, np.concatenate([one.v_mps, two.v_mps]))
 
 
-def test_the_truth_of_thinned_frames_is_at_those_that_stay_and_its_own_where_it_has_other_stamps() -> None:
+def test_the_truth_of_thinned_frames_is_at_those_that_stay_and_its_own_where_it_has_other_stamps():
     whole = load_sequence("flight").truncated(21)
     every = Recording(whole, part=Part(every=5))
     thinned, truth = prepare(every).sequence, whole.truth
-    assert truth is not None
-    assert thinned.truth is not None
     np.testing.assert_array_equal(thinned.truth.t_ns, thinned.frames_t_ns)
     np.testing.assert_array_equal(thinned.truth.T_world_imu, truth.T_world_imu[:21:5])
     np.testing.assert_array_equal(thinned.truth.v_world, truth.v_world[:21:5])
     elsewhere = replace(whole, truth=replace(truth, t_ns=truth.t_ns + 2_000_000))
     for requested in (replace(every, source=elsewhere), Recording(whole)):
         kept = prepare(requested).sequence.truth
-        assert kept is not None
         assert kept.t_ns.size == truth.t_ns.size
 
 
-def test_a_part_without_two_frames_is_refused_with_what_there_is() -> None:
+def test_a_part_without_two_frames_is_refused_with_what_there_is():
     whole = load_sequence("drive").truncated(20)
     with pytest.raises(DataError, match=r"drive: from 5 s to the end it has 0 frame\(s\).* it has 20 in 1.9 s"):
         prepare(Recording(whole, part=Part(5.0)))
 
 
-def test_a_budget_of_tracks_is_kept_and_reported() -> None:
+def test_a_budget_of_tracks_is_kept_and_reported():
     prepared = prepare(Recording(load_sequence("drive").truncated(20), tracks=TrackUse(budget=25)))
     assert np.bincount(prepared.sequence.visible.frame).max() == 25
     assert prepared.sequence.provenance.facts[-1].startswith(
@@ -182,7 +171,7 @@ def test_a_budget_of_tracks_is_kept_and_reported() -> None:
     assert prepared.whole.track_budget is None
 
 
-def test_a_plan_reads_its_recordings_by_the_settings() -> None:
+def test_a_plan_reads_its_recordings_by_the_settings():
     given = {
         "first_seed": 5,
         "seeds": 3,
@@ -204,19 +193,15 @@ def test_a_plan_reads_its_recordings_by_the_settings() -> None:
     assert Plan(("drive",), ("ekf",)).seeds == (DEFAULTS.first_seed,)
 
 
-def test_a_world_is_drawn_of_simulations_alone() -> None:
+def test_a_world_is_drawn_of_simulations_alone():
     fixed, drawn = (prepare(Recording("drive", duration_s=1.0, vary=vary)).sequence for vary in ("noise", "world"))
-    assert fixed.truth is not None
-    assert drawn.truth is not None
     assert np.abs(fixed.truth.T_world_imu - drawn.truth.T_world_imu).max() > 0.01
     with pytest.raises(SettingsError, match="vary=world draws a simulated world"):
         prepare(Recording(fixed, vary="world"))
 
 
 @pytest.mark.parametrize("ids", [lambda track: -track - 1, lambda track: track + 2**56, lambda track: track * 2**50])
-def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run(
-    ids: Callable[[np.ndarray], np.ndarray],
-) -> None:
+def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run(ids):
     short = load_sequence("drive").truncated(12)
     seen = short.observations
     named = replace(short, observations=Observations.sorted(seen.frame, ids(seen.track_id), seen.uv_px))
@@ -227,6 +212,6 @@ def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run
     assert [one.status for one in compared.runs] == ["ok"] * 3
 
 
-def test_tracks_with_ids_that_a_graph_can_have_keep_them() -> None:
+def test_tracks_with_ids_that_a_graph_can_have_keep_them():
     short = load_sequence("drive").truncated(3)
     assert prepare(Recording(short)).sequence.observations is short.observations

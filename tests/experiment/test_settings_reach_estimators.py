@@ -59,7 +59,7 @@ def plan(settings: dict[str, object], *estimators: str) -> Plan:
     return Plan(("drive",), estimators, settings=settings_of(settings, "here"), max_frames=3, workers=1)
 
 
-def test_an_estimator_is_given_its_options_and_the_common_settings(tunable: str) -> None:
+def test_an_estimator_is_given_its_options_and_the_common_settings(tunable):
     given = {"window": {"lag_s": 3.5}, "estimators": {tunable: {"gain": 0.5, "mode": "fast"}, "plain": {}}}
     (comparison,) = run(plan(given, tunable, "plain"))
     logs = {outcome.estimator: outcome.log[:2] for outcome in comparison.outcomes}
@@ -75,15 +75,13 @@ def test_an_estimator_is_given_its_options_and_the_common_settings(tunable: str)
         ({"plain": {"gain": 1.0}}, "estimator plain has no option gain; it has none"),
     ],
 )
-def test_an_option_nobody_reads_is_refused_before_anything_runs(
-    tunable: str, monkeypatch: pytest.MonkeyPatch, options: dict[str, dict[str, float]], expected: str
-) -> None:
+def test_an_option_nobody_reads_is_refused_before_anything_runs(tunable, monkeypatch, options, expected):
     monkeypatch.setattr(runner, "run", None)
     with pytest.raises(EstimatorError, match=expected):
         prepared_cases(plan({"estimators": options}, tunable, "plain"), Workers(1))
 
 
-def test_options_are_read_without_importing(tunable: str) -> None:
+def test_options_are_read_without_importing(tunable):
     import sys
 
     assert find(tunable).options() == {"gain": (), "mode": ()}

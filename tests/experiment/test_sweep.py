@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,7 +64,7 @@ def over_doses(plan: Plan, axis: Axis, ratios: list[float | None], scatter: floa
     return sweep_of(plan, axis, outcomes)
 
 
-def test_ratios_are_paired_by_seed(plan: Plan) -> None:
+def test_ratios_are_paired_by_seed(plan):
     axis = Axis.of(FRAMES, [0.1, 0.2], plan)
     effect = over_doses(plan, axis, [1.3, 2.0]).effects["ekf", axis.points[0]]
     assert effect.over_clean == pytest.approx((1.3, 1.3, 1.3))  # though clean errors scatter fourfold
@@ -73,7 +72,7 @@ def test_ratios_are_paired_by_seed(plan: Plan) -> None:
 
 
 @pytest.mark.parametrize("scatter", [0.05, 0.3])
-def test_intervals_hold_the_true_ratio_nineteen_times_in_twenty(plan: Plan, scatter: float) -> None:
+def test_intervals_hold_the_true_ratio_nineteen_times_in_twenty(plan, scatter):
     from toolkit.experiment.statistics import mean_interval
 
     rng = np.random.default_rng(3)
@@ -82,7 +81,7 @@ def test_intervals_hold_the_true_ratio_nineteen_times_in_twenty(plan: Plan, scat
     assert held == pytest.approx(0.95, abs=0.015)  # three standard errors
 
 
-def test_an_estimator_breaks_where_it_passes_three_times_clean(plan: Plan) -> None:
+def test_an_estimator_breaks_where_it_passes_three_times_clean(plan):
     axis = Axis.of(FRAMES, [0.2, 0.4, 0.8], plan)
     (exact,) = over_doses(plan, axis, [1.0, 1.5, 6.0]).breaking
     assert exact.dose == pytest.approx(0.4 + 0.4 * math.log(2.0) / math.log(4.0))  # by the logarithm of the error
@@ -94,7 +93,7 @@ def test_an_estimator_breaks_where_it_passes_three_times_clean(plan: Plan) -> No
     assert (never.dose, never.low, never.high, never.tried) == (None, None, None, 0.8)
 
 
-def test_a_run_that_ends_badly_is_infinitely_bad(plan: Plan) -> None:
+def test_a_run_that_ends_badly_is_infinitely_bad(plan):
     axis = Axis.of(FRAMES, [0.2, 0.4], plan)
     sweep = over_doses(plan, axis, [1.1, None])
     assert sweep.effects["ekf", axis.points[1]].over_clean == Interval(math.inf, math.inf, math.inf)
@@ -104,12 +103,11 @@ def test_a_run_that_ends_badly_is_infinitely_bad(plan: Plan) -> None:
     trial = list(outcomes)[1]
     outcomes[trial] = (outcome(0, None), *outcomes[trial][1:])
     one_bad = replace(sweep, grid=replace(sweep.grid, outcomes=outcomes)).effects["ekf", axis.points[0]]
-    assert one_bad.over_clean is not None
     assert one_bad.over_clean == pytest.approx((1.1, 1.1, math.inf))
     assert (one_bad.ok, one_bad.runs) == (SEEDS - 1, SEEDS)
 
 
-def test_doses_on_both_sides_of_the_clean_one_break_apart(plan: Plan) -> None:
+def test_doses_on_both_sides_of_the_clean_one_break_apart(plan):
     axis = Axis.of("fault:wrong_noise", [4.0, 0.25, 1.0, 0.5, 2.0], plan)
     assert (axis.clean, axis.values) == (1.0, (0.25, 0.5, 2.0, 4.0))
     below, above = over_doses(plan, axis, [9.0, 1.0, 1.0, 1.0]).breaking
@@ -117,7 +115,7 @@ def test_doses_on_both_sides_of_the_clean_one_break_apart(plan: Plan) -> None:
     assert (below.tried, above.tried, above.dose) == (0.25, 4.0, None)
 
 
-def test_a_recording_without_seeds_is_compared_over_its_stretches(plan: Plan) -> None:
+def test_a_recording_without_seeds_is_compared_over_its_stretches(plan):
     once = replace(plan, settings=settings_of({}, "here"))
     axis, rng = Axis.of(FRAMES, [0.2], once), np.random.default_rng(2)
     clean = np.abs(rng.standard_normal(40))
@@ -125,13 +123,12 @@ def test_a_recording_without_seeds_is_compared_over_its_stretches(plan: Plan) ->
     worse[3] = np.nan
     outcomes = {CLEAN: [outcome(0, 1.0, clean)], axis.points[0]: [outcome(0, 7.0, worse)]}
     ratio = sweep_of(once, axis, outcomes).effects["ekf", axis.points[0]].over_clean
-    assert ratio is not None
     assert 1.7 < ratio.low < 2.0 < ratio.high < 2.4
     outcomes[axis.points[0]] = [outcome(0, None)]
     assert sweep_of(once, axis, outcomes).effects["ekf", axis.points[0]].over_clean == Interval(*[math.inf] * 3)
 
 
-def test_the_audit_names_what_was_planted_and_nothing_of_the_clean_recording() -> None:
+def test_the_audit_names_what_was_planted_and_nothing_of_the_clean_recording():
     recording = Recording("drive", 1, duration_s=12.0, faults=(("camera_clock", 0.05),))
     assert found_where_planted(recording) == ("time-offset",)
     assert found_where_planted(replace(recording, faults=())) == ()
@@ -145,7 +142,7 @@ def short(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> Plan:
     return replace(plan, estimators=("dead-reckoning",), settings=settings, max_frames=12, workers=1)
 
 
-def test_two_axes_are_crossed_or_each_is_varied_by_itself(short: Plan, tmp_path: Path) -> None:
+def test_two_axes_are_crossed_or_each_is_varied_by_itself(short, tmp_path):
     over: dict[str, list[Any]] = {FRAMES: [0.5], "noise.motion_scale": [2.0, 4.0]}
     crossed = run_sweep(short, over, crossed=True, directory=tmp_path)
     assert len(crossed.points) == 2 * 3
@@ -162,7 +159,7 @@ def test_two_axes_are_crossed_or_each_is_varied_by_itself(short: Plan, tmp_path:
     }
 
 
-def test_functions_of_ones_own_are_swept_beside_what_is_named(short: Plan) -> None:
+def test_functions_of_ones_own_are_swept_beside_what_is_named(short):
     mixed = replace(short, own={"mine": find("dead-reckoning").load()})
     swept = run_sweep(mixed, {FRAMES: [0.5]}, crossed=True)
     assert swept.estimators == ("dead-reckoning", "mine")
@@ -181,6 +178,6 @@ def test_functions_of_ones_own_are_swept_beside_what_is_named(short: Plan) -> No
         ({FRAMES: [0.1], TURNED: [0.1], "window.lag_s": [1.0]}, "3 axes make no grid"),
     ],
 )
-def test_what_cannot_be_swept_is_told_in_a_line(short: Plan, over: dict[str, list[Any]], what: str) -> None:
+def test_what_cannot_be_swept_is_told_in_a_line(short, over, what):
     with pytest.raises(SettingsError, match=what):
         run_sweep(short, over, crossed=True)

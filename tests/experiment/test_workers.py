@@ -17,15 +17,13 @@ import pytest
 from loky.backend.synchronize import SemLock
 
 from toolkit.errors import DataError
-from toolkit.estimate import Trajectory
-from toolkit.experiment.units import Outcome, Scored, Unit, run_unit
+from toolkit.experiment.units import Outcome, Scored, run_unit
 from toolkit.experiment.workers import LostUnit, WorkerProcess, results_of
 from toolkit.metrics import cost
 from toolkit.progress import SILENT
+from toolkit.verify.promises import arrays_of
 
-Units = Callable[..., list[Unit]]
 Jobs = Callable[..., list[Any]]
-StartsGroup = Callable[..., subprocess.Popen[str]]
 
 _WORK = """
 import os, signal, time
@@ -121,7 +119,7 @@ def by_place(units: list[Any], workers: int, work: Any) -> list[Any]:
     return [result for _, result in sorted(found, key=lambda pair: pair[0])]
 
 
-def test_processes_equal_one_process_bit_for_bit(units: Units) -> None:
+def test_processes_equal_one_process_bit_for_bit(units):
     """Several seeds and several estimators, a smoother with them: scores, trajectories and landmarks."""
     requested = units((0, 1), ("dead-reckoning", "ekf", "batch"))
     for one, other in zip(by_place(requested, 2, run_unit), by_place(requested, 1, run_unit), strict=True):
@@ -134,30 +132,23 @@ def _assert_equal(one: Outcome, other: Outcome) -> None:
     # Which process compiles first depends on what was compiled before.
     assert [[line for line in side.log if "was compiled" not in line] for side in (one, other)] == [[], []]
     assert one.outputs.keys() == other.outputs.keys() != set()
-    for output, scored in one.outputs.items():
-        assert _but_cost(scored) == _but_cost(other.outputs[output])
-        np.testing.assert_array_equal(scored.nees_pose, other.outputs[output].nees_pose)
-        np.testing.assert_array_equal(scored.position_m, other.outputs[output].position_m)
-    assert one.run is not None
-    assert other.run is not None
-    for mine, theirs in ((one.run.causal, other.run.causal), (one.run.final, other.run.final)):
-        _assert_same_trajectory(mine, theirs)
-    np.testing.assert_array_equal(one.run.landmarks.track_ids, other.run.landmarks.track_ids)
-    np.testing.assert_array_equal(one.run.landmarks.points_world, other.run.landmarks.points_world)
+    assert [*map(_but_cost, one.outputs.values())] == [*map(_but_cost, other.outputs.values())]
+    for mine, theirs in zip(_answers(one), _answers(other), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
-def _assert_same_trajectory(one: Trajectory | None, other: Trajectory | None) -> None:
-    assert (one is None) == (other is None)
-    if one is not None and other is not None:
-        np.testing.assert_array_equal(one.t_ns, other.t_ns)
-        np.testing.assert_array_equal(one.T_world_imu, other.T_world_imu)
+def _answers(outcome: Outcome) -> Iterator[np.ndarray]:
+    """Yield every array of scores, trajectories and landmarks."""
+    for scored in outcome.outputs.values():
+        yield from arrays_of(scored)
+    yield from arrays_of((outcome.run.causal, outcome.run.final, outcome.run.landmarks))
 
 
 def _but_cost(scored: Scored) -> dict[str, float | None]:
     return {key: value for key, value in scored.scores.values.items() if key not in _COST}
 
 
-def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs: Jobs, work: ModuleType, tmp_path: Path) -> None:
+def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs, work, tmp_path):
     results = by_place(jobs((0, 1), ("dead-reckoning", "ekf", "batch")), 2, work.dies)
     assert results[4] == LostUnit("its process was ended by signal 9 before it answered")
     del results[4]
@@ -165,32 +156,30 @@ def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs: Jobs, work:
     assert (tmp_path / "mark").read_text() == "tried tried "
 
 
-def test_a_process_that_dies_once_loses_nothing(jobs: Jobs, work: ModuleType) -> None:
+def test_a_process_that_dies_once_loses_nothing(jobs, work):
     results = by_place(jobs((0, 1)), 2, work.dies_once)
     assert results == [(name, seed) for seed in (0, 1) for name in ("dead-reckoning", "ekf")]
 
 
-def test_a_unit_without_memory_is_lost_alone(jobs: Jobs, work: ModuleType) -> None:
+def test_a_unit_without_memory_is_lost_alone(jobs, work):
     kept, lost = by_place(jobs((0, 1), ("ekf",)), 2, work.is_short_of_memory)
     assert (kept, type(lost)) == (0, LostUnit)
 
 
-def test_an_error_of_the_recording_ends_everything_at_once(jobs: Jobs, work: ModuleType) -> None:
+def test_an_error_of_the_recording_ends_everything_at_once(jobs, work):
     began = time.monotonic()
     with pytest.raises(DataError, match="nothing to see"):
         list(results_of(jobs((0, 1), ("ekf",)), 2, work.refuses, SILENT))
     assert time.monotonic() - began < 300.0  # the other process, asleep for ten minutes, was not waited for
 
 
-def test_a_defect_is_reported_with_the_traceback_of_its_process(jobs: Jobs, work: ModuleType) -> None:
+def test_a_defect_is_reported_with_the_traceback_of_its_process(jobs, work):
     with pytest.raises(ZeroDivisionError, match="a defect") as raised:
         list(results_of(jobs((0,)), 2, work.is_broken, SILENT))
     assert "in is_broken" in str(raised.value.__cause__)
 
 
-def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
-    jobs: Jobs, work: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(jobs, work, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     assert by_place(jobs((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
@@ -198,18 +187,14 @@ def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
     assert "MKL_NUM_THREADS" not in os.environ
 
 
-def test_a_process_with_much_memory_goes_on_without_a_message(
-    jobs: Jobs, work: ModuleType, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_a_process_with_much_memory_goes_on_without_a_message(jobs, work, recwarn):
     """Where psutil is there, loky takes a recording held in memory for a leak, says so and begins the process anew."""
     pytest.importorskip("psutil")
     assert len(set(by_place(jobs((0, 1, 2, 3)), 2, work.holds_much))) <= 2
     assert not recwarn.list
 
 
-def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_have_other_work(
-    jobs: Jobs, work: ModuleType
-) -> None:
+def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_have_other_work(jobs, work):
     """Two processes, six seeds: only at the end may both have worked on one seed."""
     requested = jobs(tuple(range(6)), ("batch", "ekf", "riekf"))
     found = dict(results_of(requested, 2, work.names_its_process, SILENT, lambda job: job.seed))
@@ -217,9 +202,7 @@ def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_ha
     assert sorted(map(len, processes))[:5] == [1] * 5
 
 
-def test_processes_go_on_while_the_reader_of_their_results_is_busy(
-    jobs: Jobs, work: ModuleType, tmp_path: Path
-) -> None:
+def test_processes_go_on_while_the_reader_of_their_results_is_busy(jobs, work, tmp_path):
     coming = results_of(jobs(tuple(range(20)), ("ekf",)), 2, work.leaves_a_mark, SILENT)
     next(coming)
     _wait_until(lambda: len(list(tmp_path.glob("done *"))) == 20)
@@ -227,7 +210,7 @@ def test_processes_go_on_while_the_reader_of_their_results_is_busy(
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: ModuleType, workers: int) -> None:
+def test_progress_is_that_of_all_units_and_never_goes_back(jobs, work, workers):
     received: list[tuple[int, int]] = []
 
     class Listening:
@@ -245,9 +228,7 @@ def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: Mod
     assert shares[-1] == 1.0 or workers == 1
 
 
-def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(
-    tmp_path: Path, starts_group: StartsGroup
-) -> None:
+def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(tmp_path, starts_group):
     words = ("compare", "drive", "--seeds", "50", "--estimators", "ekf", "--workers", "2", "--out", "run")
     vislam = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"TMPDIR": str(tmp_path)})
     _wait_until(lambda: any(map(_has_begun, tmp_path.glob("vislam-*/progress"))))
@@ -261,7 +242,7 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
     _assert_gone(vislam.pid)
 
 
-def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_path: Path) -> None:
+def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_path):
     """In a program of its own, because Python's resource tracker starts once a program, with the first process."""
     program = textwrap.dedent("""
         import signal
@@ -281,7 +262,7 @@ def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_p
     assert ran.stdout.splitlines() == ["True", "True", "set()"]
 
 
-def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypatch):
     shared: list[str] = []
 
     def register(name: str, kind: str) -> None:
@@ -313,18 +294,18 @@ def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypat
     assert not shared
 
 
-def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: StartsGroup) -> None:
+def test_no_process_outlives_one_that_is_killed(tmp_path, starts_group):
     program = textwrap.dedent("""
         import time
         from toolkit.experiment.workers import Workers
         from toolkit.progress import SILENT
+from toolkit.verify.promises import arrays_of
         workers = Workers(2)
         list(workers.results([1, 2], lambda unit, progress: unit, SILENT))
         print("started", flush=True)
         time.sleep(600)
     """)
     parent = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
-    assert parent.stdout is not None
     assert parent.stdout.readline() == "started\n"
     parent.kill()
     parent.wait()

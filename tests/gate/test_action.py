@@ -44,7 +44,7 @@ def baseline_of(folder: Path, runs: int) -> None:
     subprocess.run([sys.executable, "-m", "toolkit.cli", *words], cwd=folder, check=True, capture_output=True)
 
 
-def test_the_check_of_the_action_passes_fails_and_says_why_in_the_summary(run, tmp_path: Path) -> None:
+def test_the_check_of_the_action_passes_fails_and_says_why_in_the_summary(run, tmp_path):
     baseline_of(tmp_path, 1)
     inputs = {
         "BASELINE": "base.json",
@@ -64,7 +64,7 @@ def test_the_check_of_the_action_passes_fails_and_says_why_in_the_summary(run, t
 
 
 @pytest.mark.parametrize(("earlier", "method"), [("", "POST"), ("17", "PATCH")])
-def test_the_comment_is_written_once_and_then_rewritten(run, tmp_path: Path, earlier: str, method: str) -> None:
+def test_the_comment_is_written_once_and_then_rewritten(run, tmp_path, earlier, method):
     (tmp_path / "gh").write_text(
         f'#!/bin/sh\ncase "$*" in *--paginate*) echo "{earlier}";; *) echo "$@" >> "{tmp_path}/calls";; esac\n'
     )
@@ -77,7 +77,7 @@ def test_the_comment_is_written_once_and_then_rewritten(run, tmp_path: Path, ear
     assert "details" not in (tmp_path / "temp/gate/comment.txt").read_text()
 
 
-def test_a_comment_that_may_not_be_written_is_a_warning(run, tmp_path: Path) -> None:
+def test_a_comment_that_may_not_be_written_is_a_warning(run, tmp_path):
     (tmp_path / "gh").write_text("#!/bin/sh\nexit 1\n")
     (tmp_path / "gh").chmod(0o755)
     (tmp_path / "temp/gate").mkdir()
@@ -87,7 +87,7 @@ def test_a_comment_that_may_not_be_written_is_a_warning(run, tmp_path: Path) -> 
     assert "::warning::" in done.stdout
 
 
-def test_the_documented_workflow_gives_inputs_that_the_action_has_and_all_it_requires() -> None:
+def test_the_documented_workflow_gives_inputs_that_the_action_has_and_all_it_requires():
     text = (PROJECT / "docs/gate.md").read_text(encoding="utf-8")
     workflow = yaml.safe_load(re.findall(r"```yaml\n(.*?)```", text, flags=re.S)[0])
     given = next(step["with"] for step in workflow["jobs"]["gate"]["steps"] if "check@" in step.get("uses", ""))

@@ -16,7 +16,7 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.experiment.units import Outcome
-from toolkit.gate.baseline import Baseline, Measured, SeriesRecord
+from toolkit.gate.baseline import Measured, SeriesRecord
 from toolkit.gate.case_check import CheckTerms, check_case
 from toolkit.gate.measuring import TimedOutcome, gathered
 from toolkit.geometry import se3_exp
@@ -68,7 +68,6 @@ def trajectories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of two sequences, one of the first and three of the other, with their truths."""
     monkeypatch.chdir(tmp_path)
     truth = load_sequence("drive").truth
-    assert truth is not None
     rng = np.random.default_rng(0)
     for name, runs in RUNS.items():
         Path("truth").mkdir(exist_ok=True)
@@ -81,7 +80,7 @@ def trajectories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("trajectories")
-def test_no_trajectory_and_no_truth_can_be_missing_or_spoilt(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_trajectory_and_no_truth_can_be_missing_or_spoilt(capsys):
     check = ["check", "--trajectories", "results", "--baseline", "base.json"]
     assert main(["baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json"]) == 0
     assert main(check) == 0
@@ -92,7 +91,7 @@ def test_no_trajectory_and_no_truth_can_be_missing_or_spoilt(capsys: pytest.Capt
 
 
 @pytest.mark.usefixtures("trajectories")
-def test_a_run_that_is_not_there_is_named_and_the_rule_that_changed_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_is_not_there_is_named_and_the_rule_that_changed_is_told(capsys):
     assert main(["baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json"]) == 0
     Path("results/maze/1.tum").unlink()
     capsys.readouterr()
@@ -103,7 +102,7 @@ def test_a_run_that_is_not_there_is_named_and_the_rule_that_changed_is_told(caps
 
 
 @pytest.mark.usefixtures("trajectories")
-def test_no_run_and_no_score_of_an_evaluation_can_be_missing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_run_and_no_score_of_an_evaluation_can_be_missing(capsys):
     assert main(["evaluate", "truth", "mine=results", "--out", "scored", "--quiet"]) == 0
     document = json.loads(Path("scored/evaluation.json").read_text())
     assert main(["baseline", "--trajectories", "scored/evaluation.json", "--out", "base.json"]) == 0
@@ -139,7 +138,7 @@ def test_no_run_and_no_score_of_an_evaluation_can_be_missing(capsys: pytest.Capt
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_no_file_of_a_recording_can_be_missing_or_spoilt(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_no_file_of_a_recording_can_be_missing_or_spoilt(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(PROJECT / "data/drive_small", "recording")
     words = ["--estimators", "dead-reckoning", "--workers", "1", "--duration", "3"]
@@ -188,7 +187,7 @@ def losses_of_a_series(one: SeriesRecord, last: int) -> Iterator[tuple[str, Seri
                 yield f"{key} {what}", structs.replace(one, **{output: of_output})
 
 
-def test_nothing_that_was_measured_can_be_missing(baseline: Baseline) -> None:
+def test_nothing_that_was_measured_can_be_missing(baseline):
     passed, count = [], 0
     for i, (case, before) in enumerate(baseline.cases):
         for what, now in losses(before):
@@ -200,7 +199,7 @@ def test_nothing_that_was_measured_can_be_missing(baseline: Baseline) -> None:
     assert passed == []
 
 
-def test_a_unit_that_gives_no_result_is_a_run_that_failed(baseline: Baseline) -> None:
+def test_a_unit_that_gives_no_result_is_a_run_that_failed(baseline):
     case, _ = baseline.cases[0]
     found = [TimedOutcome(Outcome(seed, name, "ok")) for seed in case.seeds for name in case.estimators]
     before = gathered(case, found, (), {})
@@ -210,7 +209,7 @@ def test_a_unit_that_gives_no_result_is_a_run_that_failed(baseline: Baseline) ->
         assert (verdict.finding, verdict.metric) == ("regressed", "status")
 
 
-def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline: Baseline) -> None:
+def test_a_single_seed_is_held_to_the_margins_because_no_test_can_fail(baseline):
     case, before = baseline.cases[0]
     one_seed = gathered_first(before)
     single = replace(baseline, cases=((replace(case, seeds=(0,)), one_seed), baseline.cases[1]))
