@@ -22,9 +22,9 @@ from toolkit.answers import Run, Status, Timings, checked_estimate, checked_fini
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError, in_words, one_line
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
-from toolkit.estimator import Build, Estimator, Setup
+from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array
-from toolkit.measurements import Packet, Prior, TwistChangeNoise
+from toolkit.measurements import Prior, TwistChangeNoise
 from toolkit.models.motion import motion_model
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
@@ -101,7 +101,10 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         estimator = build(setup)
         clock = _Clock()
         for packet in packets:
-            estimate = checked_estimate(_timed_step(estimator, packet, clock), packet, online[-1] if online else None)
+            began = time.perf_counter()
+            answer = estimator.step(packet)
+            clock.steps.append(time.perf_counter() - began)
+            estimate = checked_estimate(answer, packet, online[-1] if online else None)
             if estimate is not None:
                 online.append(estimate)
             progress.advance(packet.index + 1, len(packets))
@@ -146,13 +149,6 @@ def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error
-
-
-def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate | None:
-    began = time.perf_counter()
-    estimate = estimator.step(packet)
-    clock.steps.append(time.perf_counter() - began)
-    return estimate
 
 
 def _failed(name: str, online: list[Estimate], timings: Timings, error: BaseException) -> Run:

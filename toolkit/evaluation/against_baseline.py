@@ -299,7 +299,9 @@ def check_trajectories(
             elif was.size and is_.size:
                 medians = float(np.median(was)), float(np.median(is_))
                 verdicts.append(check_recorded(where, criterion, *medians, accept_better=accept_better))
-                notes += _other_rule(before.sequence, was, is_)
+                if was.size >= FEWEST_RUNS:
+                    left = f"{is_.size} of the baseline's {was.size} runs are left"
+                    notes.append(f"{before.sequence}: {left}, too few to test; they are held to the bound instead")
     tests += list(everywhere(tests))
     rate = baseline.false_alarm_rate
     verdicts += check_metrics(tests, rate, accept_better=accept_better)
@@ -320,13 +322,6 @@ def everywhere(tests: Iterable[Repeats]) -> Iterator[Repeats]:
 
 def _verdict(before: SequenceRecord, metric: str, finding: Finding, *rest: object) -> Verdict:
     return Verdict(before.sequence, "", "", metric, finding, *rest)  # type: ignore[arg-type]
-
-
-def _other_rule(sequence: str, was: Array, is_: Array) -> Iterator[str]:
-    """Say where a metric that the baseline has runs enough to test has too few now."""
-    if was.size >= FEWEST_RUNS:
-        left = f"{is_.size} of the baseline's {was.size} runs are left"
-        yield f"{sequence}: {left}, too few to test; they are held to the bound instead"
 
 
 def _missing(

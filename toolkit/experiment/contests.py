@@ -59,11 +59,6 @@ class Advantage:
     n: int
     parts: str
 
-    @property
-    def is_clear(self) -> bool:
-        """Say whether the interval excludes that both are equal."""
-        return self.low > 1.0 or self.high < 1.0
-
 
 Compared = Callable[["Row", "Row"], Advantage | None]
 
@@ -106,7 +101,8 @@ def contests_of(rows: Sequence[Row], sequence: Recorded) -> tuple[Contest, ...]:
     """
     able = list(_able(rows))
     key = accuracy_of(able)
-    test_drift, test_tracks = (_over_seeds(key), _over_seeds(HELD_OUT)) if _many(able) else _of_one_run(sequence)
+    over_seeds = any(len(row.outcomes) > 1 for row in able)
+    test_drift, test_tracks = (_over_seeds(key), _over_seeds(HELD_OUT)) if over_seeds else _of_one_run(sequence)
     wanted: tuple[tuple[Question, str, tuple[str, ...], Compared], ...] = (
         ("accuracy at each frame", key, ("causal", "both"), test_drift),
         ("accuracy in the end", key, ("final", "both"), test_drift),
@@ -123,10 +119,6 @@ def cheaper_near(contest: Contest, within: float, saves: float) -> Row | None:
     near = [row for row in contest.rows[1:] if (row.value(contest.metric) or np.inf) <= limit and row.value(COST)]
     best = min(near, key=lambda row: row.value(COST) or np.inf, default=None)
     return best if best is not None and (best.value(COST) or np.inf) <= most else None
-
-
-def _many(rows: Iterable[Row]) -> bool:
-    return any(len(row.outcomes) > 1 for row in rows)
 
 
 def _able(rows: Sequence[Row]) -> Iterator[Row]:

@@ -15,9 +15,10 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Row
-from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.geometry import se3_inverse, se3_log
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics.correction_trend import NOTHING_CORRECTED, TREND
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.state import POSE, POSITION, ROTATION
 
 # Squared distance of two consistent estimates of a pose, over its degrees of freedom, that is exceeded once in a
@@ -66,7 +67,7 @@ def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
     known = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(apart).all(axis=1)
     if not known.any():
         return None
-    squared = _squared(apart[known], cov[known])
+    squared = mahalanobis_squared(apart[known], cov[known])
     k = int(np.argmax(squared))
     t_s = (motion.t_ns[mine][known][k] - motion.t_ns[0]) / NS_PER_S
     distance_m, angle = np.linalg.norm(apart[known][k, POSITION]), np.linalg.norm(apart[known][k, ROTATION])
@@ -76,8 +77,3 @@ def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
 def _trajectory(row: Row) -> Trajectory | None:
     run = row.outcomes[0].run
     return None if run is None or len(row.outcomes) > 1 else run.trajectory(row.output)
-
-
-def _squared(apart: Array, cov: Array) -> Array:
-    """Return the squared Mahalanobis lengths (N,) of vectors (N, 6) by covariances (N, 6, 6)."""
-    return np.asarray((apart * np.linalg.solve(cov, apart[..., None])[..., 0]).sum(axis=1))

@@ -128,8 +128,11 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
         entry.check_usable(plan.settings)
     check_file_names(plan.trajectories, {*entries, *plan.own})
     files = {name: read_external(path, plan.cov_convention) for name, path in plan.trajectories.items()}
-    for source in plan.sources:
-        _check_seeds(plan, source)
+    if len(plan.seeds) > 1:
+        for source in plan.sources:
+            if isinstance(source, Recorded) or not is_drawn_from_a_seed(source, plan.settings.frontend):
+                same = f"{_name(source)} is the same under every seed"
+                raise DataError(f"{same}; only simulated ones are repeated over seeds")
     recordings = [plan.recording(source, plan.seeds[0]) for source in plan.sources]
     names = ", ".join(_name(source) for source in plan.sources)
     with progress_for(f"{names}: loading and checking") as progress:
@@ -172,15 +175,12 @@ def stores_of(plan: Plan, cases: Sequence[Prepared], directories: Sequence[Path]
 def store_of(plan: Plan, case: Prepared, directory: Path) -> OutcomeStore:
     """Return where the outcomes of a case are kept, in a directory. Raises as :func:`stores_of`."""
     own = _own_digests(find_all(plan.estimators))
-    return OutcomeStore(directory, Conditions(_data_under_seed_0(plan, case), plan.keep, own))
+    data = case.data if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0)).data
+    return OutcomeStore(directory, Conditions(data, plan.keep, own))
 
 
 def _own_digests(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.own_digest for name, entry in entries.items() if entry.own_digest}
-
-
-def _data_under_seed_0(plan: Plan, case: Prepared) -> str:
-    return case.data if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0)).data
 
 
 def comparisons(
@@ -233,7 +233,11 @@ def outcomes_of(
         closing(workers.results(units, run_unit, progress, recording_to_prepare)) as coming,
     ):
         for i, result in coming:
-            yield missing[i], _outcome(result, *jobs[missing[i]])
+            unit, store = jobs[missing[i]]
+            if isinstance(result, LostUnit):
+                yield missing[i], Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
+            else:
+                yield missing[i], result if store is None else store.keep(unit, result)
 
 
 def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
@@ -258,12 +262,6 @@ def located(source: str | Recorded) -> str | Recorded:
     return str(Path(source).expanduser().absolute())
 
 
-def _outcome(result: Outcome | LostUnit, unit: Unit, store: OutcomeStore | None) -> Outcome:
-    if isinstance(result, Outcome):
-        return result if store is None else store.keep(unit, result)
-    return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
-
-
 def _comparison(
     plan: Plan, case: Prepared, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
 ) -> Comparison:
@@ -286,13 +284,6 @@ def _comparison(
         card=case.card,
         own_files={name: entry.word for name, entry in entries.items() if entry.own_digest},
     )
-
-
-def _check_seeds(plan: Plan, source: str | Recorded) -> None:
-    if len(plan.seeds) > 1 and (
-        isinstance(source, Recorded) or not is_drawn_from_a_seed(source, plan.settings.frontend)
-    ):
-        raise DataError(f"{_name(source)} is the same under every seed; only simulated ones are repeated over seeds")
 
 
 def _name(source: str | Recorded) -> str:

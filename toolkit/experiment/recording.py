@@ -183,7 +183,7 @@ def _prepared(recording: Recording, audited: Audit) -> Prepared:
         recording = replace(recording, part=WHOLE, max_frames=None, duration_s=None)
     stated = _with_pixel_noise(whole, recording.noise.pixel_sigma_px)
     if stated is not whole:
-        whole, audited = stated, _audited_with_its_noise(audited, _cut(stated, recording))
+        whole, audited = stated, checked_again(audited, "track-scatter", _cut(stated, recording))
     card = None
     if recording.card:
         whole, card = _with_card(whole, _cut(whole, recording))
@@ -356,10 +356,6 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
         return sequence
     of = f"{given:.0%} of the sightings"
     return thinned.with_facts(f"estimators are given at most {budget} tracks a frame (tracks.budget): {of}")
-
-
-def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
-    return checked_again(audited, "track-scatter", used)
 
 
 def _with_card(whole: Sequence, used: Sequence) -> tuple[Sequence, Card | None]:

@@ -31,7 +31,6 @@ from toolkit.experiment.pipeline import Plan, located, workers_of
 from toolkit.experiment.recording import found_where_planted
 from toolkit.experiment.statistics import Interval, jackknife_interval, mean_interval
 from toolkit.experiment.workers import LostUnit
-from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import find_all
@@ -295,11 +294,8 @@ def _over_stretches(clean: Row, row: Row, key: str) -> Interval | None:
     both = np.isfinite(series).all(axis=0)
     if both.sum() < _FEWEST or not (series[0][both] > 0.0).any():
         return None
-    return jackknife_interval(_log_ratio, *(one[both] for one in series)).exp()
-
-
-def _log_ratio(before: Array, after: Array) -> float:
-    return float(0.5 * np.log((after**2).sum() / (before**2).sum()))
+    before_m, after_m = (one[both] for one in series)
+    return jackknife_interval(lambda a, b: float(0.5 * np.log((b**2).sum() / (a**2).sum())), before_m, after_m).exp()
 
 
 def _nees(row: Row) -> Interval | None:

@@ -1,6 +1,7 @@
 """A unit of work: one estimator on one recording, run and scored."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -115,13 +116,9 @@ def run_unit(unit: Unit, progress: Progress) -> Outcome:
         return Outcome(unit.seed, unit.estimator, "failed", log=(str(error),))
     requested = unit.settings.metrics.requested()
     outcome = outcome_of(run, prepared.sequence, unit.seed, requested)
-    texts = _trajectory_texts(run) if unit.keep_trajectories else {}
+    kept = {output: run.trajectory(output) for output in OUTPUTS} if unit.keep_trajectories else {}
+    texts = {output: tum.text(trajectory) for output, trajectory in kept.items() if trajectory is not None}
     return replace(outcome, run=run if unit.keep_run else None, tum=texts)
-
-
-def _trajectory_texts(run: Run) -> dict[Output, str]:
-    given = {output: run.trajectory(output) for output in OUTPUTS}
-    return {output: tum.text(trajectory) for output, trajectory in given.items() if trajectory is not None}
 
 
 def prepared_of(unit: Unit) -> Prepared:
@@ -163,23 +160,17 @@ def outcome_of(run: Run, sequence: Sequence, seed: int, requested: tuple[str, ..
 def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, ...]) -> Scored:
     evaluation = Evaluation(run, output, sequence)
     nees_pose, position_m = (np.full(sequence.frame_count, np.nan) for _ in range(2))
+    nis_dof = None
     with np.errstate(all="ignore"):  # a diverged run overflows, as in score_run
-        try:
+        with suppress(Unavailable):  # the scores have the reason
             errors = body_errors(evaluation)
             _put(position_m, sequence.frames_t_ns, errors.t_ns, errors.distance_m)
             nees = nees_over_time(evaluation)
             _put(nees_pose, sequence.frames_t_ns, nees.t_ns, nees.pose)
-        except Unavailable:
-            pass  # the scores have the reason
+        with suppress(Unavailable):
+            nis_dof = nis_over_time(evaluation).independent_dof
         drift_m, heldout_px = drift_over_stretches(evaluation), held_out_over_stretches(evaluation)
-    return Scored(scores_of(evaluation, requested), nees_pose, position_m, _nis_dof(evaluation), drift_m, heldout_px)
-
-
-def _nis_dof(evaluation: Evaluation) -> float | None:
-    try:
-        return nis_over_time(evaluation).independent_dof
-    except Unavailable:
-        return None
+    return Scored(scores_of(evaluation, requested), nees_pose, position_m, nis_dof, drift_m, heldout_px)
 
 
 def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) -> None:
