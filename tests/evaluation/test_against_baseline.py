@@ -151,7 +151,7 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vis
         (
             ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "nowhere"),
             3,
-            "--truth nowhere: it is no folder; name one that has SEQUENCE.tum, or SEQUENCE=FILE",
+            "nowhere: there is no such truth; give a file, or a folder that has SEQUENCE.tum",
         ),
         (
             ("check", "--trajectories", "results", "--baseline", "base.json", "--junit", "same", "--json", "./same"),
@@ -159,7 +159,7 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vis
             "--junit and --json are files of their own",
         ),
         (("baseline", "--trajectories", "results"), 3, "lap: no truth is given; name it with --truth"),
-        (("baseline", "--trajectories", "results", "--truth", "results"), 3, "maze: results has 5 truths for it"),
+        (("baseline", "--trajectories", "results", "--truth", "results"), 3, "results: it has 5 truths for maze"),
         (("baseline", "--trajectories", "truth", "--truth", "truth", "--plan"), 3, "no sequence has 3 runs"),
         (("baseline", "drive", "--trajectories", "results"), 2, "--trajectories takes no SEQUENCE"),
         (("baseline", "drive", "--gap", "3"), 2, "--gap, --bound and --plan go with --trajectories"),

@@ -263,22 +263,12 @@ def _check_of_trajectories(options: argparse.Namespace) -> Check:
 
 
 def _runs_given(place: Path, truths: Sequence[str], known: Iterable[str] = ()) -> GivenRuns:
-    """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
-
-    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none, or
-    a truth that is not there, or of a sequence that neither the folder has nor is ``known``.
-    """
-    from toolkit.evaluation.against_baseline import EvaluatedRuns, FolderOfRuns, Truths
+    """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own."""
+    from toolkit.evaluation.against_baseline import EvaluatedRuns, FolderOfRuns, truths_given
+    from toolkit.evaluation.gathering import files_by_sequence
 
     if place.is_dir() or place.suffix != ".json":
-        named = [text.partition("=") for text in truths if "=" in text and not Path(text).is_dir()]
-        folders = [Path(text) for text in truths if "=" not in text or Path(text).is_dir()]
-        if len(folders) > 1:
-            raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
-        files = {name: Path(file) for name, _, file in named}
-        folder = FolderOfRuns(place, Truths(folders[0] if folders else None, files))
-        folder.truths.check({*folder.sequences, *known})
-        return folder
+        return FolderOfRuns(place, truths_given(truths, {*files_by_sequence(place), *known}))
     if truths:
         raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
     return EvaluatedRuns(place)

@@ -6,7 +6,7 @@ the hash of the truth they were scored against: the contract is ``vislam.traject
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
 
 from toolkit.errors import DataError, no_such, one_line, printable
-from toolkit.evaluation.gathering import files_by_sequence
+from toolkit.evaluation.gathering import files_by_sequence, truths_in
 from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth, score_file
 from toolkit.evaluation.standings import EvaluationRecord, RunRecord, read_evaluation
 from toolkit.files import documents
@@ -26,6 +26,7 @@ from toolkit.gate.measuring import place_of
 from toolkit.gate.significance import FEWEST_RUNS, Everywhere, Repeats, Where, check_metrics
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.geometry import Array
+from toolkit.settings import SettingsError
 
 Align = Literal["se3", "yaw", "sim3"]
 # The scores of a run by metric, or why it has none.
@@ -105,42 +106,31 @@ def to_text(baseline: TrajectoryBaselineRecord) -> str:
     return json_text(to_builtins(baseline))
 
 
-@dataclass(frozen=True)
-class Truths:
-    """Where the truth of a sequence is: in a file named for it in a folder, or in one that was named."""
+def truths_given(words: Sequence[str], sequences: Iterable[str]) -> dict[str, Path]:
+    """Return the truths that words name, a folder that has SEQUENCE.tum or SEQUENCE=FILE, by sequence.
 
-    folder: Path | None = None
-    files: Mapping[str, Path] | None = None
-
-    def check(self, sequences: Iterable[str]) -> None:
-        """Raise DataError where a truth is named for none of the sequences, as for a misspelt one, or is not there."""
-        known = sorted(sequences)
-        for name, file in (self.files or {}).items():
-            if name not in known:
-                raise DataError(f"--truth names the truth of {name}: {no_such('sequence', name, known)}")
-            if not file.exists():
-                raise DataError(f"--truth {name}={file}: there is no such file; check the path")
-        if self.folder is not None and not self.folder.is_dir():
-            raise DataError(f"--truth {self.folder}: it is no folder; name one that has SEQUENCE.tum, or SEQUENCE=FILE")
-
-    def of(self, sequence: str) -> Path:
-        """Return the truth's file; raises DataError where there is none."""
-        if self.files and sequence in self.files:
-            return self.files[sequence]
-        if self.folder is None:
-            raise DataError(f"{sequence}: no truth is given; name it with --truth {sequence}=FILE.tum or --truth DIR")
-        found = files_by_sequence(self.folder).get(sequence, ())
-        if len(found) != 1:
-            raise DataError(f"{sequence}: {self.folder} has {len(found)} truths for it; give one, {sequence}.tum")
-        return found[0]
+    Raises DataError where one is of none of the sequences, as of a misspelt one, or is not there, SettingsError where
+    two folders are named.
+    """
+    folders, known = [text for text in words if "=" not in text or Path(text).is_dir()], sorted(sequences)
+    if len(folders) > 1:
+        raise SettingsError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
+    named = [text.partition("=") for text in words if text not in folders]
+    for name, _, file in named:
+        if name not in known:
+            raise DataError(f"--truth names the truth of {name}: {no_such('sequence', name, known)}")
+        if not Path(file).exists():
+            raise DataError(f"--truth {name}={file}: there is no such file; check the path")
+    in_folder = truths_in(Path(folders[0])) if folders else {}
+    return in_folder | {name: Path(file) for name, _, file in named}
 
 
 @dataclass(frozen=True)
 class FolderOfRuns:
-    """The trajectory files in a folder, with their truths."""
+    """The trajectory files in a folder, with truths by sequence."""
 
     folder: Path
-    truths: Truths
+    truths: Mapping[str, Path]
 
     @property
     def sequences(self) -> tuple[str, ...]:
@@ -157,10 +147,13 @@ class FolderOfRuns:
         if not files:
             had = ", ".join(before.files if before else ())
             raise DataError(f"no trajectory of it is in {self.folder}; the baseline has {had}")
-        given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
-        path = self.truths.of(sequence) if before is None or given else place_of(before.truth) or Path(before.truth)
-        if not given and not path.is_file():
-            raise DataError(f"its truth is not at {path}, where the baseline had it; name another place with --truth")
+        if sequence in self.truths:
+            path = self.truths[sequence]
+        elif before is None:
+            raise DataError(f"{sequence}: no truth is given; name it with --truth {sequence}=FILE.tum or --truth DIR")
+        elif not (path := place_of(before.truth) or Path(before.truth)).is_file():
+            where = f"its truth is not at {path}, where the baseline had it"
+            raise DataError(f"{where}; name another place with --truth")
         truth = read_truth(sequence, path)
         _check_truth(path.as_posix(), truth.digest, before)
         by_file: dict[str, Scored] = {}

@@ -48,7 +48,7 @@ def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gather
     ``runs`` runs of a sequence gets the missing ones likewise. Raises DataError where an argument names nothing, or
     nothing that has a truth.
     """
-    truths = {_name(truth): truth} if truth.is_file() else _truths_in(truth)
+    truths = {_name(truth): truth} if truth.is_file() else truths_in(truth)
     found = _of_one_sequence(truth, given) if truth.is_file() else _of_folders(given)
     known = {sequence for sequences in found.values() for sequence in sequences}
     scored = [sequence for sequence in truths if sequence in known]
@@ -124,7 +124,8 @@ def _systems_in(tree: Path) -> dict[str, Path]:
     return systems
 
 
-def _truths_in(folder: Path) -> dict[str, Path]:
+def truths_in(folder: Path) -> dict[str, Path]:
+    """Return the truth of each sequence in a folder; raises DataError where there are none, or two of one."""
     if not folder.exists():
         raise DataError(f"{folder}: there is no such truth; give a file, or a folder that has SEQUENCE.tum")
     found = files_by_sequence(folder)
