@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, Unpack, get_args
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from toolkit.answers import Output, Run
 from toolkit.errors import VislamError, did_you_mean, no_such, type_of
@@ -55,8 +55,8 @@ Source = str | Path | Sequence
 Names = str | Iterable[str]
 
 
-class _Run(Struct, frozen=True):
-    """How a comparison is run, beside what is compared: seeds, processes, and where outcomes are kept."""
+class _Asked(Request, frozen=True):
+    """What is compared, and how it is run: seeds, processes, and where outcomes are kept."""
 
     seed: Annotated[int, Meta(ge=0)] | None = None
     seeds: Annotated[int, Meta(ge=1)] | None = None
@@ -100,10 +100,17 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,
     ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
-    given = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s, "to_s": to_s}
-    given |= {"cov_convention": cov_convention}
-    how = {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
-    plan, kept = _planned(source, estimators, own, settings, {**given, **how, "every": every, "keep": keep})
+    given: dict[str, Any] = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s}
+    given |= {
+        "to_s": to_s,
+        "cov_convention": cov_convention,
+        "every": every,
+        "keep": keep,
+        "own": own,
+        "settings": settings,
+    }
+    given |= {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
+    plan, kept = _planned(source, estimators, given)
     if kept is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if kept is None else (kept,))[0])
@@ -145,9 +152,7 @@ def sweep(
     """
     if strange := sorted(options.keys() - SweepOptions.__annotations__.keys()):
         raise SettingsError(no_such("argument", strange[0], SweepOptions.__annotations__))
-    given = dict(options)
-    own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
-    plan, kept = _planned(source, estimators, own, settings, given)
+    plan, kept = _planned(source, estimators, options)
     return SweepResult(run_sweep(plan, over, crossed=not each, directory=kept))
 
 
@@ -166,35 +171,30 @@ def explain(
 
     Raises as :func:`compare` does, and EstimatorError for an estimator that does not say what it has.
     """
-    given = dict(options)
-    own, settings = given.pop("own", None), given.pop("settings", DEFAULTS)
-    if own:
+    if options.get("own"):
         raise SettingsError(
             "own has functions, which cannot say what they have; give the path of a file with INGREDIENTS"
         )
     usual = default_ends() if None in (start, goal) else ("", "")
-    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, own, settings, given)
+    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, options)
     return ExplainResult(run_explanation(plan, str(start or usual[0]), str(goal or usual[1]), kept))
 
 
-def _planned(
-    source: Source, estimators: Names | None, own: Any, settings: Any, given: Mapping[str, Any]
-) -> tuple[Plan, Path | None]:
+def _planned(source: Source, estimators: Names | None, options: Mapping[str, Any]) -> tuple[Plan, Path | None]:
     """Return the plan of a function's arguments, and the directory its outcomes are kept in, if any."""
     if not isinstance(source, str | Path | Sequence):
         raise SettingsError(f"source is {type_of(source)}; give one recording: a path, a built-in name, a Sequence")
-    what = {key: value for key, value in given.items() if key not in _Run.__struct_fields__ and value is not None}
-    what |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
-    request = record_of(Request, _plain({key: value for key, value in what.items() if value is not None}), "")
-    run = record_of(_Run, _plain({key: value for key, value in given.items() if key in _Run.__struct_fields__}), "")
+    given = {key: value for key, value in options.items() if key not in ("own", "settings")}
+    given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
+    asked = record_of(_Asked, _plain({key: value for key, value in given.items() if value is not None}), "")
     plan = plan_of(
-        Configuration(request, _with_seeds(settings, run)),
+        Configuration(asked, _with_seeds(options.get("settings", DEFAULTS), asked)),
         (source if isinstance(source, Sequence) else str(source),),
-        _checked_own(own, request.estimators or ()),
-        run.workers,
-        run.scheduler,
+        _checked_own(options.get("own"), asked.estimators or ()),
+        asked.workers,
+        asked.scheduler,
     )
-    return plan, None if run.resume is None else Path(run.resume)
+    return plan, None if asked.resume is None else Path(asked.resume)
 
 
 def _names(what: str, given: Names | None) -> Any:
@@ -220,7 +220,7 @@ def _checked_own(own: Mapping[str, Build] | None, named: Iterable[str]) -> Mappi
     return own
 
 
-def _with_seeds(settings: Settings | Mapping[str, Any], run: _Run) -> Settings:
+def _with_seeds(settings: Settings | Mapping[str, Any], run: _Asked) -> Settings:
     if not isinstance(settings, Settings | Mapping):
         raise SettingsError(f"settings is {type_of(settings)}; give nested values, as {{'seeds': 3}}")
     values = as_values(settings) if isinstance(settings, Settings) else _plain(settings)

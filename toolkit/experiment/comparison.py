@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -82,34 +82,28 @@ def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
     by_errors = _by_errors(scored)
     if by_errors is not None and by_errors.verdict == "overconfident":
         return by_errors
-    return _contradicted(scored) or by_errors
-
-
-def _contradicted(scored: Sequence[Scored]) -> Consistency | None:
-    """Return the mean correction trend of runs where it is beyond the mean of its limits, or None."""
-    trends = [one.scores.values for one in scored if one.scores.values.get(TREND) is not None]
-    if not trends:
-        return None
-    mean, limit = (float(np.mean([values[key] for values in trends])) for key in (TREND, LIMIT))
-    return Consistency(TREND, mean, 0.0, limit) if mean > limit else None
+    trends, limits = _known(scored, TREND), _known(scored, LIMIT)
+    if trends and (mean := float(np.mean(trends))) > (limit := float(np.mean(limits))):
+        return Consistency(TREND, mean, 0.0, limit)
+    return by_errors
 
 
 def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
-    nees = [value for one in scored if (value := one.scores.values.get(NEES)) is not None]
-    if nees:
-        return _consistency(NEES, nees, float(POSE_DOF * len(nees)))
-    nis = [(value, one.nis_dof) for one in scored if (value := one.scores.values.get(NIS)) is not None and one.nis_dof]
-    if not nis:
+    if nees := _known(scored, NEES):
+        return Consistency(NEES, sum(nees) / len(nees), *nees_band(float(POSE_DOF * len(nees))))
+    innovating = [one for one in scored if one.nis_dof and one.scores.values.get(NIS) is not None]
+    if not (nis := _known(innovating, NIS)):
         return None
     # A mean of n chi-square variables over their degrees of freedom d_i has the variance 2 sum(1 / d_i) / n^2.
-    accepted = [value for one in scored if (value := one.scores.values.get(ACCEPTED)) is not None]
+    dof = len(nis) ** 2 / sum(1.0 / one.nis_dof for one in innovating if one.nis_dof)
+    accepted = _known(scored, ACCEPTED)
     refused_much = bool(accepted) and refuses_much(sum(accepted) / len(accepted))
-    found = _consistency(NIS, [value for value, _ in nis], len(nis) ** 2 / sum(1.0 / dof for _, dof in nis))
-    return replace(found, refused_much=refused_much)
+    return Consistency(NIS, sum(nis) / len(nis), *nees_band(dof), refused_much)
 
 
-def _consistency(metric: str, values: list[float], dof: float) -> Consistency:
-    return Consistency(metric, sum(values) / len(values), *nees_band(dof))
+def _known(scored: Iterable[Scored], key: str) -> list[float]:
+    """Return the values of a metric that runs have."""
+    return [value for one in scored if (value := one.scores.values.get(key)) is not None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,14 +187,14 @@ class Row:
 
     def spread(self, key: str) -> Spread | None:
         """Return mean, median and spread of a metric over the runs that are ok, or None where there is no value."""
-        return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)
+        return spread_of(_known(self.good, key))
 
     def quantiles_of_all(self, metric: Metric) -> QuantilesOfAll | None:
         """Return a metric's quartiles over all runs, one that is not ok counted as infinitely bad.
 
         Returns None where runs are ok and none of them has a value, or no value is better than another.
         """
-        good = [value for scored in self.good if (value := scored.scores.values.get(metric.key)) is not None]
+        good = _known(self.good, metric.key)
         if self.good and not good:
             return None
         return quantiles_of_all(good, len(self.outcomes) - self.counts["ok"], metric.best)
