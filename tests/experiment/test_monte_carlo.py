@@ -147,7 +147,7 @@ def test_seeds_json_obeys_its_contract(over, document):
         (lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(), "metrics.ate_none_m.values"),
         (lambda d: d["runs"][0]["counts"].update(ok=9), "counts does not count status"),
         (lambda d: d["runs"][3]["notes"].clear(), "has no value, and notes does not say why"),
-        (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed"),
+        (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed, or status of a run"),
     ],
 )
 def test_a_broken_document_is_refused_with_the_place(document, spoil, expected):

@@ -184,6 +184,13 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         check_promised(dict(self.metrics))
+        if self.counts != {status: self.status.count(status) for status in self.counts}:
+            raise ValueError("counts does not count status")
+        for key, metric in self.metrics.items():
+            if len(metric.values) != len(self.status):
+                raise ValueError(f"metrics.{key}.values does not have an entry a seed")
+            if metric.n == 0 and not self.notes.get(key):
+                raise ValueError(f"metrics.{key} has no value, and notes does not say why")
 
 
 class LogEntry(Struct, frozen=True, kw_only=True):
@@ -209,6 +216,10 @@ class Seeds(Struct, frozen=True, kw_only=True):
     estimators: Annotated[tuple[str, ...], Meta(description="in order")]
     runs: Annotated[tuple[RunOverSeeds, ...], Meta(description="by estimator, causal before final")]
     log: Annotated[tuple[LogEntry, ...], Meta(description="every run that has log lines")]
+
+    def __post_init__(self) -> None:
+        if {len(self.seeds)} != {len(self.hashes), *(len(run.status) for run in self.runs)}:
+            raise ValueError("hashes does not have an entry a seed, or status of a run")
 
 
 read_metrics = reader(MetricsDocument, REPEAT)
