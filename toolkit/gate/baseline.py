@@ -244,7 +244,7 @@ def load_baseline(path: Path) -> Baseline:
     if path.is_dir():
         return _of_these_releases(path)
     try:
-        return _of_record(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+        return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
     except BaselineError as error:
         if "'vislam.trajectory-baseline/" not in str(error):
             raise
@@ -286,7 +286,8 @@ def to_text(baseline: Baseline) -> str:
     return json_text(to_builtins(record))
 
 
-def _of_record(record: BaselineRecord) -> Baseline:
+def from_document(record: BaselineRecord) -> Baseline:
+    """Return the baseline of a record."""
     return Baseline(
         record.releases,
         tuple(_case(case) for case in record.sequences),
