@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -195,14 +194,11 @@ def test_any_other_error_at_the_first_motion_is_a_broken_promise(newcomer, capsy
     assert RUNS in failed(capsys)
 
 
-@pytest.mark.parametrize("refusal", ["no process", "no import"])
-def test_a_process_that_cannot_start_breaks_no_promise(monkeypatch, refusal):
-    def run(*_given, **_named):
-        if refusal == "no process":
-            raise BlockingIOError(11, "Resource temporarily unavailable")
-        return subprocess.CompletedProcess([], 1, "", "ModuleNotFoundError: No module named 'toolkit'\n")
+def test_a_process_that_cannot_start_breaks_no_promise(monkeypatch):
+    def refused(*_given, **_named):
+        raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr("toolkit.verify.threads.subprocess.run", run)
+    monkeypatch.setattr("toolkit.verify.threads.ProcessPoolExecutor.submit", refused)
     checked = verification._threads("ekf")
     assert checked.result == "not applicable"
     assert "not checked" in checked.found
