@@ -73,7 +73,20 @@ WRONG: list[tuple[str, int, str]] = [
             ("--set window.lag_s=1", "window.lag_s=2"),
         )
     ),
+    # Baselines.
     ("baseline drive:1 --set seeds=9", 2, "--set seeds=9 is for compare"),
+    ("check", 2, "--baseline"),
+    ("baseline", 2, "name a SEQUENCE, or --trajectories DIR"),
+    ("baseline drive --seeds 4", 2, "at least 5"),
+    ("baseline drive drive:2", 2, "a sequence is named twice"),
+    ("baseline drive --truth gt.tum", 2, "--truth takes SEQUENCE=FILE.tum, not gt.tum"),
+    ("baseline drive --truth kitti00=gt.tum", 2, "--truth is for kitti00, which is none of the sequences"),
+    ("baseline drive --truth drive=gt.tum", 2, "--truth is for recorded sequences"),
+    ("baseline nowhere.npz --out new.json", 3, "nowhere.npz: no such file"),
+    ("baseline drive:soon --out new.json", 3, "drive:soon: no such file"),
+    ("baseline drive --out t", 4, "t is a directory"),
+    ("baseline drive --estimators oracle --out new.json", 5, "no estimator is called oracle"),
+    ("check --baseline broken.toml --skip-speed --json t", 4, "t is a directory"),  # before anything is read
     # Recordings, trajectories, and what does not go together.
     ("compare no/such.npz", 3, "no/such.npz: no such file or directory"),
     ("compare https://example.org/03.npz", 3, "it is an address: download it and name the file"),

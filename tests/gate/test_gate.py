@@ -94,39 +94,3 @@ def test_another_release_is_3_in_one_line_unless_allowed(vislam, capsys, allowed
     messages = capsys.readouterr().err
     assert messages.startswith("vislam: error: base.json: made with gtsam 4.2.0, here ")
     assert messages.count("\n") == 1
-
-
-def test_an_output_that_cannot_be_written_is_4_before_anything_runs(vislam):
-    Path("base.json").write_text("{")  # would be 3, were it read
-    assert vislam(*CHECK, "--json", "root") == 4
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("check",),
-        ("baseline",),
-        ("baseline", "drive", "--seeds", "4"),
-        ("baseline", "drive", "drive:2"),
-        ("baseline", "drive", "--truth", "gt.tum"),
-        ("baseline", "drive", "--truth", "kitti00=gt.tum"),
-        ("baseline", "drive", "--truth", "drive=gt.tum"),
-    ],
-)
-def test_a_wrong_command_line_is_2(vislam, capsys, words):
-    assert vislam(*words) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "status"),
-    [
-        (("baseline", "nowhere.npz", "--out", "new.json"), 3),
-        (("baseline", "drive:soon", "--out", "new.json"), 3),
-        (("baseline", "drive", "--out", "root"), 4),
-        (("baseline", "drive", "--estimators", "oracle", "--out", "new.json"), 5),
-    ],
-)
-def test_trouble_with_a_new_baseline_leaves_nothing(vislam, words, status):
-    assert vislam(*words) == status
-    assert {path.name for path in Path().iterdir()} == {"root", "base.json"}
