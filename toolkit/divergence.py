@@ -24,18 +24,14 @@ from toolkit.sequence import Sequence
 _LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
 FAR_STEP = float(chdtri(6, 1e-6))
-# Mismatches and poor noise figures make some steps far in healthy runs too: up to one in seven where frames are stale
-# and tracks go wrong, by estimators that end within 2 m of each other after 1.3 km. A sixth of all is no accident.
-# Chosen by looking at real recordings; in sound simulated runs no step is far (docs/estimators.md has the figures).
+# Mismatches and poor noise figures make up to one step in seven far in healthy runs. Chosen by looking at real
+# recordings; in sound simulated runs no step is far (docs/estimators.md has the figures).
 MOST_FAR_STEPS = 1.0 / 6.0
-# The gate passes nearly all sound measurements, and still 65 % where tracks go wrong all the time. A filter whose
-# covariance does not cover its error rejects nearly all measurements, and from then on: this share must pass in the
-# whole run and in its last quarter. Chosen likewise; in sound simulated runs at least 85 % of the measurements pass.
+# The gate passes nearly all sound measurements, and 65 % where tracks go wrong all the time. One whose covariance does
+# not cover its error rejects nearly all from then on: this share must pass in the whole run and in its last quarter.
 LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
-# A track that is tested as a whole passes only if all of its sightings are sound: of tracks of 12 sightings, one in ten
-# of which is an outlier, 28 % pass in a run that is millimetres off. So many sightings may be outliers in a run that
-# works, by the length of those that pass, which are the shorter ones. Chosen on simulated runs with one in ten, where a
-# quarter of the tracks passes; of the tracks of a filter whose gate has collapsed still fewer do.
+# A track that is tested as a whole passes only if all of its sightings are sound: of 12 sightings, one in ten of which
+# is an outlier, 28 %. So many sightings may be outliers in a run that works, by the mean length of tracks that pass.
 _MOST_OUTLIERS = 0.2
 # What a correction may do beyond the noise of the motion where it corrects a velocity and biases as well:
 # rad/s of turn rate and m/s of velocity.

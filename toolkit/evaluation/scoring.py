@@ -1,12 +1,9 @@
 """One trajectory file against the truth: matched in time, checked to be of the same recording, scored.
 
-The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so is the rule of association: poses are
-paired on the stamps of the sparser of both, between whose neighbours the other is interpolated. ``max_dt_s`` asks for
-the rule of evo (Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017) instead: the nearest pose.
-
-A file may state covariances, which are judged as an estimator's are. So may the one in the place of the truth: it is
-then another estimate of the same run, and a difference is compared with the sum of both covariances. Errors that both
-share cancel in it, so that this finds too little, and never too much.
+The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so is the rule of association;
+``max_dt_s`` asks for that of evo (Grupp 2017) instead, the nearest pose. Stated covariances are judged as an
+estimator's are. A truth that states some is another estimate of the same run, and a difference is compared with the sum
+of both: errors that both share cancel in it, so that this finds too little, and never too much.
 """
 
 from contextlib import suppress

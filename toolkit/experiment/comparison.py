@@ -1,19 +1,9 @@
 """The result of a comparison on one sequence: every estimator under every seed, scored. Every report is made from it.
 
 A line of the table is one kind of output of one estimator. Its values are those of the single run or, over seeds, the
-means over the runs that are ok.
-
-A line also says whether its runs are overconfident or timid. The NEES of a pose against an independent truth is, in a
-consistent estimator, a chi-square variable over its 6 degrees of freedom (Bar-Shalom, Li and Kirubarajan 2001, section
-5.4). The errors of the poses of a run are correlated in an unknown way, so the band of the mean is derived for the
-worst case: all poses share one error, and their mean scatters as a single NEES does. However they are correlated, a
-mean of equally distributed variables scatters no more than one of them (it is smaller in convex order: Shaked and
-Shanthikumar, "Stochastic orders", 2007, theorem 3.A.36). Over N seeds, which are independent, the mean has the band of
-N. Without such a truth the innovations are judged in the same way: those of one frame share the error of its pose and
-count as one stereo sighting; those of different frames of a consistent filter are independent. Both bands are wide on
-purpose; docs/metrics.md says where simulated consistent runs lie in them. Where a gate refused many innovations and the
-others are smaller than stated, the covariance is not marked as too large: few large and many small innovations have a
-distribution with heavy tails, for which no covariance is right.
+means over the runs that are ok. Whether it is overconfident or timid is told by the NEES of its poses (Bar-Shalom, Li
+and Kirubarajan 2001, section 5.4) where the truth is independent, else by the NIS, with bands that hold however its
+errors are correlated in time; docs/metrics.md derives them.
 """
 
 from __future__ import annotations

@@ -3,11 +3,9 @@
 On a recording results are the same every time, up to rounding, so that any change is real. It is shown from one part in
 a million on, and fails beyond its bound in either direction.
 
-A change of a metric's formula is distinguished from a change of the trajectory, because the same poses cannot have
-another error. The median reprojection of withheld tracks, the errors of the positions and the NEES are all computed
-from the same poses. Where one of them is the same to six digits under every seed, the poses are the same, and any of
-the others that moved by a thousandth is computed by another formula. A NEES may also move with the covariance alone: an
-unchanged NEES shows that poses are the same, but a NEES is never called changed.
+A change of a metric's formula is told apart from one of the trajectory: where the errors of positions, the reprojection
+of withheld tracks or the NEES are the same to six digits under every seed, so are the poses, and any of the others that
+moved by a thousandth is computed differently. A NEES may move with the covariance alone and is never called changed.
 """
 
 import math

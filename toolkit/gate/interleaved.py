@@ -1,10 +1,9 @@
 """Tests whether the code became slower: old and new code run in turns on the same recording and processor.
 
-Other load of the machine slows both sides of a pair alike, so that a change of 15 % is found although times measured
-separately scatter by as much. The number of pairs is decided by the scatter of the first ones, not by their mean
-(Stein, "A two-sample test for a linear hypothesis whose power is independent of the variance", Annals of Mathematical
-Statistics 16, 1945). The test is Wilcoxon's signed-rank test, which is robust to single runs that were delayed. The
-other version of the code, a git revision or a wheel, is unpacked beside the installed one while it is timed.
+Other load of the machine slows both sides of a pair alike. The number of pairs is decided by the scatter of the first
+ones, not by their mean (Stein, Annals of Mathematical Statistics 16, 1945); the test is Wilcoxon's signed-rank test,
+which is robust to single runs that were delayed. The other version, a git revision or a wheel, is unpacked beside the
+installed one while it is timed.
 """
 
 import io

@@ -1,19 +1,12 @@
 """The statistical tests of the gate, on logarithms of metrics.
 
-Simulated sequences are tested in pairs, because under each seed both sides read the same measurements. The logarithms
-of a metric are compared, so that a mean difference is a ratio. Two hypotheses are tested for each metric: that it
-*moved*, up or down, by more than another processor's rounding, and that it became *worse* by more than its margin. A
-NEES is worse the farther its mean over the seeds is outside the chi-square band of as many runs, on either side
-(Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4); a NIS,
-the farther it is from 1. Whatever became worse has moved as well: both questions share one rate.
-
-Student's paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
-section 2.5; the correction is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
-Statistics 6 (1979). Arrays are tested along their last axis, so that a benchmark can test thousands of checks at once.
-
-Runs that were made anew on both sides, of a system that answers differently each time, are tested by Welch's test,
-one-sided ("The generalization of 'Student's' problem when several different population variances are involved",
-Biometrika 34, 1947). Identical runs have no spread; then the answer is certain.
+Simulated sequences are tested in pairs, because under each seed both sides read the same measurements: that a metric
+*moved* by more than another processor's rounding, and that it became *worse* by more than its margin, by Student's
+paired test (Montgomery, "Design and analysis of experiments", 2013, section 2.5). A NEES is worse the farther its mean
+over the seeds is outside the chi-square band of as many runs, on either side (Bar-Shalom, Li and Kirubarajan 2001,
+section 5.4); a NIS, the farther it is from 1. Runs that were made anew on both sides are tested by Welch's test
+(Biometrika 34, 1947). The correction over all tests is Holm's (Scandinavian Journal of Statistics 6, 1979). Arrays are
+tested along their last axis, so that a benchmark can test thousands of checks at once; docs/gate.md tells the rest.
 """
 
 from collections.abc import Sequence
