@@ -33,13 +33,13 @@ from toolkit.registry import discover, find_all
 from toolkit.report.comparison_table import Columns, comparison_table, requested_columns
 from toolkit.report.comparison_text import comparison_latex
 from toolkit.report.explanation import (
+    EXPLANATIONS,
     ExplanationRecord,
     explanation_document,
     explanation_table,
-    explanation_text,
     write_explanation,
 )
-from toolkit.report.sweep import sweep_document, sweep_table, sweep_text, write_sweep
+from toolkit.report.sweep import SWEEPS, sweep_document, sweep_table, write_sweep
 from toolkit.report.text import WIDTH, Table, as_markdown, as_text, in_markdown
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
@@ -356,7 +356,7 @@ class SweepResult:
         return Path(directory)
 
     def __repr__(self) -> str:
-        return sweep_text(sweep_document(self.sweep))
+        return SWEEPS.text(sweep_document(self.sweep))
 
     def _repr_markdown_(self) -> str:
         return self.table()._repr_markdown_()
@@ -402,7 +402,7 @@ class ExplainResult:
         return Path(directory)
 
     def __repr__(self) -> str:
-        return explanation_text(self.document, WIDTH)
+        return EXPLANATIONS.text(self.document, WIDTH)
 
     def _repr_markdown_(self) -> str:
         return f"{in_markdown(self.words)}\n\n{self.table()._repr_markdown_()}"

@@ -204,7 +204,7 @@ def explain(options: argparse.Namespace) -> int:
     from toolkit.experiment.configuration import plan_of
     from toolkit.experiment.explanation import default_ends, run_explanation
     from toolkit.registry import discover
-    from toolkit.report.explanation import check_explanation_directory, explanation_text, write_explanation
+    from toolkit.report.explanation import EXPLANATIONS, write_explanation
     from toolkit.report.text import width_of_output
 
     options.sequences = [options.sequence]
@@ -213,12 +213,12 @@ def explain(options: argparse.Namespace) -> int:
     usual = default_ends()
     ends = options.start_at or usual[0], options.goal or usual[1]
     target, progress_for = options.out or _new_run(), of_this_process()
-    check_explanation_directory(target)
+    EXPLANATIONS.check(target)
     with _kept_where([target]):
         found = run_explanation(plan, *ends, target, progress_for)
     with progress_for(f"{found.grid.case.name}: figure"):
         document = write_explanation(found, target, shlex.join(options.command_line))
-    _print(document, explanation_text(document, width_of_output()), target, options)
+    _print(document, EXPLANATIONS.text(document, width_of_output()), target, options)
     return 0
 
 
@@ -265,7 +265,7 @@ def sweep(options: argparse.Namespace) -> int:
     from toolkit.experiment.configuration import SweepRequest, plan_of, read_sweep_request
     from toolkit.experiment.sweep import run_sweep
     from toolkit.report.figures.sweeps import draw_sweep
-    from toolkit.report.sweep import check_sweep_directory, sweep_text, write_sweep
+    from toolkit.report.sweep import SWEEPS, write_sweep
     from toolkit.settings.reading import assigned
 
     requested = SweepRequest() if options.config is None else read_sweep_request(options.config)
@@ -277,13 +277,13 @@ def sweep(options: argparse.Namespace) -> int:
     if not plan.sources:
         raise UsageError("name the sequence to sweep, a path or a built-in name as drive")
     target, progress_for = options.out or _new_run(), of_this_process()
-    check_sweep_directory(target)
+    SWEEPS.check(target)
     with _kept_where([target]):
         crossed = not (options.each or requested.each)
         found = run_sweep(plan, axes or requested.over, crossed=crossed, directory=target, progress_for=progress_for)
     with progress_for(f"{found.grid.case.name}: figures"):
         document = write_sweep(found, target, shlex.join(options.command_line), list(draw_sweep(found)))
-    _print(document, sweep_text(document), target, options)
+    _print(document, SWEEPS.text(document), target, options)
     return 0
 
 

@@ -14,28 +14,20 @@ from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
 from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation, Variant, called
 from toolkit.experiment.statistics import Paired
-from toolkit.files.documents import Count, reader, rounded, to_text
-from toolkit.files.writing import check_replaceable
+from toolkit.files.documents import Count, reader, rounded
 from toolkit.metrics import metrics_called
-from toolkit.report.html import card
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import PAGE, own_files, write_results
+from toolkit.report.results_folder import Results, Shown
 from toolkit.report.text import (
     MISSING,
     Table,
-    Width,
-    as_markdown,
-    as_text,
-    filled,
-    in_markdown,
-    markdown_section,
+    TextPart,
     number,
 )
 from toolkit.settings import changes_of
 
 Kind = Literal["added", "taken"]
 Other = Literal["variance", "nees"]
-EXPLANATION, TEXT = "explain.json", "explain.md"
 # Factors of more than this stand for any larger one, which a diverged run may have.
 _MOST = 1e6
 _DIGITS = 3
@@ -380,57 +372,22 @@ def _cells(effect: ContributionRecord, keys: Sequence[str]) -> Iterator[str]:
         yield f"{factor}{star} ({', '.join(filter(None, (f'{low}-{high}', ok if key == 'error' else '')))})"
 
 
-def explanation_text(found: ExplanationRecord, width: Width = None) -> str:
-    """Return an explanation as it is printed."""
-    return f"{filled(found.words, width, further='')}\n\n{as_text(explanation_table(found))}"
-
-
-def explanation_markdown(found: ExplanationRecord) -> str:
-    """Return an explanation as ``explain.md``: words, figures with their captions, table, pairs."""
-    shown = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in found.figures.items())
+def _shown_as(found: ExplanationRecord) -> Shown:
     pairs = (
         f"{part.ingredient}: {'; '.join(f'{one.less} and {one.more}' for one in part.effects) or 'none'}"
         for part in found.parts
     )
-    parts = [
-        f"# {in_markdown(title_of(found))}",
-        in_markdown(found.words),
-        *shown,
-        as_markdown(explanation_table(found)),
-    ]
-    return "\n\n".join([*parts, *markdown_section("Pairs that differ in one ingredient", pairs)]) + "\n"
+    title = f"From {found.gap.less} to {found.gap.more} on {found.sequence.name}"
+    more = (TextPart("Pairs that differ in one ingredient", tuple(pairs)),)
+    return Shown(title, found.words, explanation_table(found), found.figures, found.files, more)
 
 
-def title_of(found: ExplanationRecord) -> str:
-    """Return the title of an explanation."""
-    return f"From {found.gap.less} to {found.gap.more} on {found.sequence.name}"
-
-
-def explanation_section(found: ExplanationRecord, directory: Path) -> str:
-    """Return the section of the page for an explanation, with the figure of its directory inside, as HTML.
-
-    Raises DataError where the figure is missing.
-    """
-    figures = {directory / name: caption for name, caption in found.figures.items()}
-    return card(title_of(found), [found.words], explanation_table(found), figures)
-
-
-def check_explanation_directory(target: Path) -> None:
-    """Raise OutputError unless an explanation can be written at ``target`` without the loss of anybody's files."""
-    check_replaceable(target, _ours)
-
-
-def _ours(directory: Path) -> frozenset[str]:
-    return own_files(directory, lambda folder: (EXPLANATION, PAGE, *read_explanation(folder / EXPLANATION).files))
+EXPLANATIONS = Results("explain.json", "explain.md", read_explanation, _shown_as)
 
 
 def write_explanation(found: Explanation, target: Path, command: str) -> ExplanationRecord:
-    """Write ``explain.json``, ``explain.md`` and the figure, PNG and PDF, beside the outcomes kept in a directory.
-
-    Raises OutputError where it cannot be written or holds something else; nothing is left behind then.
-    """
+    """Write the explanation's folder: document, Markdown and figure; raises as :meth:`Results.write` does."""
     from toolkit.report.figures.waterfall import draw_explanation
 
-    texts = {TEXT: explanation_markdown, EXPLANATION: to_text}
-    figures = list(draw_explanation(explanation_document(found)))
-    return write_results(target, _ours, figures, partial(explanation_document, found, command), texts)
+    figures = draw_explanation(explanation_document(found))
+    return EXPLANATIONS.write(target, figures, partial(explanation_document, found, command))

@@ -4,23 +4,36 @@ The folder of a sweep or an explanation is written here whole: document, text an
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
-import msgspec
+from msgspec import Struct
 
 from toolkit.errors import DataError
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
-from toolkit.files.writing import replaced_directory, with_folders
+from toolkit.files.documents import to_text
+from toolkit.files.writing import check_replaceable, replaced_directory, with_folders
+from toolkit.report.html import card
+from toolkit.report.text import (
+    Table,
+    TextPart,
+    Width,
+    as_markdown,
+    as_text,
+    filled,
+    in_markdown,
+    parts_as_markdown,
+)
 
 if TYPE_CHECKING:
     from toolkit.report.figures.style import NamedFigure
 
 PAGE = "report.html"
 _FIGURES = "figures"
-Record = TypeVar("Record", bound=msgspec.Struct)
+Record = TypeVar("Record", bound=Struct)
 
 
 def own_files(directory: Path, written: Callable[[Path], Iterable[str]]) -> frozenset[str]:
@@ -44,28 +57,80 @@ def take_over(file: Path, place: Path) -> None:
         shutil.copyfile(file, place)
 
 
-def write_results(
-    target: Path,
-    owner: Callable[[Path], frozenset[str]],
-    figures: "Sequence[NamedFigure]",
-    document: Callable[[dict[str, str], tuple[str, ...]], Record],
-    texts: Mapping[str, Callable[[Record], str]],
-) -> Record:
-    """Write a folder anew: figures, PNG and PDF, then ``texts`` by file name, made of the document; return that.
+class Shown(NamedTuple):
+    """What a document says: title, words, table, captions by figure, files, and what only its Markdown has."""
 
-    ``document`` makes it of the captions by file and of the files there are. Outcomes kept in the folder stay. Raises
-    OutputError where it cannot be written or holds something else; nothing is left behind then.
-    """
-    from toolkit.report.figures import save
+    title: str
+    words: str
+    table: Table
+    figures: Mapping[str, str]
+    files: tuple[str, ...]
+    more: tuple[TextPart, ...] = ()
 
-    with replaced_directory(target, owner) as directory:
-        if (target / OUTCOMES).exists():
-            take_over(target / OUTCOMES, directory / OUTCOMES)
-        (directory / _FIGURES).mkdir()
-        save(figures, directory / _FIGURES, "pdf")
-        captions = {f"{_FIGURES}/{name}": text for name, text in save(figures, directory / _FIGURES).items()}
-        written = sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file())
-        made = document(captions, (*written, *texts))
-        for name, text_of in texts.items():
-            (directory / name).write_text(text_of(made), encoding="utf-8")
-    return made
+
+@dataclass(frozen=True)
+class Results(Generic[Record]):
+    """The folder of a kind of results: the names of its document and its Markdown, how one is read and shown."""
+
+    document: str
+    markdown: str
+    read: Callable[[Path], Record]
+    shown: Callable[[Record], Shown]
+
+    def is_in(self, directory: Path) -> bool:
+        """Say whether a folder has the document."""
+        return (directory / self.document).is_file()
+
+    def check(self, target: Path) -> None:
+        """Raise OutputError unless the results can be written at ``target`` without the loss of anybody's files."""
+        check_replaceable(target, self._ours)
+
+    def _ours(self, directory: Path) -> frozenset[str]:
+        def written(folder: Path) -> tuple[str, ...]:
+            return (self.document, PAGE, *self.shown(self.read(folder / self.document)).files)
+
+        return own_files(directory, written)
+
+    def text(self, record: Record, width: Width = None) -> str:
+        """Return the results as they are printed."""
+        shown = self.shown(record)
+        return f"{filled(shown.words, width, further='')}\n\n{as_text(shown.table)}"
+
+    def as_markdown(self, record: Record) -> str:
+        """Return the results as Markdown, figures by the names of their files."""
+        shown = self.shown(record)
+        figures = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in shown.figures.items())
+        parts = (f"# {in_markdown(shown.title)}", in_markdown(shown.words), as_markdown(shown.table), *figures)
+        return "\n\n".join([*parts, *parts_as_markdown(shown.more)]) + "\n"
+
+    def section(self, directory: Path) -> str:
+        """Return the section of the page for a folder; raises DataError where its document or a figure is missing."""
+        shown = self.shown(self.read(directory / self.document))
+        figures = {directory / name: caption for name, caption in shown.figures.items()}
+        return card(shown.title, [shown.words], shown.table, figures)
+
+    def write(
+        self,
+        target: Path,
+        figures: "Iterable[NamedFigure]",
+        made: Callable[[dict[str, str], tuple[str, ...]], Record],
+    ) -> Record:
+        """Write the folder anew: figures, PNG and PDF, then the document and its Markdown; return the document.
+
+        It is ``made`` of the captions by file and of the files there are. Outcomes kept in the folder stay. Raises
+        OutputError where it cannot be written or holds something else; nothing is left behind then.
+        """
+        from toolkit.report.figures import save
+
+        drawn, names = list(figures), (self.markdown, self.document)
+        with replaced_directory(target, self._ours) as directory:
+            if (target / OUTCOMES).exists():
+                take_over(target / OUTCOMES, directory / OUTCOMES)
+            (directory / _FIGURES).mkdir()
+            save(drawn, directory / _FIGURES, "pdf")
+            captions = {f"{_FIGURES}/{name}": text for name, text in save(drawn, directory / _FIGURES).items()}
+            written = sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file())
+            record = made(captions, (*written, *names))
+            for name, text in zip(names, (self.as_markdown(record), to_text(record)), strict=True):
+                (directory / name).write_text(text, encoding="utf-8")
+        return record

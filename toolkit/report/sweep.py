@@ -12,20 +12,16 @@ from msgspec import Meta, Struct
 from toolkit.experiment.statistics import Interval
 from toolkit.experiment.sweep import BREAKS_AT, Axis, Breaking, Effect, Sweep
 from toolkit.files.documents import number as finite
-from toolkit.files.documents import of_attributes, reader, to_text
-from toolkit.files.writing import check_replaceable
+from toolkit.files.documents import of_attributes, reader
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import sequence_line
-from toolkit.report.html import card
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
-from toolkit.report.results_folder import PAGE, own_files, write_results
+from toolkit.report.results_folder import Results, Shown
 from toolkit.report.text import (
     MISSING,
     Table,
-    as_markdown,
-    as_text,
+    TextPart,
     cell,
-    in_markdown,
     number,
     unit_of,
 )
@@ -33,8 +29,6 @@ from toolkit.settings import Scalar, changes_of
 
 if TYPE_CHECKING:
     from toolkit.report.figures.style import NamedFigure
-
-SWEEP, TEXT = "sweep.json", "sweep.md"
 
 
 class IntervalRecord(Struct, frozen=True, kw_only=True):
@@ -197,22 +191,6 @@ def _under(sweep: SweepRecord) -> Iterator[str]:
         yield f"{axis.name}{f' [{axis.unit}]' if axis.unit else ''}: {axis.meaning}"
 
 
-def sweep_text(sweep: SweepRecord) -> str:
-    """Return a sweep as it is printed."""
-    return f"{sweep.about}\n\n{as_text(sweep_table(sweep))}"
-
-
-def sweep_markdown(sweep: SweepRecord) -> str:
-    """Return a sweep as ``sweep.md``: the table, the figures, and everything of each point."""
-    shown = (f"![{in_markdown(text)}]({name})\n\n{in_markdown(text)}" for name, text in sweep.figures.items())
-    parts = [
-        f"# Sweep of {in_markdown(sweep.sequence.name)}",
-        in_markdown(sweep.about),
-        as_markdown(sweep_table(sweep)),
-    ]
-    return "\n\n".join([*parts, *shown, "## Every point", as_markdown(_whole_table(sweep))]) + "\n"
-
-
 def _whole_table(sweep: SweepRecord) -> Table:
     metric = metric_of(sweep)
     unit = unit_of(metric, [effect.error for effect in sweep.effects])
@@ -231,28 +209,15 @@ def _whole_table(sweep: SweepRecord) -> Table:
     return Table(tuple((head, "", "") for head in (*heads, "NEES pose", "CPU frame [ms]")), rows, labels=3)
 
 
-def sweep_section(sweep: SweepRecord, directory: Path) -> str:
-    """Return the section of the page for a sweep, with the figures of its directory inside, as HTML.
-
-    Raises DataError where a figure is missing.
-    """
-    figures = {directory / name: caption for name, caption in sweep.figures.items()}
-    return card(f"Sweep of {sweep.sequence.name}", [sweep.about], sweep_table(sweep), figures)
+def _shown_as(sweep: SweepRecord) -> Shown:
+    more = (TextPart("Every point", _whole_table(sweep)),)
+    title = f"Sweep of {sweep.sequence.name}"
+    return Shown(title, sweep.about, sweep_table(sweep), sweep.figures, sweep.files, more)
 
 
-def check_sweep_directory(target: Path) -> None:
-    """Raise OutputError unless a sweep can be written at ``target`` without the loss of anybody's files."""
-    check_replaceable(target, _ours)
+SWEEPS = Results("sweep.json", "sweep.md", read_sweep, _shown_as)
 
 
-def _ours(directory: Path) -> frozenset[str]:
-    return own_files(directory, lambda folder: (SWEEP, PAGE, *read_sweep(folder / SWEEP).files))
-
-
-def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Sequence[NamedFigure]") -> SweepRecord:
-    """Write ``sweep.json``, ``sweep.md`` and the figures, PNG and PDF, beside the outcomes kept in a directory.
-
-    Raises OutputError where it cannot be written or holds something else; nothing is left behind then.
-    """
-    texts = {TEXT: sweep_markdown, SWEEP: to_text}
-    return write_results(target, _ours, figures, partial(sweep_document, sweep, command), texts)
+def write_sweep(sweep: Sweep, target: Path, command: str, figures: "Iterable[NamedFigure]") -> SweepRecord:
+    """Write the sweep's folder: document, Markdown and figures; raises as :meth:`Results.write` does."""
+    return SWEEPS.write(target, figures, partial(sweep_document, sweep, command))

@@ -35,17 +35,12 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     nothing is left behind then.
     """
     # Here, because pages of other systems' trajectories are made without what reads a run directory.
-    from toolkit.report.explanation import EXPLANATION, explanation_section, read_explanation
+    from toolkit.report.explanation import EXPLANATIONS
     from toolkit.report.html.payload import payload_of
     from toolkit.report.run_directory import read_run
-    from toolkit.report.sweep import SWEEP, read_sweep, sweep_section
+    from toolkit.report.sweep import SWEEPS
 
-    sections = {one: sweep_section(read_sweep(one / SWEEP), one) for one in directories if (one / SWEEP).is_file()}
-    sections |= {
-        one: explanation_section(read_explanation(one / EXPLANATION), one)
-        for one in directories
-        if (one / EXPLANATION).is_file()
-    }
+    sections = {one: kind.section(one) for kind in (SWEEPS, EXPLANATIONS) for one in directories if kind.is_in(one)}
     runs = [read_run(directory) for directory in directories if directory not in sections]
     write_text(target, page_text(payload_of(runs), "\n".join(sections.values())))
 
