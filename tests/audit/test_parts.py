@@ -8,7 +8,7 @@ import pytest
 from toolkit.audit.conventions import axes_named, right_handed_axes, signed_axes
 from toolkit.audit.intervals import interval_means
 from toolkit.audit.one_step import errors_are_independent
-from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, median, slope
+from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, slope
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.measurements import NS_PER_S
@@ -59,14 +59,6 @@ def test_interval_means_integrate_straight_lines_exactly() -> None:
     values = np.stack([2.0 * t_ns / NS_PER_S, np.ones(5)], axis=1)
     frames_t_ns = np.array([1, 2, 8, 11]) * NS_PER_S
     np.testing.assert_allclose(interval_means(t_ns, values, frames_t_ns), [[3, 1], [10, 1], [19, 1]], rtol=1e-12)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 8])
-def test_the_median_is_numpys_also_of_what_is_not_a_number(count: int) -> None:
-    values = np.random.default_rng(5).standard_normal((count, 3))
-    values[2 * count // 3 : 2 * count // 3 + count // 4, 1] = np.nan
-    expected = np.median(values, axis=0) if count else np.full(3, np.nan)
-    np.testing.assert_array_equal(median(values), expected)
 
 
 @pytest.mark.parametrize("stretches", [3, 5, 10])

@@ -23,7 +23,7 @@ from toolkit.audit.intervals import (
     speed_ratio,
 )
 from toolkit.audit.one_step import errors_are_independent
-from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, MEDIAN_TO_MEAN_ERROR, Scalar, median, median_error
+from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, MEDIAN_TO_MEAN_ERROR, Scalar, median_error
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import STRETCHES
 from toolkit.measurements import NS_PER_S
@@ -31,8 +31,7 @@ from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import MAD_TO_SIGMA
 from toolkit.sequence import Sequence
 
-# A ratio must be this many standard errors beyond its limit. The noise of the camera's rotation lowers the ratio of the
-# rates of rotation, so that ratio has only an upper limit.
+# A ratio must be this many standard errors beyond its limit; the noise of the camera's rotation lowers that of rates.
 RATIO_SIGMAS = 5.0
 # Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
 NEAR_UNIT = 0.08
@@ -105,8 +104,7 @@ CONFLICT_SIGMAS = 10.0
 # recordings at hand have up to 0.05 rad/s, a tenth of the speed where wheels slip or depths are wrong, and 0.4 m/s^2.
 LEAST_DEVIATION = {"rate of rotation": 0.06, "velocity": 0.2, "specific force": 0.5}
 LEAST_OF_SPEED = 0.1
-# Length (s) of the stretches that are averaged: longer than a correction of the steering, shorter than a stop at a
-# traffic light.
+# Length (s) of the averaged stretches: longer than a correction of the steering, shorter than a stop.
 STRETCH_S = 2.0
 # Least number of intervals for a mean.
 LEAST_IN_STRETCH = 8
@@ -114,8 +112,7 @@ LEAST_IN_STRETCH = 8
 LEAST_STRETCHES = 10
 # The specific force is compared with the gravity estimated within this time (s), before the gyro's drift rotates it.
 GRAVITY_S = 10.0
-# A velocity is the median of this many neighbours; its standard deviation is that of a single one times this factor,
-# for normal errors.
+# A velocity is the median of this many neighbours, with a standard deviation that is smaller by this factor.
 _MEDIAN_OF, _MEDIAN_ERROR = 5, 0.536
 # The quartile of the absolute value of a normal variable, over its standard deviation.
 _LOWER_QUARTILE = 0.3186
@@ -243,7 +240,7 @@ def _stretches(deviation: Deviation) -> tuple[Array, Array, Array]:
     begin, end = begin[enough], end[enough]
     count = (end - begin)[:, None]
     of_stretches = (value[i:j] for i, j in zip(begin, end, strict=True))
-    average = partial(np.mean, axis=0) if deviation.telescopes else median
+    average = partial(np.mean if deviation.telescopes else np.median, axis=0)
     mean = np.array([average(of_one) for of_one in of_stretches]).reshape(-1, 3)
     noise = deviation.noise / (count if deviation.telescopes else np.sqrt(count))
     return 0.5 * (t_s[begin] + t_s[end - 1]), mean, noise
@@ -287,12 +284,11 @@ def _around(t_s: Array, value: Array) -> Array:
     first: IntArray = np.searchsorted(t_s, knots_s - GRAVITY_S)
     last: IntArray = np.searchsorted(t_s, knots_s + 1.0 + GRAVITY_S)
     even = _neighbours(value, round(0.5 * STRETCH_S / float(np.median(np.diff(t_s))))).mean(axis=-1)
-    medians = np.array([median(even[i:j]) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
+    medians = np.array([np.median(even[i:j], axis=0) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
     return medians[np.searchsorted(knots_s, np.floor(t_s))]
 
 
-# Level of significance of a step, over all places where it can be, and its least share: the sound drives at hand have
-# 0.057 at most. Chosen with them in view.
+# Level of significance of a step, over all places where it can be, and its least share (sound drives have 0.057).
 LEVEL, SYSTEMATIC = 1e-3, 0.06
 # Where only a step larger than this would be found, the finding is undecided and says so.
 LARGEST_HIDDEN_STEP = 0.08
@@ -351,13 +347,10 @@ def _largest_step(ratio: Array) -> tuple[int, Scalar]:
     return best, steps[best]
 
 
-# The parts before and after each of these shares of the recording are compared. A change must be beyond this many
-# standard errors and a share of gravity, a larger one unless the errors of the tracks are independent. Beyond five
-# standard errors, parts of sound recordings at hand have 0.3 % at most, and simulated flights whose tracks drift from
-# image to image 0.8 %. Chosen with them in view.
+# The parts before and after these shares of the recording are compared. A change must be beyond this many standard
+# errors and a share of gravity (sound recordings have 0.3 % at most), a larger one if tracks drift (0.8 %).
 CUTS, GRAVITY_SIGMAS, GRAVITY_SYSTEMATIC, BY_TRACK_DRIFT = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
-# Length (s) of the windows in which gravity is read, short enough for the gyro's drift to be negligible, and the least
-# number of intervals of a window.
+# Length (s) of the windows in which gravity is read, while the gyro hardly drifts, and their least number of intervals.
 GRAVITY_WINDOW_S, FEWEST_IN_GRAVITY_WINDOW = 4.0, 12
 # Where only a change larger than this share of gravity would be found, the finding is undecided and says so.
 LARGEST_HIDDEN_GRAVITY = 0.05
@@ -439,9 +432,8 @@ def _read(t_s: Array, fallen: Array) -> tuple[float, float]:
 JUMP_SIGMAS, LEAST_JUMP_RAD = 12.0, 0.008
 # The intervals before and after it must be less than this share of it.
 ALONE = 0.5
-# The lasting rotation, over this many intervals before and after, must be within these shares of the jump, and this
-# many standard errors from zero. Real drives have shares of 1.26 to 1.43 where a jump was planted; three slips of the
-# tracks in 03 have 0.0, 0.4 and 2.1.
+# The lasting rotation, over this many intervals before and after, as a share of the jump and in standard errors. Real
+# drives with a planted jump have shares of 1.26 to 1.43, three slips of the tracks in 03 0.0, 0.4 and 2.1.
 AROUND, STAYS_SIGMAS, SHARE = 60, 4.0, (0.5, 1.75)
 LEAST_AROUND = 10
 

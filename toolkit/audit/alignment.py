@@ -30,23 +30,18 @@ from toolkit.sequence import Sequence
 
 # Unknowns of the regression: the scale, the camera's position (3) and its rotation (3).
 _LEVER, _TURN = slice(1, 4), slice(4, 7)
-# Logarithms of the odds at which the other position is accepted (1000 to 1) and excluded (20 to 1 against it). They
-# differ because the position in a file is right more often than not.
+# Logarithms of the odds at which the other position is accepted and excluded: a position is right more often than not.
 LOG_ODDS, LOG_ODDS_AGAINST = float(np.log(1000.0)), float(np.log(20.0))
 # The other position is excluded where the measured one is this many standard deviations away.
 MOST_SIGMAS = 4.0
-# Standard deviations of the systematic error of sound odometry, chosen with the recordings at hand in view: the
-# distance along the direction of travel to the point whose velocities are given (m; 0.4 to 0.9 in ten cars), and a
-# relative error of the velocity that lasts as long as a turn, which looks like this share of the turn's radius. The
-# share agrees with SYSTEMATIC_RAD and SYSTEMATIC_SCALE.
+# Standard deviations of the systematic error of sound odometry: the distance (m) along the direction of travel to the
+# point whose velocities are given (0.4 to 0.9 in ten cars), and a share of a turn's radius, by errors that last.
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
 # The same of sound recordings with an IMU (m), which have 0.06 at most.
 BESIDE_IMU_M = 0.05
-# Limits beyond the standard errors for a rotation (rad) estimated by velocities, which slip and pitch of cars bias, and
-# by rates of rotation. Chosen with the sound recordings at hand in view.
+# Limits beyond the standard errors for a rotation (rad) by velocities, which slip and pitch of cars bias, and by rates.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
-# Axes whose standard error is more than this many times that of the best axis are not judged: velocities do not
-# determine the rotation about their own direction, and slip would bias it.
+# Axes known worse than the best one by this factor are not judged, as that of the direction of travel by velocities.
 MOST_ERROR_RATIO = 4.0
 # Least bound (rad); without noise it would be zero.
 LEAST_BOUND_RAD = 5e-6

@@ -64,12 +64,9 @@ _PAIR, _FAR, _TURNS = (
     "too little motion sideways to near points",
     "too little rotation",
 )
-# With an IMU, 80 parts of real recordings (4 s to the whole) exceed four standard errors by at most 0.6 % of the focal
-# lengths, 2.4 px of cy (kitti00), 0.003 rad and 0.2 ms; with odometry, parts of eleven recordings (8 s to the whole)
-# exceed six by at most 3.4 % of fx, 3.0 px of cx, 0.3 px of cy and 0.025 rad, because tracks drift from image to image
-# and twists contain slip. The limits are about twice that, more for cy, and were chosen with these in view. Hidden
-# errors are reported from the size on that makes errors of estimators about three times as large. With odometry the
-# baseline is judged by `vision_scale`, the clock by `time_offset`, and a hidden rotation by the velocities.
+# Limits are about twice what parts of sound recordings exceed four (six) standard errors by (docs/audit.md); hidden
+# errors are reported where they would triple those of estimators. With odometry the baseline is judged by
+# `vision_scale`, the clock by `time_offset`, and a hidden rotation by the velocities.
 JUDGED = {
     "fx_px": Judged(slice(0, 1), "K", {"imu": 0.012, "twist": 0.06}, {"imu": 0.02, "twist": 0.16}, "fx off by {:.0%}"),
     "fy_px": Judged(slice(1, 2), "K", {"imu": 0.012, "twist": 0.06}, {"imu": 0.02, "twist": 0.16}, "fy off by {:.0%}"),
@@ -182,12 +179,10 @@ NORMALISED = 10.0
 # A usual range over the focal length, also the least factor between two sizes of an image; and the largest ratio of the
 # factors of width and height for one change of size.
 USUAL, ALIKE = 1.5, 1.3
-# Least share by which other intrinsics must lower the tracks' residual. A principal point that is wrong by half the
-# view gives 0.15 and more.
+# Least share by which other intrinsics must lower the tracks' residual; half a view of a wrong centre gives 0.15.
 LEAST_GAIN = 0.05
 TRIED_FRAMES = 300
-# Where the principal point is farther than this share of the range from the middle of the sightings, the middle is
-# tried.
+# Where the principal point is farther than this share of the range from the middle, the middle is tried.
 MOST_OFF_MIDDLE = 0.2
 # Largest ratio of fy and fx in either direction: pixels are square unless an image was rescaled.
 MOST_STRETCHED = 1.5
@@ -272,8 +267,7 @@ def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
 STANDING_MPS = 0.05
 LEAST_STANDING = 50
 # Systematic errors (rad/s), added to the standard error of the median: a standing vehicle vibrates, and the camera's
-# own rotation is off by up to 0.0045 on KITTI drives whose gyro has no bias. A bias is reported beyond BIAS_SIGMAS of
-# the sum. The constants were chosen on the recordings at hand.
+# own rotation is off by up to 0.0045 on KITTI drives whose gyro has no bias.
 SYSTEMATIC_STANDING = 0.00075
 SYSTEMATIC_CAMERA = 0.00125
 # The same for self-calibrations: on V2_01 they are off by up to 0.0009 rad/s, six of their standard errors.
@@ -345,12 +339,9 @@ def _median(residual_radps: Array, systematic_radps: float) -> tuple[Array, Arra
     return np.median(residual_radps, axis=0), np.hypot(median_error(residual_radps), systematic_radps)
 
 
-# A scale is reported beyond this many standard errors, by a jackknife, and this share. Beyond five standard errors,
-# tracks that drift cause 2.3 % for one axis of kitti00, 1.6 % in 8 s of a drive, and nothing in twenty other sound
-# recordings. Chosen with them in view.
+# A scale is reported beyond this many standard errors and this share; tracks that drift cause 2.3 % at most.
 GYRO_SCALE_SIGMAS, GYRO_SCALE_SYSTEMATIC = 5.0, 0.05
-# An axis is judged only if the lower bound is more than this share of the upper one; otherwise there is too little
-# rotation about it.
+# An axis is judged only if the lower bound is more than this share of the upper one: it has rotation enough.
 LEAST_IN_COMMON = 0.8
 
 
@@ -407,8 +398,7 @@ LEVER_SIGMAS, SYSTEMATIC_M = {"twist": 5.0, "imu": 4.0}, {"twist": 0.6, "imu": 0
 LARGEST_ERROR_M = 0.25
 # Where only a camera farther off than this (m) would be found, the finding is undecided and says so.
 HIDDEN_M = {"twist": 1.2, "imu": 0.5}
-# A position that a mistake in the file explains must be so far (m) from the given one. The second number (m) is the
-# systematic error that is added to the standard errors.
+# Least distance (m) of a position that a mistake explains, and the systematic error (m) added to the standard errors.
 LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
@@ -464,9 +454,7 @@ def _explains(way_m: Array, found: Position) -> bool:
 
 RATIO_SIGMAS = 5.0
 # Limits of the ratios of specific force to gravity and of the gyro's rates to the camera's, beyond five standard
-# errors. The noise of the camera's rates lowers the second ratio, so only values above one count. Of 699 parts of sound
-# recordings, two beside odometry exceed one by 0.011 at most beyond five standard errors, and none beside an IMU
-# exceeds it. Chosen with them in view.
+# errors; of 699 parts of sound recordings two exceed one, by 0.011. Noise lowers the second: only values above 1 count.
 SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
 # Where only a rotation (rad) larger than this would be found, the finding is undecided and says so.
 LARGEST_RAD = 0.05
@@ -540,14 +528,11 @@ def _is_off(ratio: Scalar, systematic: float) -> bool:
     return abs(ratio.value - 1.0) > RATIO_SIGMAS * ratio.error + systematic
 
 
-# Limit of the scale beyond chance (with an IMU, four standard errors), and the largest standard error with which it is
-# judged. Sound recordings have up to 0.044 +- 0.007 with the odometry of cars. Chosen with them in view.
+# Limit of the scale beyond chance (0.044 +- 0.007 in cars), and the largest standard error with which it is judged.
 SYSTEMATIC_SCALE, LARGEST_SCALE_ERROR = {"twist": 0.03, "imu": 0.025}, 0.02
-# Where only an error larger than this share would be found, the finding is undecided and says so. With an IMU, only
-# vision determines the scale once the IMU's noise is large: the limit is about the drift of a stereo system with one.
+# Where only a larger error would be found, the finding is undecided; with an IMU that is about a stereo system's drift.
 LARGEST_HIDDEN_SCALE = {"twist": 0.08, "imu": 0.01}
-# With odometry `steady_difference` reports a scale from chance on. Where chance is more than this share, the finding is
-# undecided: an error of 2 % in all disparities makes the errors on `drive` six times as large.
+# Where chance is more than this share, below `steady_difference`, it is undecided: 2 % make errors six times as large.
 LARGEST_CHANCE = 0.02
 
 

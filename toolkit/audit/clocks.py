@@ -30,17 +30,14 @@ MOST_S, COARSE_STEP = 0.6, 0.25
 # Means over an interval that are computed at a time: they take a megabyte, however long the recording.
 MEANS_AT_A_TIME = 10_000
 REFINEMENTS = 5
-# The standard error is that of a jackknife over stretches of the recording (a corner is one event and not ten
-# intervals), times this factor, which was measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+# The standard error is a jackknife's, times this factor, measured on 24 simulated drives and 8 flights.
 SCATTER = 1.45
 # The unexplained variance must fall below this share of that without an offset, because slow turns may fit by chance.
 MOST_UNEXPLAINED = 0.9
-# The difference of two independent rates has the sum of their variances; a gyro's noise at standstill also has a shift
-# with the smallest difference. The variance must be below this share of the sum, without differences beyond this many
-# spreads.
+# Share of the sum of both variances that the difference may have, without those beyond so many spreads: independent
+# rates have 1, and at a standstill some shift always fits best.
 MOST_APART, GROSS_SPREADS = 0.8, 6.0
-# Limits of an offset of the truth's clock: this many standard errors and this time (s); a rate must cause as much at
-# both ends. Sound recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+# Limits of an offset (s) of the truth's clock, and of what a rate causes at both ends; sound recordings have 9 +- 2 ms.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 # The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
 SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
@@ -50,8 +47,7 @@ FEWEST = LEAST_INTERVALS + 10
 SLOPE_STEP = 0.1
 # Largest rate; beyond it, other parts of a motion fit as well.
 MOST_RATE = 0.1
-# Limits of the change of the offset between the halves: this many standard errors, and beyond them what sound
-# recordings at hand have (s): 14 ms at most on drives, 3 ms with an IMU. Chosen with them in view.
+# Limits of the change between the halves: standard errors, and what sound recordings have (s): 14 ms, 3 ms with an IMU.
 CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 # The lag s of twists, in intervals, by their pairing: the motion from sample k to sample k + 1 is (1 - s) times sample
 # k plus s times sample k + 1.

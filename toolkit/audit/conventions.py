@@ -42,9 +42,8 @@ def axes_named(turn: Array) -> str:
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 
 
-# Least mean difference of the costs of two candidates, in its own standard errors. To choose among those that a file
-# allows, or among repairs, it only has to be beyond chance (intervals are correlated over about a second); to reject
-# the file as given, far beyond.
+# Least mean difference of the costs of two candidates, in its own standard errors: to choose among those that a file
+# allows, beyond chance (intervals are correlated over about a second), and far beyond to reject the file as given.
 AGAINST_SECOND, AGAINST_GIVEN = 4.0, 8.0
 # Two readings look the same way if their cameras differ by less than this angle. The noise of the samples, which the
 # lever arm turns into motion of the camera, then changes the residuals more than the choice of the reading.
@@ -290,17 +289,15 @@ def extrinsic_translation(evidence: Evidence, intervals: Intervals) -> Symptom |
     return Symptom(1, detail, "the camera's position is set to it", remedy)
 
 
-# Durations (s). Over a stride the camera's velocity changes by more than its noise; over a window the gyro drifts
-# little.
+# Durations (s): over a stride velocity changes by more than its noise, over a window the gyro drifts little.
 STRIDE_S, WINDOW_S = 0.5, 10.0
 # So many strides begin within the length of one.
 OVERLAP = 2
 LEAST_STRIDES = 20
 # Accuracy of such a change of velocity (m/s^2).
 LEAST_SPREAD = 0.1
-# Another order must be better than the given one by this many standard errors, and leave at most this share of what the
-# given one leaves, because an order can also explain a part of other faults. In sound recordings the given order is the
-# best.
+# Another order must be better by this many standard errors and leave at most this share, because an order can also
+# explain a part of other faults.
 AGAINST_GIVEN_ORDER, MOST_LEFT = 5.0, 0.7
 
 

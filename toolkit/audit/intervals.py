@@ -17,8 +17,7 @@ from toolkit.sequence import Sequence, check_runnable
 LEAST_INTERVALS = 30
 # Longest step (s) in the integration of an IMU's samples, with the orientation in its middle.
 STEP_S = 0.02
-# Largest bias (rad/s) of a gyro with odometry, 11 degrees per second; a larger difference is another fault, such as
-# wrong axes.
+# Largest bias (rad/s) of a gyro with odometry; a larger difference is another fault, such as wrong axes.
 MOST_BIAS_RADPS = 0.2
 
 

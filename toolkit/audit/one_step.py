@@ -20,19 +20,15 @@ from toolkit.models.noise import white_sigma
 from toolkit.models.stereo import project, projection_jacobian, triangulate
 from toolkit.sequence import Sequence
 
-# Median one-step residual (px) beyond which samples and tracks disagree. Sound recordings have 0.3 to 3.1 px, the
-# largest where the samples' own noise explains it.
+# Median one-step residual (px) beyond which samples and tracks disagree; sound recordings have 0.3 to 3.1 px.
 MOST_PX = 3.0
 # The limit is no less than this many times what the tracks' own scatter and the stated noise of the samples explain.
 TIMES_EXPLAINED = 2.0
-# Residuals beyond this many robust standard deviations, of mismatches and moving objects, are left out of the
-# correlation, which needs this many pairs.
+# Residuals beyond this many robust standard deviations are left out of the correlation, which needs so many pairs.
 USUAL = 3.0
 LEAST_TRIPLES = 300
-# Limit of the correlation of neighbouring residuals. Errors with a white part and a random walk along the track have
-# the correlation -1 / (2 + w), where w is the walk's variance per frame over that of the white part; above the limit w
-# is more than 2. Simulated white tracks have -0.40 to -0.48, because the camera's motion is fitted to them, and real
-# ones 0.1 to 0.9. The correlation must be beyond the limit by this many standard errors.
+# Limit of the correlation of neighbouring residuals, to be passed by so many standard errors. A random walk along the
+# track, of w times the white variance per frame, gives -1 / (2 + w); real tracks have 0.1 to 0.9.
 MOST_CORRELATION, CORRELATION_SIGMAS = -0.25, 5.0
 # Least standard deviation of whitened residuals; below it, tracks are exact.
 _NO_ERROR = 1e-6

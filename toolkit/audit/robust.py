@@ -19,9 +19,8 @@ LEAST_STRETCHES = 2
 LEVEL = 1e-3
 # How long slip lasts (s); chosen with the parts of the recordings at hand in view.
 SLIP_S = 1.5
-# Errors that last for seconds, such as slip, increase the scatter of estimates over that of independent errors by these
-# factors; a factor has the weight of this many stretches. 248 parts of ten drives have 2.0 (median) and 4.6 (90 %
-# quantile), 03 alone 3.3 and 5.0; 258 parts with an IMU have 1.0 and 1.3. Chosen with them in view.
+# Factors by which errors that last for seconds increase the scatter of estimates, and their weight in stretches: 248
+# parts of ten drives have 2.0 (median) and 4.6 (90 % quantile), 258 parts with an IMU 1.0 and 1.3.
 INFLATION, INFLATION_STRETCHES = {"twist": 3.0, "imu": 1.5}, 8.0
 # Accuracy of the camera's own rate of rotation (rad/s) and velocity (m/s) over one interval.
 LEAST_SPREAD_W = 0.003
@@ -37,8 +36,7 @@ class Scalar(NamedTuple):
 
 def spread(residuals: Array) -> Array:
     """Return the standard deviation (d,) of residuals (M, d) about their median, from the median deviation."""
-    centred = np.abs(residuals - median(residuals))
-    deviation: Array = MAD_TO_SIGMA * median(centred)
+    deviation: Array = MAD_TO_SIGMA * np.median(np.abs(residuals - np.median(residuals, axis=0)), axis=0)
     return deviation
 
 
@@ -73,20 +71,6 @@ def ranked(costs: Array) -> Ranking:
     """Rank candidates by their costs (C, M) over M intervals. The one named first wins a tie."""
     order = np.argsort(costs.mean(axis=1), kind="stable").tolist()
     return Ranking(order[0], order, [mean_in_sigmas(cost - costs[order[0]]) for cost in costs])
-
-
-def median(values: Array) -> Array:
-    """Return the median (...) of values (N, ...), NaN where one is NaN or N is 0.
-
-    An audit computes some thousands of medians of few values, and this takes a fifth of NumPy's time.
-    """
-    if len(values) == 0:
-        return np.full(values.shape[1:], np.nan)
-    # With an odd number the middle value is used twice. NaN is sorted to the end.
-    lower, upper, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
-    ordered = np.partition(values, (lower, upper, last), axis=0)
-    middle: Array = np.where(np.isnan(ordered[last]), np.nan, 0.5 * (ordered[lower] + ordered[upper]))
-    return middle
 
 
 def median_error(residuals: Array) -> Array:

@@ -93,8 +93,7 @@ def _empty(values: Array, names: tuple[str, ...]) -> list[str]:
 
 # Values beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
 MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
-# Rates of change (m/s^2, rad/s^2) of a vehicle's velocity and rate of rotation that no vehicle reaches in both
-# directions within two samples: one and a half times gravity, and the same number.
+# Rates of change (m/s^2, rad/s^2) that no vehicle reaches in both directions within two samples.
 MOST_CHANGE = 15.0
 # A single sample of an accelerometer or gyro that differs from its neighbours by more is not a knock (m/s^2, rad/s).
 MOST_STEP = np.repeat([500.0, 10.0], 3)
@@ -174,8 +173,7 @@ def _alone(step: Array, least: Array) -> BoolArray:
     return alone if alone.sum() <= max(FEWEST_ALONE, MOST_ALONE * alone.size) else np.zeros_like(alone)
 
 
-# Least number and duration (s) of equal samples in a row: beyond chance, and beyond a sensor that is read more often
-# than it measures.
+# Least number and duration (s) of equal samples in a row: beyond chance and sensors that are read too often.
 LEAST_RUN, LEAST_S = 10, 0.1
 # Level of significance of a run of odometry's samples, for the whole recording, and the least length of a run.
 CHANCE, LEAST_RUN_OF_ODOMETRY = 1e-3, 4
@@ -293,8 +291,7 @@ def _in_long_runs(values: Array, least: int) -> BoolArray:
     return np.asarray(same & long & ~is_coarse)
 
 
-# Least number of samples at the largest value of an axis, and the least ratio to the number at the value next to it. A
-# sensor with coarse steps also has several samples at its largest value, but more at the one next to it.
+# Least number of samples at the largest value of an axis, and its ratio to that at the next: coarse sensors have more.
 LEAST_COUNT, LEAST_RATIO = 10, 3.0
 
 
@@ -369,13 +366,9 @@ def _step_of(column: Array) -> float:
     return float(np.diff(distinct).min())
 
 
-# Limit of the stated white noise over that of the samples. It is often stated several times too large on purpose, for
-# vibration and errors of scale. Sound recordings at hand have 8 at most (accelerometer, 5 s of MH_01), with the factor
-# that this toolkit puts on EuRoC's noise; chosen with them in view.
+# Limit of the stated white noise over the samples', often stated too large on purpose (8 times in sound recordings).
 MOST_WHITE = 40.0
-# Limit of the stated random walk over the change of the samples, to which motion adds far more than the walk. A true
-# walk exceeds it less than once in ten thousand, by the chi-square of twelve changes (three axes, four quarters of a
-# recording).
+# Limit of the stated random walk over the change of the samples; a true walk exceeds it less than once in ten thousand.
 MOST_WALK = 3.0
 LEAST_SAMPLES = 100
 
@@ -415,8 +408,7 @@ def overstated_noise(evidence: Evidence) -> Symptom | None:
     return Symptom.warning("; ".join(found), treatment, len(found)) if found else None
 
 
-# Limit of the samples' own scatter over the stated one. Rotors shake an accelerometer 15 times as much as stated, in
-# the quietest tenth of V1_01_easy too; units that were not converted and values of a bench are beyond.
+# Limit of the samples' own scatter over the stated one; rotors shake an accelerometer 15 times as much (V1_01_easy).
 MOST_BEYOND_STATED = 20.0
 QUIET_S, QUIETEST = 0.5, 0.1
 
@@ -443,8 +435,7 @@ def understated_noise(evidence: Evidence) -> Symptom | None:
     return Symptom.warning("; ".join(found), f"{treatment} and not in g and degrees", len(found)) if found else None
 
 
-# As given a size is wrong by more than the first factor; exchanged, both are right within the second, as in sound
-# recordings.
+# As given a size is wrong by more than the first factor; exchanged, both are right within the second.
 LEAST_FACTOR, MOST_FACTOR = 3.0, 1.25
 _OTHER_WAY = [3, 4, 5, 0, 1, 2]
 
@@ -474,9 +465,8 @@ def _linear_ratio(evidence: Evidence) -> Scalar | None:
     return speed_ratio(evidence.intervals) if force is None else force
 
 
-# A specific force whose median is below this share of gravity lacks it. One in g has a size that hardly changes over a
-# recording, averaged over this time (s): its range is less than this share of it (0.2 in the recordings at hand).
-# Below the last share it is a bias alone.
+# A specific force below this share of gravity lacks it, unless its size, averaged over this time (s), has a range of
+# less than this share of it (0.2 at hand): then it is in g. Below the last share it is a bias alone.
 LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE, MOST_BIAS = 0.5, 0.25, 0.5, 0.06
 
 
@@ -516,16 +506,14 @@ LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 WITHIN_FACTOR, UNIT_SIGMAS = 1.25, 5.0
 # Vision's speed is accurate to 5 % in sound recordings, which distinguishes km/h from ft/s, a factor of 1.1 apart.
 WITHIN_FACTOR_OF_SPEED = 1.08
-# The stamps are wrong if the ratios of speeds and of rates of rotation are both beyond the first factor, and differ by
-# less than the second.
+# The stamps are wrong if the ratios of speeds and rates are beyond the first factor, and alike within the second.
 LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
 # Limits of the time (s) between two frames of a vehicle's camera.
 LEAST_FRAME_S, MOST_FRAME_S = 1e-3, 5.0
 # Residuals of tracks under another unit of the arm over those as given, from which on the arm is as long as given.
 MOST_WORSE = 1.05
 IN_A_PART = " in a part of the recording and not in another"
-# Limits of the baselines of rigs on vehicles, hand-held or flying (m), and the largest distance of a camera from its
-# IMU (m).
+# Limits of the baselines of rigs (m), and the largest distance (m) of a camera from its IMU.
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
 
 

@@ -42,8 +42,8 @@ from toolkit.sequence import Sequence
 
 # Difference of a bias (rad/s) and of a rotation (rad) for the difference quotients.
 _DIFFERENCE = 1e-4
-# Error of a gyro in addition to its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s),
-# because real gyros filter vibration. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
+# Error of a gyro in addition to its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s):
+# real gyros filter vibration.
 GYRO_ERROR = 0.1
 POSE, STATE, GRAVITY, COMMON = 6, 9, 3, 21
 # The common unknowns, in order: logarithms of fx and fy; cx and cy (px); the logarithm of the baseline; the rotation of
@@ -381,9 +381,8 @@ class Effort(NamedTuple):
     iterations: int
 
 
-# In long recordings, the windows are spread evenly with an IMU, whose clock may change. With odometry those with the
-# most rotation are used, because cars drive straight ahead for long; more windows would not help, because errors of
-# drifting tracks dominate.
+# In long recordings, the windows are spread evenly with an IMU, whose clock may change, and are those with the most
+# rotation with odometry, because cars drive straight ahead for long.
 MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 100, 14)}
 # Converged where the step is less than this share of the standard errors.
 SETTLED = 0.4
@@ -391,9 +390,8 @@ SETTLED = 0.4
 STRAYED = 10.0
 # Least share of the information on the camera's position that is taken to come from the data.
 LEAST_BY_DATA = 1e-3
-# The first unknowns are those of a rectified pair. The errors of the right image are fixed at zero, and estimated only
-# where one step from the converged calibration has them beyond this many standard errors. Few recordings need them; in
-# all others they would make focal length and baseline less certain.
+# The errors of the right image, the last unknowns, are estimated only where one step from the converged calibration has
+# them beyond this many standard errors: they make focal length and baseline less certain.
 _RECTIFIED, RIGHT = RIGHT_SHIFT, slice(RIGHT_SHIFT, COMMON)
 RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}
 # Of the unknowns in the order above, how many they are, and for an IMU and odometry the standard deviation of the

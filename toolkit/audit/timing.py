@@ -25,16 +25,13 @@ GAP_RATIO = 3.5
 NOT_A_TIME = np.iinfo(np.int64).min
 
 
-# A step of the frames is unusual if it differs from the usual one by this share of it, by this time (s), and by this
-# many times the scatter of all steps. A step of the samples near it must differ by the same, to half of their usual
-# step or a quarter of the difference.
+# A step of the frames is unusual if it is off by this share, this time (s), and this many times the scatter; a step of
+# the samples near it must be off alike, to half of their usual step or a quarter of the difference.
 LEAST_JUMP_SHARE, LEAST_JUMP_S, SCATTERS = 0.25, 0.01, 10.0
 ALIKE_STEPS, ALIKE = 0.5, 0.25
-# This many intervals on either side show how far the camera moves in a step, at least this many together; acceleration
-# limits the accuracy to this share.
+# Intervals on either side that show how far the camera moves, their least number, and the error by acceleration.
 AROUND, FEWEST_AROUND, SYSTEMATIC = 4, 5, 0.03
-# The camera moved one step, or as many as the stamps say, to within this many standard errors; the two must be at least
-# this many standard errors apart.
+# Standard errors within which the camera moved one step, or as many as stamped; and how far apart the two must be.
 WITHIN, APART = 3.0, 6.0
 # A camera that moves less (m), or rotates less (rad), in a usual step is not used.
 LEAST_M, LEAST_RAD = 0.01, 0.005
@@ -145,9 +142,8 @@ def _gone(sequence: Sequence, frame: int, stamped: float) -> Scalar | None:
     return None
 
 
-# A forward step of this many usual ones means that earlier stamps were out of order; after a jump, all steps are
-# smaller. At least this many stamps must follow a jump, so that a single stamp out of order at the end is not taken for
-# one.
+# A forward step of this many usual ones means that earlier stamps were out of order; so many stamps must follow a jump,
+# as a single one at the end is merely out of order.
 LEAP, FEWEST_AFTER = 1.9, 3
 # If more than this share of the stamps is late, the whole order is wrong, and sorting is no repair.
 MOST_LATE = 0.5
@@ -324,8 +320,7 @@ def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
     return Symptom(holes.size, detail, treatment, sequence.with_frames(kept))
 
 
-# A vehicle turns and stops within this time (s). Samples with a longer step, and with this many frames in one step, do
-# not represent its motion.
+# Samples with a longer step (s), and with this many frames in one step, do not represent a vehicle's motion.
 MOST_STEP_S, MOST_RATIO = 2.0, 20.0
 
 
@@ -346,8 +341,7 @@ def sparse_motion(evidence: Evidence) -> Symptom | None:
     return Symptom.warning(detail, why, count)
 
 
-# Least number of measured stretches that are interpolated. With fewer, the variance of the samples is taken as the
-# error of the interpolation.
+# Of fewer measured stretches, the variance of the samples is taken as the error of the interpolation.
 LEAST_STRETCHES = 5
 
 
@@ -437,14 +431,11 @@ def _with(before: Bridges | None, new: Bridges) -> Bridges:
     return Bridges(begin, end, np.vstack([before.noise_scale, new.noise_scale]))
 
 
-# Least root mean square of the steps' deviation, as a share of the usual step. Real drives have 1.3 % at most, which
-# their cameras do not follow either; chosen with them in view.
+# Least root mean square of the steps' deviation, as a share of the usual step; real drives have 1.3 % at most.
 LEAST_UNEVEN_SHARE = 0.03
-# The motion follows a share of 1 of the deviations if the stamps are right. The stamps are reported if the share is
-# below the second number by this many standard errors, of a jackknife.
+# The motion follows a share of 1 if the stamps are right; it must be below the second number by this many errors.
 UNEVEN_SIGMAS, MOST_FOLLOWED = 5.0, 0.5
-# The usual step is half of this quantile of two steps together, which are even where every other frame is late. The
-# shortest quarter misses no frame, in a recording that has lost half of its frames at most.
+# The usual step is half of this quantile of two steps together, which are even where every other frame is late.
 UNHURT = 0.25
 # Offsets of the intervals around one that show how the camera moves there.
 BESIDE = (-2, -1, 1, 2)
@@ -542,29 +533,23 @@ def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
-# An offset is reported beyond this many standard errors and beyond what is no fault. A sample of an IMU may describe
-# the interval before or after its stamp, 5 ms at 100 Hz. A twist may describe the interval before or after its stamp,
-# whose middle is half an interval away, and may be one interval late: an indoor recording that is taken as sound is
-# late by 0.8.
+# An offset is reported beyond this many standard errors and what is no fault: a sample of an IMU may describe the
+# interval before or after its stamp; so may a twist, and be one interval late.
 OFFSET_SIGMAS, LEAST_OFFSET_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
-# With an IMU, sound recordings at hand have 3.1 standard errors at most; from this many on the finding is undecided and
-# says so.
+# From this many standard errors on an offset with an IMU is undecided; sound recordings have 3.1 at most.
 DOUBTFUL_SIGMAS = 3.2
-# The same limit, in intervals, for twists stamped between the frames. There a pairing has the same effect as an offset
-# of the clock, and the shift corrects both.
+# The same limit, in intervals, for twists stamped between the frames, whose pairing looks like an offset.
 LEAST_OFF_FRAMES = 0.25
-# A shift is rejected if the velocities fit worse by this many standard errors. Halves and thirds of the indoor
-# recording whose gyro is late have 3.4 and 3.5; planted offsets of 0.2 and 0.3 s on four real drives and a simulated
-# one have -0.1 at most. Chosen between these.
+# A shift is rejected if the velocities fit worse by this many standard errors: 3.4 where the gyro alone is late, and at
+# most -0.1 on five drives with planted offsets.
 AGAINST_SHIFT = 2.5
 # Offsets (s) up to this are taken from the self-calibration.
 NEAR_S = 0.025
-# With a larger standard error (s), an offset is not excluded and the finding is undecided. One beyond chance is
-# accepted up to twice the standard error, except for twists stamped at the frames, whose interval is open.
+# With a larger standard error (s) an offset is undecided; one beyond chance is accepted up to twice that, except for
+# twists stamped at the frames, whose interval is open.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
-# The time from a sample to the next frame is constant if this share of the frames has it to within this share of a
-# step; drifting clocks and different rates have no constant. The tracks do not exclude an offset within this many
-# standard errors.
+# The time from a sample to the next frame is constant if this share of the frames has it to this share of a step; the
+# tracks do not exclude an offset within this many standard errors.
 CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 ONE_CLOCK = "a clock drifts or was set: stamp both by one clock, or cut the recording there"
 

