@@ -149,6 +149,5 @@ def _finding(name: str, symptom: Symptom, before: Sequence, repaired: bool) -> F
 
 
 def _share_lost(before: Sequence, after: Sequence) -> float:
-    """Return the share of the sightings that a repair drops from the frames it keeps."""
     in_kept_frames = np.isin(before.frames_t_ns, after.frames_t_ns)[before.observations.frame].sum()
     return 1.0 - len(after.observations) / int(in_kept_frames) if in_kept_frames else 0.0

@@ -88,7 +88,6 @@ def _ratios(sequence: Sequence, intervals: Intervals) -> Iterator[str]:
 
 
 def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:
-    """Name the units whose factor is near a ratio, if there are any."""
     units = [unit for unit, factor in factors.items() if abs(ratio / factor - 1.0) < NEAR_UNIT]
     return f", as if in {' or '.join(units)}" if units else ""
 
@@ -171,10 +170,7 @@ def conflict(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | 
 
 
 def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ...]:
-    """Return the deviations of the rotation, and of the velocity of twists or the specific force of an IMU.
-
-    The gyro's constant bias is subtracted first.
-    """
+    """Return the deviations of rotation, less the gyro's bias, and of the velocity or of an IMU's specific force."""
     sequence = evidence.sequence
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     t_s = 0.5 * (frame_s[intervals.interval] + frame_s[intervals.interval + 1])
@@ -225,10 +221,7 @@ def _scatter_of_means(mean: Array) -> Array:
 
 
 def _stretches(deviation: Deviation) -> tuple[Array, Array, Array]:
-    """Average a deviation over every stretch that begins with one of its intervals and is whole.
-
-    Return the centres (m,) s of the stretches, the means (m, 3) in them and the noise (m, 3) of those.
-    """
+    """Return centres (m,) s, means (m, 3) and noise (m, 3) of the whole stretches that begin with an interval."""
     t_s, value = deviation.t_s, deviation.value
     begin = np.flatnonzero(t_s + STRETCH_S <= t_s[-1:] + 1e-9)
     end = np.searchsorted(t_s, t_s[begin] + STRETCH_S)
@@ -249,9 +242,8 @@ def _stretches(deviation: Deviation) -> tuple[Array, Array, Array]:
 def _specific_force(sequence: Sequence, camera: CameraMotion, found: ForceBesideCamera) -> Deviation:
     """Return the change of the camera's velocity less the specific force, less the gravity estimated around that time.
 
-    In the axes of the first frame, by the gyro, the velocity changes by the specific force plus gravity, which is
-    constant but for the drift of the gyro. The integrals of both are subtracted from the velocities before the median
-    of five neighbours is taken: the median of velocities that vibrate or fall differs from their mean.
+    In the axes of the first frame that is constant but for the drift of the gyro. Integrals of both are subtracted from
+    the velocities before the median of five neighbours is taken: that of velocities that vibrate differs from the mean.
     """
     middle_s = (found.middle_ns - sequence.frames_t_ns[0]) / NS_PER_S
     h_s = np.diff(middle_s)[:, None]

@@ -181,7 +181,7 @@ def is_excluded(share: Scalar) -> bool:
 
 
 def _log_odds(share: Scalar) -> float:
-    """Return the logarithm of the odds of the vector's end against its start, for normal errors."""
+    """Return the logarithm of the odds of the vector's end against its start."""
     return (share.value - 0.5) / share.error**2
 
 

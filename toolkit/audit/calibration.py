@@ -130,13 +130,11 @@ def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
 
 
 def _least(found: SelfCalibration, name: str, kind: MotionKind) -> float:
-    """Return the least error of a parameter that is detected."""
     rows, limit = JUDGED[name].rows, JUDGED[name].limits.get(kind, np.inf)
     return limit + RIGHT_SIGMAS[kind] * float(found.error[rows].max())
 
 
 def _beyond(found: SelfCalibration, rig: StereoRig, kind: MotionKind, limits: dict[str, float]) -> list[Wrong]:
-    """Return the parameters that are beyond their limits and their standard errors."""
     wrongs = list[Wrong]()
     for name, limit in limits.items():
         rows, check = JUDGED[name].rows, JUDGED[name].check
@@ -165,7 +163,6 @@ def _summary(name: str, value: Array, error: Array, rig: StereoRig, beside: str)
 
 
 def _unfitted(kind: MotionKind) -> str:
-    """Say why there may be no self-calibration."""
     unseen = f"no tracks are long enough to be compared with the {BESIDE[kind]}"
     return f"{unseen}, or no calibration near the given one fits them"
 
@@ -258,7 +255,6 @@ def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None
 
 
 def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
-    """Return the median residual (px) under the camera's own best motion; infinite where there is none."""
     own_px = own_one_step_px(sequence, camera)
     return own_px if np.isfinite(own_px) else np.inf
 
@@ -487,10 +483,7 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
 
 
 def _calibration(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str]:
-    """Return what the self-calibration finds wrong, and in words which errors would not be found.
-
-    With odometry, and where there is no self-calibration, the motion from frame to frame is judged as well.
-    """
+    """Return what the self-calibration, or with odometry else the turn, finds wrong, and what would not be found."""
     sequence, kind, found = evidence.sequence, evidence.sequence.motion_kind, evidence.self_calibration
     if kind == "twist":
         found = self_calibration(sequence, evidence.camera_motion, intervals)

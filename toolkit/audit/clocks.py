@@ -90,11 +90,7 @@ def camera_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
 
 
 def _change_seen(sequence: Sequence, intervals: Intervals) -> tuple[Array, BoolArray]:
-    """Return the camera's angular acceleration at each interval (M, 3) rad/s^2, and where it is known (M,).
-
-    It is computed from the neighbouring intervals, so it is independent of the noise of the gyro and of the interval's
-    own.
-    """
+    """Return the camera's angular acceleration (M, 3) rad/s^2 by the neighbouring intervals, and if known (M,)."""
     seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
     seen[intervals.interval + 1], known[intervals.interval + 1] = intervals.w_seen_radps, True
     step_s = usual_step_s(sequence.frames_t_ns)

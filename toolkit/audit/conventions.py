@@ -111,9 +111,8 @@ def _four_readings(T_imu_cam: Array) -> dict[str, Array]:
 def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scalar | None:
     """Return where the measured velocity lies between those that two extrinsics predict: 0 is the first, 1 the other.
 
-    Constant differences are removed, because slip of a wheel and an error of the rotation cause them. The measured rate
-    of rotation is the instrument: the errors of the camera's rotation and velocity are correlated, and those of the
-    gyro are independent of both. None where no velocity is measured, or there is too little rotation.
+    Slip and an error of the rotation are constant and removed; the gyro's rate, whose errors are independent of the
+    camera's, is the instrument. None where no velocity is measured, or there is too little rotation.
     """
     if intervals.v_mps is None:
         return None
@@ -213,11 +212,7 @@ def _readings(given: Array) -> list[ExtrinsicConvention]:
 
 
 def _twins(readings: list[ExtrinsicConvention], one: int) -> list[int]:
-    """Return the readings under which the camera looks the same way as under one, which is among them.
-
-    A rotation of the camera's axes and one of the body's can be such a pair. The given extrinsic and its inverse have
-    none.
-    """
+    """Return the readings under which the camera looks the same way as under one: two rotations, of body and camera."""
     R_imu_cam = np.stack([reading.T_imu_cam[:3, :3] for reading in readings])
     apart_rad = np.linalg.norm(R_imu_cam - R_imu_cam[one], axis=(1, 2)) / np.sqrt(2.0)  # of small angles
     alone = (0, len(readings) - 1)
@@ -345,7 +340,6 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
 
 
 def _changes(evidence: Evidence) -> _Changes:
-    """Return the changes over strides in which the camera's motion is known."""
     found, known = evidence.force_beside_camera, evidence.camera_motion.known
     t_s = (found.middle_ns - found.middle_ns[0]) / NS_PER_S
     stride = max(OVERLAP, round(STRIDE_S / float(np.median(np.diff(t_s)))))

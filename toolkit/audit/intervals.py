@@ -110,7 +110,6 @@ class Integral(NamedTuple):
         return np.asarray(np.diff(self._at(frames_t_ns), axis=-2) / (np.diff(frames_t_ns) / NS_PER_S)[..., None])
 
     def _at(self, t_ns: IntArray) -> Array:
-        """Return the integral (..., K, d) from the first sample to stamps (..., K)."""
         row = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, len(self.t_ns) - 1)
         following = np.minimum(row + 1, len(self.t_ns) - 1)
         since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[..., None]

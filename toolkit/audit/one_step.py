@@ -128,11 +128,10 @@ def agreement(sequence: Sequence, camera: CameraMotion, intervals: Intervals) ->
 
 
 def _explained_px(sequence: Sequence, intervals: Intervals, own_px: float) -> float:
-    """Return the residual (px) that the tracks' scatter and noise over a usual interval explain.
+    """Return the residual (px) that the tracks' scatter and the samples' noise over a usual interval explain.
 
-    That is the stated noise of the samples and, with an IMU, the scatter of the camera's rotation about the gyro's: in
-    a narrow view its errors and those of the camera's velocity are large and compensate, until the gyro's rotation
-    takes its place beside that velocity.
+    With an IMU also the scatter of the camera's rotation about the gyro's, which takes that one's place: in a narrow
+    view its errors are large, and compensate those of the camera's velocity.
     """
     noise, focal_px = sequence.noise, sequence.rig.fx_px
     step_s = usual_step_s(sequence.frames_t_ns)

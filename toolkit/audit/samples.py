@@ -79,7 +79,6 @@ DROPPED = "dropped; the neighbouring motion samples bridge the interval"
 
 
 def _with_rows(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> Sequence:
-    """Return the sequence with some of its sightings (N,) and motion samples (S,)."""
     kept = sequence if sightings.all() else replace(sequence, observations=sequence.observations.select(sightings))
     return kept if samples.all() else kept.with_samples(samples)
 
@@ -161,10 +160,7 @@ def _there_and_back(step: Array, least: Array) -> BoolArray:
 
 
 def _alone(step: Array, least: Array) -> BoolArray:
-    """Say which samples (S,) differ from their neighbours, by steps (S - 1, d), while those do not differ from theirs.
-
-    None where there are too many.
-    """
+    """Say which samples (S,) differ from their neighbours while those do not differ from theirs, unless too many do."""
     alone = np.zeros(len(step) + 1, dtype=bool)
     size = np.abs(step)
     beside = np.maximum(size[:-3], size[3:])  # steps from its two neighbours to the next samples
@@ -460,7 +456,6 @@ def exchanged_samples(evidence: Evidence) -> Symptom | None:
 
 
 def _linear_ratio(evidence: Evidence) -> Scalar | None:
-    """Return the ratio of specific force to gravity, or else of the samples' speed to the camera's."""
     force = force_ratio(evidence.sequence)
     return speed_ratio(evidence.intervals) if force is None else force
 
@@ -482,10 +477,7 @@ def gravity_removed(evidence: Evidence) -> Symptom | None:
 
 
 def _lacks_gravity(sequence: Sequence) -> bool:
-    """Say whether a specific force is far below gravity, and no steady one of another unit or scale.
-
-    At rest little but a bias is left of what lacks it.
-    """
+    """Say whether a specific force is far below gravity, and neither steady, in another unit, nor a bias at rest."""
     ratio = force_ratio(sequence)
     if ratio is None or not 0.0 < ratio.value < LEAST_GRAVITY:
         return False
@@ -708,10 +700,7 @@ def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: f
 
 
 def _with_columns(sequence: Sequence, changed: Callable[[Array], Array]) -> Sequence:
-    """Return the sequence with the columns of its motion samples (S, 6), linear and angular ones, changed.
-
-    Noise that the file did not state, but a loader estimated from the scatter of the samples, changes with them.
-    """
+    """Return the sequence with other columns of its samples (S, 6), and of noise that was estimated from these."""
     motion, noise = sequence.motion, sequence.noise
     now = replace(sequence, motion=motion.of(motion.t_ns, changed(motion.values)))
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):

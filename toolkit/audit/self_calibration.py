@@ -520,10 +520,7 @@ def _adjusted(at: _At, kind: MotionKind, free: int) -> _Adjusted:
 
 
 def _step(all_reduced: list[Reduced], value: Array, prior: Array, free: int = COMMON) -> Array:
-    """Return the step (21,) of the calibration from all windows and the prior about zero.
-
-    Only the first ``free`` unknowns are estimated.
-    """
+    """Return the step (21,) of the first ``free`` unknowns from all windows and the prior about zero."""
     gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / prior**2
     step = np.zeros(COMMON)
     step[:free] = np.linalg.solve(_information(all_reduced, prior)[:free, :free], gradient[:free])
@@ -562,7 +559,6 @@ def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[
 
 
 def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[KeyFrameWindow]:
-    """Return the windows in which the motion is known and there are enough tracks."""
     stride = max(1, round(STRIDE_S / usual_step_s(sequence.frames_t_ns)))
     keys = np.arange(0, sequence.frame_count, stride)
     whole = round(sequence.duration_s / WINDOW_S)
@@ -635,17 +631,13 @@ def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray
 
 
 def _usable(uv_px: Array) -> BoolArray:
-    """Say which sightings (N, 3) are of both cameras and near enough."""
     both = ~is_left_only(uv_px)
     both[both] = disparity_px(uv_px[both]) > LEAST_DISPARITY_PX
     return np.asarray(both & np.isfinite(uv_px).all(axis=1))
 
 
 def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:
-    """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4), by linear least squares over an IMU's strides.
-
-    With odometry the velocities are means of the neighbouring strides', and gravity is zero.
-    """
+    """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4): least squares, or means of odometry's strides."""
     n, dt_s = len(T_first_imu), strides.dt_s
     R_first_a, position = T_first_imu[:-1, :3, :3], T_first_imu[:, :3, 3]
     if not strides.inertial:

@@ -192,7 +192,7 @@ def _sorted(sequence: Sequence) -> Sequence:
 def _jumps(t_ns: IntArray) -> IntArray:
     """Return the rows after which the clock has jumped back and goes on at its usual step.
 
-    After a stamp, or a block of stamps, that is merely out of order, time jumps forward to where it was.
+    After stamps that are merely out of order, time jumps forward to where it was.
     """
     step_ns = np.diff(t_ns)
     if t_ns.size < 3 or (t_ns == NOT_A_TIME).any():
@@ -212,15 +212,11 @@ def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
 
 
 def _part_of(t_ns: IntArray, jumps: IntArray) -> IntArray:
-    """Return for each stamp (N,) the number of jumps, each after a row, before it."""
     return np.searchsorted(jumps, np.arange(t_ns.size), side="left")
 
 
 def _longest_part(sequence: Sequence, frame_part: IntArray, sample_part: IntArray) -> Sequence:
-    """Return the longest part, in frames, between two jumps, with its samples; of equal ones the first.
-
-    Where the samples have another number of jumps than the frames, their longest part is taken.
-    """
+    """Return the longest part, in frames, between two jumps; samples of their own longest if their jumps differ."""
     part = int(np.argmax(np.bincount(frame_part)))
     kept = sequence.with_frames(np.flatnonzero(frame_part == part))
     if not sample_part.max(initial=0):
@@ -234,13 +230,12 @@ def _kept(part: Sequence, whole: Sequence) -> str:
 
 
 def _late(t_ns: IntArray) -> int:
-    """Count the stamps that are no time, or not after every valid stamp before them."""
+    """Count the stamps that are no time, or not after all before them."""
     latest_before = np.maximum.accumulate(np.concatenate([[NOT_A_TIME], t_ns[:-1]]))
     return int(np.sum(t_ns <= latest_before)) if t_ns.size else 0
 
 
 def _in_order(t_ns: IntArray) -> IntArray:
-    """Return the rows that sort the stamps, without invalid ones, and of repeated ones only the first."""
     _, first_row = np.unique(t_ns, return_index=True)
     rows: IntArray = first_row[t_ns[first_row] != NOT_A_TIME]
     return rows
@@ -302,7 +297,6 @@ def _longest_s(t_ns: IntArray, holes: IntArray) -> float:
 
 
 def _holes(t_ns: IntArray, least_s: float) -> IntArray:
-    """Return the rows after which the next stamp is too far away."""
     if t_ns.size < 2:
         return np.empty(0, dtype=np.int64)
     return np.flatnonzero(np.diff(t_ns) / NS_PER_S > max(least_s, GAP_RATIO * usual_step_s(t_ns)))
@@ -375,9 +369,9 @@ def motion_gap(evidence: Evidence) -> Symptom | None:
 
 
 def _short_holes(sequence: Sequence) -> tuple[IntArray, float]:
-    """Return the samples after which there is a gap, between the first frame and the last, and the usual step (ns).
+    """Return the samples after which there is a gap between the first frame and the last, and the usual step (ns).
 
-    A twist may be the mean over the whole interval to the next one, so a gap between twists needs a frame inside it.
+    A twist may be the mean up to the next one, so a gap between twists needs a frame inside it.
     """
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
     if t_ns.size < 2 or isinstance(sequence.motion, NoSamples):
@@ -407,7 +401,6 @@ def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
 
 
 def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray:
-    """Return the first samples of the stretches of ``steps`` steps without a gap."""
     if t_ns.size <= steps:
         return np.empty(0, dtype=np.int64)
     holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
@@ -476,10 +469,7 @@ def _even_steps_s(step_s: Array) -> Array:
 
 
 def _followed(rates: Array, step_s: Array, even_s: Array, known: BoolArray) -> Scalar | None:
-    """Return the share of the variation of the steps about even ones that the camera's rates (K - 1, 6) follow.
-
-    None where the motion is known in too few intervals and those around them.
-    """
+    """Return the share of the steps' variation about even ones that the camera's rates (K - 1, 6) follow, if known."""
     rows = np.arange(-BESIDE[0], step_s.size - BESIDE[-1])
     beside = rows[:, None] + np.array(BESIDE)
     usable = known[rows] & known[beside].all(axis=1)
@@ -616,10 +606,7 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
 
 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
-    """Return the self-calibration's offset, unless that of the rotations is large and a self-calibration confirms it.
-
-    Offsets by rotations have larger errors, and a wrong rotation of the extrinsic causes offsets of up to 0.1 s.
-    """
+    """Return the self-calibration's offset, unless that of the rotations is large and leads to a self-calibration."""
     fitted = evidence.self_calibration
     if found is None or fitted is None:
         return found
@@ -674,7 +661,6 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
 
 
 def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
-    """Return the sequence with its frames on the samples' clock, without frames outside the time of the samples."""
     shifted = replace(sequence, frames_t_ns=sequence.frames_t_ns + round(offset_s * NS_PER_S))
     motion_t_ns = sequence.motion.t_ns
     inside = (shifted.frames_t_ns >= motion_t_ns[0]) & (shifted.frames_t_ns <= motion_t_ns[-1])
@@ -708,10 +694,7 @@ def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
 
 
 def _fitted_change(evidence: Evidence, intervals: Intervals) -> Scalar | None:
-    """Return the change (s) by the self-calibration; None where it has no windows in both halves.
-
-    Rotations of half a short recording may agree best at a wrong shift, about which their standard error is too small.
-    """
+    """Return the change (s) by the self-calibration; rotations of half a short recording may agree at a wrong shift."""
     found = evidence.self_calibration
     if found is not None and found.windows == 1:
         found = self_calibration(evidence.sequence, evidence.camera_motion, intervals, fewest_windows=2)

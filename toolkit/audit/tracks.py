@@ -190,13 +190,11 @@ def _step_px(uv_px: Array) -> tuple[float | None, str]:
 
 
 def _share_round(uv_px: Array, step_px: float) -> float:
-    """Return the share of coordinates that are multiples of a step."""
     steps = uv_px / step_px
     return float(np.mean(np.abs(steps - np.round(steps)) < 1e-4))
 
 
 def _share_half(uv_px: Array) -> float:
-    """Return the share of coordinates that are half-precision numbers."""
     with np.errstate(over="ignore"):
         return float(np.mean(uv_px.astype(np.float16) == uv_px))
 
@@ -290,7 +288,6 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
 
 
 def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
-    """Return the recording in every other order of coordinates."""
     # A sighting without the right image has nothing to be exchanged with.
     both = sequence.observations.select(~is_left_only(sequence.observations.uv_px))
     orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
@@ -465,7 +462,7 @@ def thin_vision(evidence: Evidence) -> Symptom | None:
 
 
 def _runs(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return begin and end of every run of marked entries (n,), the end being the index after its last."""
+    """Return begin and end (exclusive) of every run of marked entries (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

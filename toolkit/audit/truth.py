@@ -301,7 +301,6 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
 
 
 def _doubtful(scale: WindowMedian) -> Undecided | None:
-    """Return a scale that is beyond chance and within the limit of sound recordings, as undecided."""
     if abs(scale.value - 1.0) <= scale.by_chance:
         return None
     within = "which is more than chance and no more than in recordings without faults"
@@ -355,7 +354,6 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
 
 
 def _readings(T_world_imu: Array) -> Iterator[tuple[str, str, Array]]:
-    """Yield other readings of a truth: a description, what to do about it, and the poses."""
     yield "whose poses run backwards", "write them in the order of their stamps", T_world_imu[::-1]
     for exchange in exchanges():
         yield f"with {exchange.description}", _AXES, exchange.reread(T_world_imu)

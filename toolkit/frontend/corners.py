@@ -65,7 +65,6 @@ def count_in_cells(points_px: Array, size_px: tuple[int, int], grid: tuple[int, 
 
 
 def _cells_of(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
-    """Return the cell (N,) of each point (N, 2), counted row by row."""
     column = np.clip(points_px[:, 0] * grid[1] / size_px[0], 0, grid[1] - 1).astype(np.int64)
     row = np.clip(points_px[:, 1] * grid[0] / size_px[1], 0, grid[0] - 1).astype(np.int64)
     return row * grid[1] + column

@@ -68,7 +68,6 @@ def _check_complete(video: Path, frames: int, directory: Path) -> None:
 
 
 def _written_by_us(directory: Path) -> frozenset[str]:
-    """Return the names that stills and videos have: nothing else is replaced."""
     stills = {path.name for path in directory.glob("*.png") if path.stem.lstrip("-").isdecimal()}
     return frozenset({*stills, _VIDEO})
 
@@ -86,7 +85,6 @@ def _drawn(
 
 
 def _still(images: tuple[Image, Image], tracks: ImageTracks, k: int) -> Image:
-    """Return both images (height, 2 width, 3) with the tracks of frame k."""
     import cv2
 
     canvas = cv2.cvtColor(np.hstack(images), cv2.COLOR_GRAY2BGR)

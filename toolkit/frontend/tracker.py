@@ -141,7 +141,6 @@ class Tracker:
         return fitted, fitted_px, (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
-        """Return the tracks found in the right image, near where they are in ``right_px``."""
         right_px, found = self._found_right(left, right, tracks.left_px, tracks.right_px)
         return replace(tracks, right_px=right_px).select(found)
 
@@ -169,7 +168,6 @@ class Tracker:
         return min(self.rig.fx_px * self.rig.baseline_m / self.settings.nearest_m, 0.5 * self.rig.size_px[0])
 
     def _begun(self, left: Image, right: Image, floats: Floats, tracks: _Tracks) -> _Tracks:
-        """Return new tracks where there is room for them."""
         wanted = self.settings.max_tracks - int(tracks.sound.sum())
         if wanted <= 0:
             return _NO_TRACKS
@@ -192,7 +190,6 @@ class Tracker:
         return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px), identities, sound)
 
     def _free(self, taken_px: Array) -> BoolArray:
-        """Return for each pixel whether a track may begin there."""
         import cv2
 
         free = self._seen[0].astype(np.uint8)
@@ -203,7 +200,6 @@ class Tracker:
         return np.asarray(free > 0)
 
     def _inside(self, points_px: Array, side: int) -> BoolArray:
-        """Say of points (N, 2) whether the camera sees them."""
         width, height = self.rig.size_px
         column, row = np.rint(points_px).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)

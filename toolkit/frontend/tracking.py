@@ -105,12 +105,10 @@ def read_pairs(recording: ImageRecording, pairs: Sequence[StampedPair]) -> Itera
 
 
 def _bits_of(pairs: Sequence[StampedPair]) -> int:
-    """Return the bits that the images' values fill, by the first, the middle and the last pair."""
     return bit_depth(path for pair in _some(pairs) for path in (pair.left, pair.right))
 
 
 def _some(pairs: Sequence[StampedPair]) -> list[StampedPair]:
-    """Return the first, the middle and the last pair."""
     return [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
 
 
@@ -144,7 +142,6 @@ def _tracked(
 
 
 def _commonest(skipped: Sequence[Unusable]) -> Unusable:
-    """Return the first of those that have the commonest reason."""
     reasons = [one.reason for one in skipped]
     return max(skipped, key=lambda one: reasons.count(one.reason))
 
@@ -221,7 +218,6 @@ def _count(found: TrackedCorners | None) -> int:
 
 
 def _check_sides(check: _SideCheck) -> None:
-    """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
     folders, settings = f"{check.pairs[0].left.parent} and {check.pairs[0].right.parent}", check.settings
     if check.all_alike():
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
@@ -246,19 +242,5 @@ def _check_sides(check: _SideCheck) -> None:
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "
-            f"ones; the calibration is not that of these images, or they are no pairs{_too_strict(settings)}"
+            f"ones; the calibration is not that of these images, they are no pairs, or a threshold of frontend.* is too strict"
         )
-
-
-def _too_strict(settings: Frontend) -> str:
-    """Return the end of the message: the settings that find fewer corners in right images than the defaults do."""
-    default = Frontend()
-    stricter = {
-        "nearest_m": settings.nearest_m > default.nearest_m,
-        "forward_backward_px": settings.forward_backward_px < default.forward_backward_px,
-        "epipolar_px": settings.epipolar_px < default.epipolar_px,
-        "patch_px": settings.patch_px < default.patch_px,
-        "patch_correlation": settings.patch_correlation > default.patch_correlation,
-    }
-    named = [f"frontend.{name}={getattr(settings, name):.12g}" for name, is_so in stricter.items() if is_so]
-    return f", or {' or '.join(named)} is too strict" if named else ""
