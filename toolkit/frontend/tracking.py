@@ -242,5 +242,5 @@ def _check_sides(check: _SideCheck) -> None:
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "
-            f"ones; the calibration is not that of these images, they are no pairs, or a threshold of frontend.* is too strict"
+            "ones; the calibration is not that of these images, they are no pairs, or frontend.* is too strict"
         )
