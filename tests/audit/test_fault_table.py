@@ -334,21 +334,6 @@ def test_the_offset_of_the_clocks_is_measured_and_undone(dose: float) -> None:
     assert abs(left_s) < 0.01  # three standard errors of 3 ms over six seconds
 
 
-def test_a_kept_offset_is_reported_blocks_and_is_left() -> None:
-    late = faults.camera_clock(clean("flight"), 0.25, 0)
-    outcome = audit(late, frozenset({"time-offset"}))
-    (finding,) = [f for f in outcome.findings if f.fault == "time-offset"]
-    assert finding.blocking
-    assert outcome.sequence is late
-
-
-def test_an_implausible_sample_is_dropped_alone() -> None:
-    sequence = clean("flight")
-    repaired = audited(faults.spike, 1e300, "flight").sequence
-    assert repaired.motion.t_ns.size == sequence.motion.t_ns.size - 1
-    assert np.abs(repaired.motion.values).max() < 100.0
-
-
 def test_after_a_clock_jump_no_time_is_there_twice() -> None:
     sequence = clean("flight")
     repaired = audited(faults.clock_jump, -0.5, "flight").sequence

@@ -102,12 +102,6 @@ def test_an_id_that_ends_is_never_used_again(plain: Filmed) -> None:
     assert any(frames[-1] < 9 for frames in frames_of.values())
 
 
-def test_the_same_images_give_the_same_bits(plain: Filmed) -> None:
-    for one, other in zip(tracked(plain), tracked(plain), strict=True):
-        np.testing.assert_array_equal(one.corners_px, other.corners_px)
-        np.testing.assert_array_equal(one.track_ids, other.track_ids)
-
-
 def test_tracks_keep_their_distance_at_birth_and_their_number(plain: Filmed) -> None:
     seen = tracked(plain, msgspec.structs.replace(DEFAULTS.frontend, max_tracks=40))[0]
     assert len(seen.track_ids) == 40

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from toolkit.errors import DataError
-from toolkit.experiment import Plan, run
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import IntArray
 from toolkit.measurements import TwistChangeNoise
 from toolkit.motion_samples import NoSamples
 from toolkit.noise import measured_noise
 from toolkit.noise.measurement import MotionScale, motion_scale
 from toolkit.noise.stretches import MotionFit, Stretch
 from toolkit.sequence import Sequence, is_held_out
-from toolkit.settings import Noise, Settings
+from toolkit.settings import Noise
 from toolkit.simulation import SCENARIOS, noise_free, simulate
 from toolkit.simulation.faults import track_walk
 
@@ -45,14 +44,6 @@ def test_white_errors_as_stated_leave_the_recording_as_it_is(name: str, duration
         assert (measured.why_not, measured.tracks.value, measured.motion.value) == ("", 1.0, 1.0)
     found, stated = (prepare(Recording(sequence, noise=noise)).sequence for noise in (Noise(), AS_STATED))
     assert found.content_hash() == stated.content_hash()
-
-
-def test_where_the_noise_is_as_stated_answers_are_those_of_noise_that_is_set_to_the_bit() -> None:
-    def poses(noise: Noise) -> list[Array]:
-        plan = Plan(("drive",), ("ekf", "fixed-lag"), settings=Settings(noise=noise), max_frames=15, workers=1)
-        return [one.final.T_world_imu for one in run(plan)[0].runs]
-
-    np.testing.assert_array_equal(poses(Noise()), poses(AS_STATED))
 
 
 def test_the_more_tracks_walk_the_less_they_count(drive: Sequence) -> None:
@@ -217,13 +208,6 @@ def test_wild_values_end_nothing_and_change_little_or_are_told(drive: Sequence, 
         assert found.tracks.value == pytest.approx(measured_noise(walking).tracks.value, rel=0.3)
     else:  # one in every stretch, and none has a solution: the audit drops such values
         assert "do not determine the motion" in found.why_not
-
-
-@pytest.mark.parametrize(("tracks", "frames", "reason"), [(0, 15, "no tracks"), (50, 7, "7 frames are too few")])
-def test_a_reason_is_given_where_nothing_can_be_measured(
-    drive: Sequence, tracks: int, frames: int, reason: str
-) -> None:
-    assert reason in measured_noise(only(drive.truncated(frames), tracks)).why_not
 
 
 def test_without_measured_motion_tracks_are_weighed_alone(drive: Sequence) -> None:
