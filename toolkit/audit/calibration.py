@@ -49,7 +49,7 @@ class Judged(NamedTuple):
     """A parameter of the self-calibration that is judged: its rows, and what to check where it is wrong.
 
     ``limits`` are those of sound recordings, beyond the standard errors, and ``hidden`` the sizes from which on an
-    error that would not show is reported as ``unseen``, both by the kind of motion; without a limit it is not judged.
+    error that would not show is reported as ``unseen``, both by the kind of motion; infinite where it is not judged.
     """
 
     rows: slice
@@ -59,38 +59,35 @@ class Judged(NamedTuple):
     unseen: str = ""
 
 
-_PAIR, _FAR, _TURNS = (
-    "the rectification of the pair",
-    "too little motion sideways to near points",
-    "too little rotation",
-)
+def _by_kind(imu: float = np.inf, twist: float = np.inf) -> dict[MotionKind, float]:
+    return {"imu": imu, "twist": twist}
+
+
+def _one(row: int) -> slice:
+    return slice(row, row + 1)
+
+
+_PAIR, _FAR = "the rectification of the pair", "too little motion sideways to near points"
+_TURNS = "too little rotation"
 # Limits are about twice what parts of sound recordings exceed four (six) standard errors by (docs/audit.md); hidden
 # errors are reported where they would triple those of estimators. With odometry the baseline is judged by
-# `vision_scale`, the clock by `time_offset`, and a hidden rotation by the velocities.
+# `vision_scale`, the clock by `time_offset`, and a hidden rotation by the velocities. A shift of an image has the same
+# effect on far points as a baseline.
 JUDGED = {
-    "fx_px": Judged(slice(0, 1), "K", {"imu": 0.012, "twist": 0.06}, {"imu": 0.02, "twist": 0.16}, "fx off by {:.0%}"),
-    "fy_px": Judged(slice(1, 2), "K", {"imu": 0.012, "twist": 0.06}, {"imu": 0.02, "twist": 0.16}, "fy off by {:.0%}"),
-    "cx_px": Judged(slice(2, 3), "K", {"imu": 2.0, "twist": 8.0}, {"imu": 10.0}, "cx off by {:.0f} px"),
-    "cy_px": Judged(slice(3, 4), "K", {"imu": 5.0, "twist": 12.0}, {"imu": 10.0}, "cy off by {:.0f} px"),
-    # A shift of an image has the same effect on far points as a baseline.
-    "baseline": Judged(slice(BASELINE, BASELINE + 1), f"the baseline, {_PAIR}", {"imu": 0.015}, {}),
+    "fx_px": Judged(_one(0), "K", _by_kind(0.012, 0.06), _by_kind(0.02, 0.16), "fx off by {:.0%}"),
+    "fy_px": Judged(_one(1), "K", _by_kind(0.012, 0.06), _by_kind(0.02, 0.16), "fy off by {:.0%}"),
+    "cx_px": Judged(_one(2), "K", _by_kind(2.0, 8.0), _by_kind(10.0), "cx off by {:.0f} px"),
+    "cy_px": Judged(_one(3), "K", _by_kind(5.0, 12.0), _by_kind(10.0), "cy off by {:.0f} px"),
+    "baseline": Judged(_one(BASELINE), f"the baseline, {_PAIR}", _by_kind(0.015), _by_kind()),
     "turn": Judged(
-        TURN, "the rotation of T_imu_cam", {"imu": 0.006, "twist": 0.06}, {"imu": 0.02}, "a camera turned by {:.2f} rad"
+        TURN, "the rotation of T_imu_cam", _by_kind(0.006, 0.06), _by_kind(0.02), "a camera turned by {:.2f} rad"
     ),
-    "clock": Judged(slice(LATE, LATE + 1), "the clocks of the camera and the IMU", {"imu": 0.0008}, {}),
+    "clock": Judged(_one(LATE), "the clocks of the camera and the IMU", _by_kind(0.0008), _by_kind()),
     "right shift": Judged(
-        slice(RIGHT_SHIFT, RIGHT_SHIFT + 1),
-        _PAIR,
-        {"imu": 0.05, "twist": 0.3},
-        {"imu": 0.5, "twist": 1.5},
-        "a right image shifted by {:.1f} px",
+        _one(RIGHT_SHIFT), _PAIR, _by_kind(0.05, 0.3), _by_kind(0.5, 1.5), "a right image shifted by {:.1f} px"
     ),
     "right roll": Judged(
-        slice(RIGHT_ROLL, RIGHT_ROLL + 1),
-        _PAIR,
-        {"imu": 0.002, "twist": 0.003},
-        {"imu": 0.01, "twist": 0.02},
-        "a right image rolled by {:.3f} rad",
+        _one(RIGHT_ROLL), _PAIR, _by_kind(0.002, 0.003), _by_kind(0.01, 0.02), "a right image rolled by {:.3f} rad"
     ),
 }
 BESIDE = {"imu": "IMU", "twist": "odometry"}
@@ -108,13 +105,12 @@ def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wron
 
     Their standard errors include the largest error of sound recordings, half of the limit.
     """
-    limits = {name: one.limits[kind] for name, one in JUDGED.items() if kind in one.limits}
-    return _beyond(found, rig, kind, limits)
+    return _beyond(found, rig, kind, {name: one.limits[kind] for name, one in JUDGED.items()})
 
 
 def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | None:
     """Say which parts are wrong by more than chance but no more than in sound recordings."""
-    differences = _beyond(found, rig, kind, {name: 0.0 for name, one in JUDGED.items() if one.hidden})
+    differences = _beyond(found, rig, kind, {name: 0.0 for name, one in JUDGED.items() if one.unseen})
     summary = "; ".join(one.summary for one in differences)
     return f"{summary}: that is more than chance and no more than in recordings without faults" if differences else None
 
@@ -124,14 +120,14 @@ def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
     unseen: dict[str, list[str]] = {_TURNS: [], _FAR: []}
     for name, one in JUDGED.items():
         least = _least(found, name, kind)
-        if least > one.hidden.get(kind, np.inf):
+        if least > one.hidden[kind]:
             unseen[_FAR if one.check == _PAIR else _TURNS].append(one.unseen.format(least))
     return "; ".join(f"{why}: {', '.join(parts)} would not show" for why, parts in unseen.items() if parts) or None
 
 
 def _least(found: SelfCalibration, name: str, kind: MotionKind) -> float:
-    rows, limit = JUDGED[name].rows, JUDGED[name].limits.get(kind, np.inf)
-    return limit + RIGHT_SIGMAS[kind] * float(found.error[rows].max())
+    one = JUDGED[name]
+    return one.limits[kind] + RIGHT_SIGMAS[kind] * float(found.error[one.rows].max())
 
 
 def _beyond(found: SelfCalibration, rig: StereoRig, kind: MotionKind, limits: dict[str, float]) -> list[Wrong]:
@@ -290,8 +286,7 @@ def gyro_bias(evidence: Evidence) -> Symptom | Undecided | None:
         expected_radps, sigma_radps = prior.bias[3:], np.sqrt(np.diag(prior.cov)[-3:])
     excluded = np.abs(bias_radps - expected_radps) > BIAS_SIGMAS * np.hypot(sigma_radps, error_radps)
     biased = np.abs(bias_radps) > BIAS_SIGMAS * error_radps
-    count = int((biased | excluded).sum()) if prior is not None else int(biased.sum())
-    if not count:
+    if not (count := int((biased | excluded).sum())):
         return None
     values = ", ".join(f"{b:z.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
     detail = f"the gyro reads ({values}) rad/s too much about x, y, z ({source})"
