@@ -2,8 +2,7 @@
 
 Reading order: arguments (how a command is declared, and the arguments that several share), then the commands about one
 thing in a file each: compare (with explain and sweep), evaluate, runs, recordings, gate, parts. Beside them
-progress_display, and completion for shells. Here: how a command is run, and what becomes of errors, signals and its
-output.
+progress_display. Here: how a command is run, and what becomes of errors, signals and its output.
 """
 
 import errno
@@ -20,7 +19,7 @@ from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
-from toolkit.cli import compare, completion, evaluate, gate, parts, recordings, runs
+from toolkit.cli import compare, evaluate, gate, parts, recordings, runs
 from toolkit.cli.arguments import Parser, ShowVersion
 from toolkit.errors import OutputError, SystemLimitError, VislamError, one_line
 
@@ -45,7 +44,7 @@ _COMMANDS = (
     *(compare.compare, compare.explain, compare.sweep, evaluate.evaluate),
     *(runs.diff, runs.report, runs.export, runs.reproduce),
     *(gate.check, gate.baseline, recordings.check_data, recordings.card, parts.verify, parts.list_parts, parts.cite),
-    *(recordings.simulate, recordings.tracks, recordings.import_tables, completion.completion),
+    *(recordings.simulate, recordings.tracks, recordings.import_tables, parts.completion),
 )
 
 
@@ -67,7 +66,7 @@ def parser() -> Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
     if "_ARGCOMPLETE" in os.environ:
-        completion.complete(parser())
+        parts.complete(parser())
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
     with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as end_requests:

@@ -1,9 +1,10 @@
-"""``vislam list``, ``cite`` and ``verify``: the estimators, formats and metrics there are, and one of your own."""
+"""``vislam list``, ``cite``, ``verify`` and ``completion``: what there is, and an estimator of your own."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import arg, choice, command, output
@@ -16,6 +17,16 @@ if TYPE_CHECKING:
 KINDS = ("estimators", "metrics", "faults", "injectors", "settings", "formats", "sequences")
 # How many names of each kind stand for all of it.
 _EXAMPLES = 4
+# Which of these names an argument takes, by its destination.
+_KINDS_OF = {
+    "estimators": "estimators",
+    "sequence": "sequences",
+    "sequences": "sequences",
+    "columns": "metrics",
+    "metric": "metrics",
+    "keep": "faults",
+    "set": "settings",
+}
 
 
 @command(
@@ -135,3 +146,38 @@ def verify(options: argparse.Namespace) -> int:
     elif not options.quiet:
         print(verification_text(found, width_of_output()))
     return 0 if found.passed else 1
+
+
+@command(
+    "completion",
+    "print the script with which a shell completes vislam's commands and options",
+    choice("shell", ("bash", "zsh", "fish"), "which shell"),
+    examples=("vislam completion bash",),
+)
+def completion(options: argparse.Namespace) -> int:
+    """Print a script that completes commands, options, their choices, and the names of estimators, built-in
+    sequences, metrics, faults and settings that are installed. bash and zsh: put eval "$(vislam completion
+    bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as ~/.config/fish/completions/vislam.fish.
+    """
+    from argcomplete.shell_integration import shellcode
+
+    print(shellcode(["vislam"], shell=options.shell))
+    return 0
+
+
+def complete(root: argparse.ArgumentParser) -> None:
+    """Answer a shell that asks for completions, and leave; return where none does."""
+    import argcomplete
+
+    (commands,) = (one for one in root._actions if isinstance(one, argparse._SubParsersAction))
+    for parser in commands.choices.values():
+        for action in parser._actions:
+            if action.dest in _KINDS_OF:
+                action.completer = partial(_known_names, _KINDS_OF[action.dest])
+    argcomplete.autocomplete(root)
+
+
+def _known_names(kind: str, prefix: str, **_: object) -> list[str]:
+    """Return the names of a kind behind what stands of a list already."""
+    before, comma, _last = prefix.rpartition(",")
+    return [f"{before}{comma}{name}{'=' if kind == 'settings' else ''}" for name in entries(kind)]

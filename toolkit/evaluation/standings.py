@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -247,14 +246,13 @@ def evaluate(
     with the reason, and so does a run that covers too little of the truth's time.
     """
     truths = {name: read_truth(name, path, terms.cov_convention) for name, path in gathered.truths.items()}
-    units = [
-        _Unit(name, path, tuple(item for item in gathered.items if item.sequence == name), terms)
-        for name, path in gathered.truths.items()
-    ]
+    # All runs of a sequence, which share its truth, are the work of one process.
+    of_sequence = {name: [item for item in gathered.items if item.sequence == name] for name in truths}
+    units = [(truths[name], items, terms) for name, items in of_sequence.items()]
     scored: dict[Item, RunRecord] = {}
     processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
     for place, result in results_of(units, processes, _evaluated, progress):
-        items = units[place].items
+        items = units[place][1]
         found = [_run(item, None, result.why) for item in items] if isinstance(result, LostUnit) else result
         scored |= zip(items, found, strict=True)
     runs = tuple(scored[item] for item in gathered.items)
@@ -263,27 +261,16 @@ def evaluate(
     return EvaluatedSystems(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
 
 
-@dataclass(frozen=True)
-class _Unit:
-    """All runs of a sequence, which share its truth: the work of one process."""
-
-    sequence: str
-    truth: Path
-    items: tuple[Item, ...]
-    terms: Terms
-
-
-def _evaluated(unit: _Unit, progress: Progress) -> tuple[RunRecord, ...]:
-    truth = read_truth(unit.sequence, unit.truth, unit.terms.cov_convention)
+def _evaluated(unit: tuple[TruthFile, list[Item], Terms], progress: Progress) -> list[RunRecord]:
+    truth, items, terms = unit
     runs = []
-    for i, item in enumerate(unit.items):
-        progress.advance(i, len(unit.items))
-        runs.append(evaluated(item, truth, unit.terms))
-    return tuple(runs)
+    for i, item in enumerate(items):
+        progress.advance(i, len(items))
+        runs.append(_evaluated_run(item, truth, terms))
+    return runs
 
 
-def evaluated(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
-    """Score one run; a fault of its file goes into its log and is not raised."""
+def _evaluated_run(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
     if item.path is None:
         return _run(item, None, "there is no trajectory")
     try:
@@ -442,6 +429,5 @@ def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
     )  # fmt: skip
 
 
-def read_evaluation(path: Path) -> EvaluationRecord:
-    """Read an ``evaluation.json``; raises DataError, in one line with the place, where it is not one."""
-    return documents.read(path, EvaluationRecord, remedy="make it with vislam evaluate --out")
+# Reads an ``evaluation.json``; raises DataError, in one line with the place, where it is not one.
+read_evaluation = documents.reader(EvaluationRecord, "make it with vislam evaluate --out")

@@ -164,22 +164,10 @@ def look_ahead(watched: Watched, counts: tuple[int, ...] = ()) -> str:
 
 def other_answers(watched: Watched) -> str:
     """Say at which frame a second run over the same packets gives another answer."""
-    return _other_in_second_run(watched.packets, watched)
+    return other_in_second_run(watched.packets, watched)
 
 
-def other_when_repeated(watched: Watched) -> str:
-    """Check both properties above in one run: repeat it with packets of recordings that end early.
-
-    The first two packets come from a recording that ends with them, the others of the first half from one that ends
-    there: they cannot contain later data. The check does not say which of the two promises is broken.
-    """
-    counts = (2, len(watched.online) // 2, len(watched.online))
-    cut = [list(watched.sequence.truncated(count).packets()) for count in counts]
-    packets = tuple(packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:])
-    return _other_in_second_run(packets, watched)
-
-
-def _other_in_second_run(packets: tuple[Packet, ...], first: Watched) -> str:
+def other_in_second_run(packets: tuple[Packet, ...], first: Watched) -> str:
     """Say at which frame an estimator answers differently than before; empty where answers are the same."""
     estimator = first.build(first.setup)
     for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
