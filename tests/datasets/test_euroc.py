@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.datasets.conftest import assert_refused, edit
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.datasets.io.fields import read_fields
@@ -240,53 +239,6 @@ def test_a_matrix_of_opencv_has_its_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_fields(path).constant("cam0.T", 2, 3), [[1, 2, 3], [4, 5, 6]])
     path.write_text(path.read_text().replace("cols: 3", "cols: 4"))
     assert "cam0.T" not in read_fields(path)
-
-
-def shift_truth(recording: Path) -> None:
-    truth_s = np.arange(100.0, 102.0, 0.005)
-    write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
-
-
-def scale_truth(recording: Path, factor: float) -> None:
-    """Write positions in another unit."""
-    path = recording / "mav0/state_groundtruth_estimate0/data.csv"
-    heading, *lines = path.read_text().splitlines()
-    rows = [line.split(",") for line in lines]
-    scaled = [[row[0], *(f"{factor * float(x):.12g}" for x in row[1:4]), *row[4:]] for row in rows]
-    write(path, "\n".join([heading, *map(",".join, scaled)]) + "\n")
-
-
-TRUTH = "state_groundtruth_estimate0"
-# Nine lists of ten, each of the one before it: 600 characters that stand for a billion values.
-BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
-MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no truth", lambda d: shutil.rmtree(d / "mav0" / TRUTH), "no ground truth in mav0/state_groundtruth_estimate0"),
-    ("other clock", shift_truth, "overlap by less than 0.2 s"),
-    ("no stamps", lambda d: (d / "mav0/cam0/data.csv").unlink(), "cam0/data.csv: cannot be read"),
-    (
-        "column",
-        lambda d: edit(d / "mav0/imu0/data.csv", "w_RS_S_y", "rate_y"),
-        "imu0/data.csv: missing column w_RS_S_y",
-    ),
-    ("open list", lambda d: edit(d / "mav0/cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
-    ("aliases", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "more than 10 aliases"),
-    ("too deep", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(f"a: {'[' * 5000}"), "is nested too deeply"),
-    ("twice", lambda d: edit(d / "mav0/cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
-    ("not rigid", lambda d: edit(d / "mav0/cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
-    (
-        "another unit",
-        lambda d: scale_truth(d, 1e6),
-        r"swing: the truth spans \S+ m, and tracks are simulated in a room; check its unit",
-    ),
-]
-
-
-@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
-def test_a_malformed_recording_is_one_clear_line(
-    recording: Path, spoil: Callable[[Path], object], complaint: str
-) -> None:
-    spoil(recording)
-    assert_refused(lambda: load_sequence(str(recording)), recording, complaint)
 
 
 @functools.cache

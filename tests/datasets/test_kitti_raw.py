@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.datasets.conftest import assert_folder_refused, edit
 from toolkit.datasets import load_sequence
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
@@ -157,32 +156,3 @@ def test_packets_without_a_stamp_and_stamps_without_a_packet_are_counted(drive: 
     sequence = load_sequence(str(drive))
     assert sequence.motion.t_ns.size == FRAMES
     assert "2 oxts packets lack their file or their stamp and are left out" in sequence.provenance.facts
-
-
-def another_day(stamps: Path) -> None:
-    stamps.write_text(stamps.read_text().replace("2011-09-26", "2011-09-30"))
-
-
-CAMS, IMU = "calib_cam_to_cam.txt", "calib_imu_to_velo.txt"
-BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
-    ("imu cut", lambda d: edit(d.parent / IMU, "T: 0 0 0", "T: 0 O 0"), f"{IMU}: missing T; it has R"),
-    ("no baseline", lambda d: edit(d.parent / CAMS, "-1.000000000e+02", "1.0e+02"), "is not to the right of the left"),
-    ("no stamps", lambda d: (d / "image_00/timestamps.txt").unlink(), "timestamps.txt: cannot be read"),
-    ("blank stamps", lambda d: (d / "image_00/timestamps.txt").write_text("\n\n"), "holds no stamps"),
-    ("packet cut", lambda d: (d / "oxts/data/0000000003.txt").write_text("1 2 3"), "0000000003.txt: 3 numbers"),
-    ("one camera", lambda d: shutil.rmtree(d / "image_01"), "image_00/data has images and image_01/data has none"),
-    (
-        "no image at all",
-        lambda d: [p.unlink() for p in d.glob("image_*/data/*")],
-        r"image_00/data and image_01/data, .* with images; unpack them there \(.png",
-    ),
-    ("other day", lambda d: another_day(d / "oxts/timestamps.txt"), "in the time of the oxts packets.*two recordings"),
-]
-
-
-@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in BROKEN], ids=[m[0] for m in BROKEN])
-def test_a_drive_that_cannot_be_used_is_one_clear_line(
-    drive: Path, spoil: Callable[[Path], object], complaint: str
-) -> None:
-    spoil(drive)
-    assert_folder_refused(drive, complaint)
