@@ -118,19 +118,6 @@ def test_a_recording_is_what_was_saved(tmp_path: Path, small: dict[str, Any]) ->
     np.testing.assert_allclose(sequence.frames_t_ns, original.frames_t_ns, atol=500)
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-@pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4", "<i2"])
-def test_memory_order_and_number_type_do_not_matter(
-    tmp_path: Path, small: dict[str, Any], order: Any, dtype: str
-) -> None:
-    small["features"] = np.asarray(np.rint(small["features"]), dtype=dtype, order=order)
-    small["v_t"] = small["v_t"].astype(dtype if dtype != "<i2" else "<f8")
-    small["features_again"] = small["features"]  # by reference in the pickle
-    path = saved(tmp_path, small)
-    np.testing.assert_array_equal(read_dict(path)["features_again"], small["features"])
-    assert len(load_sequence(str(path)).observations) == len(drive().truncated(6).observations)
-
-
 def test_cameras_that_differ_in_their_matrices_become_one(tmp_path: Path, small: dict[str, Any]) -> None:
     expected = load_sequence(str(saved(tmp_path, small))).observations
     K, factor, shift = small["K_l"], 1.25, 7.0
@@ -210,6 +197,7 @@ def test_other_content_is_refused_in_one_line(tmp_path: Path, content: Any, patt
         b"\x96" + (1 << 40).to_bytes(8, "little") + b".",
         b"\xff.",
         b"\x8a\xff",
+        b"\x80\x04\x8e" + (1 << 50).to_bytes(8, "little") + b"x",  # no memory is taken for what is not there
         b"]r\xff\xff\xff\xff.",
     ],
 )
@@ -221,13 +209,6 @@ def test_no_instruction_runs_anything(tmp_path: Path, instructions: bytes, monke
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-def test_bytes_that_are_announced_and_not_there_are_no_memory_taken(tmp_path: Path) -> None:
-    path = saved(tmp_path, {"v_t": 1})
-    header = path.read_bytes()[:128]
-    path.write_bytes(header + b"\x80\x04\x8e" + (1 << 50).to_bytes(8, "little") + b"x")
-    assert_refused(lambda: load_sequence(str(path)), path, "damaged or truncated npy")
-
-
 def test_the_reader_agrees_with_pickle_on_plain_data(tmp_path: Path) -> None:
     values = {
         "numbers": [0, 1, -1, 255, 256, 65536, -(2**40), 2**70, 1.5, float("inf"), True, False, None],
@@ -236,6 +217,10 @@ def test_the_reader_agrees_with_pickle_on_plain_data(tmp_path: Path) -> None:
         "scalar": np.float64(2.5),
         "bytes": b"abc",
     }
+    arrays = {"swapped": np.arange(6.0).reshape(2, 3).astype(">f4", order="F"), "whole": np.arange(3, dtype="<i2")}
+    arrays["again"] = arrays["swapped"]  # by reference in the pickle
+    for key, read in read_dict(saved(tmp_path, arrays)).items():
+        np.testing.assert_array_equal(read, arrays[key])
     for protocol in (3, 4):  # those of numpy.save in Python 3
         path, stream = tmp_path / "plain.npy", io.BytesIO()
         np.save(stream, np.array(None, dtype=object), allow_pickle=True)

@@ -11,7 +11,6 @@ import pytest
 
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
-from toolkit.datasets.io.fields import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.measurements import ImuMotion, ImuNoise
 from toolkit.models.stereo import project, triangulate
@@ -231,14 +230,6 @@ def test_the_seed_draws_the_noise_and_nothing_else(recording: Path) -> None:
     assert same.truth is not None
     assert other.truth is not None
     np.testing.assert_array_equal(other.truth.T_world_imu, same.truth.T_world_imu)
-
-
-def test_a_matrix_of_opencv_has_its_rows(tmp_path: Path) -> None:
-    path = tmp_path / "chain.yaml"
-    path.write_text("%YAML:1.0\ncam0:\n  T: !!opencv-matrix\n    rows: 2\n    cols: 3\n    data: [1, 2, 3, 4, 5, 6]\n")
-    np.testing.assert_array_equal(read_fields(path).constant("cam0.T", 2, 3), [[1, 2, 3], [4, 5, 6]])
-    path.write_text(path.read_text().replace("cols: 3", "cols: 4"))
-    assert "cam0.T" not in read_fields(path)
 
 
 @functools.cache

@@ -1,6 +1,5 @@
 """Trajectory files: what is written is read back, evo reads it alike, and every wrong file gets one line."""
 
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from evo.tools import file_interface as evo
 
 from toolkit.datasets.trajectories import FORMATS, read_poses
-from toolkit.datasets.trajectories.formats import read_rows, stamp_text
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3, so3_exp
@@ -135,20 +133,6 @@ def test_kitti_leaves_no_pose_out(trajectory: Trajectory) -> None:
 
 
 @pytest.mark.parametrize(
-    ("t_ns", "text"),
-    [
-        (0, "0.000000000"),
-        (1, "0.000000001"),
-        (1_600_000_000_123_456_789, "1600000000.123456789"),
-        (-1_500_000_000, "-1.500000000"),
-        (999_999_999, "0.999999999"),
-    ],
-)
-def test_stamps_keep_every_nanosecond(t_ns: int, text: str) -> None:
-    assert stamp_text(t_ns) == text
-
-
-@pytest.mark.parametrize(
     ("name", "per_second", "unit"),
     [
         ("tum", 10**9, "nanoseconds: divide by 1e9"),
@@ -168,20 +152,3 @@ def test_a_wrong_unit_of_time_is_named(
     stamps = [f"{t * per_second / 1e9:.6f}" if per_second < 10**9 else str(t) for t in t_ns.tolist()]
     rows = [[stamp, *row[1:]] for stamp, row in zip(stamps, lines_of(name, trajectory), strict=True)]
     assert f"the stamps look like {unit}" in complaint(spoiled(tmp_path, name, rows))
-
-
-@pytest.mark.parametrize("digits", [(1, 1), (9, 9), (10, 3), (10, 9)])
-def test_stamps_printed_alike_are_exact_to_the_nanosecond(tmp_path: Path, digits: tuple[int, int]) -> None:
-    rng = np.random.default_rng(sum(digits))
-    before, after = digits
-    texts = sorted(
-        "".join(map(str, [rng.integers(1, 9), *rng.integers(0, 10, before - 1)]))
-        + "."
-        + "".join(map(str, rng.integers(0, 10, after)))
-        for _ in range(7)
-    )
-    path = tmp_path / "poses.txt"
-    for stamps in (texts, [*texts[:-1], f"{texts[-1]}0"[: before + 10]]):
-        path.write_text("".join(f"{text} 0 0 0 0 0 0 1\n" for text in stamps))
-        exact = [int(Decimal(text) * 10**9) for text in stamps]
-        assert read_rows(path, "a file").stamps(10**9).tolist() == exact
