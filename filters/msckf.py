@@ -56,7 +56,7 @@ class Msckf:
     """
 
     def __init__(self, setup: Setup, at: Linearisation, landmarks: int = 0, window_s: float | None = None) -> None:
-        self.log = load_kernels()
+        self.log = load_kernels(setup.progress)
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
         self._motion = setup.motion
         if window_s is None:

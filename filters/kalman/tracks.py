@@ -48,15 +48,18 @@ from toolkit.models.gating import (
     huber_threshold,
 )
 from toolkit.models.state import POSE, Belief
+from toolkit.progress import Progress
 
 
-def load_kernels() -> tuple[str, ...]:
+def load_kernels(progress: Progress) -> tuple[str, ...]:
     """Import the kernels, and compile them where that has not been done for this version; say so in one line.
 
-    Processes do it one after another: the second finds what the first has compiled.
+    It is reported while it goes on, because compiling takes many seconds. Processes do it one after another: the second
+    finds what the first has compiled.
     """
     if "filters.kalman.kernels" in sys.modules:
         return ()
+    progress.advance(0, 1, "loading compiled code, which is compiled the first time")
     with Path(__file__).open("rb") as own:
         with suppress(OSError):  # a file system without locks: they compile side by side
             fcntl.flock(own, fcntl.LOCK_EX)

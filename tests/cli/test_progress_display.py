@@ -61,3 +61,11 @@ def test_a_terminal_sees_a_bar_that_is_gone_at_the_end():
     assert "drive: batch" in written and "drive: batch, iteration" in written
     assert "\n" not in written
     assert written.rstrip("\r").endswith("\r" + " " * len(written.rstrip("\r").rpartition("\r")[2]))
+
+
+def test_a_terminal_sees_what_is_waited_for_before_the_first_step() -> None:
+    stream = Terminal()
+    with progress.on_stream(stream)("8 runs") as watched:
+        watched.advance(0, 800)
+        watched.advance(0, 800, "compiling")
+        assert "8 runs, compiling" in stream.getvalue()

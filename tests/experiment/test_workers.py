@@ -20,7 +20,7 @@ from toolkit.errors import DataError
 from toolkit.experiment.units import Outcome, Scored, run_unit
 from toolkit.experiment.workers import LostUnit, WorkerProcess, results_of
 from toolkit.metrics import cost
-from toolkit.progress import SILENT
+from toolkit.progress import SILENT, Progress
 from toolkit.verify.promises import arrays_of
 
 Jobs = Callable[..., list[Any]]
@@ -226,6 +226,23 @@ def test_progress_is_that_of_all_units_and_never_goes_back(jobs, work, workers):
     assert len({total for _, total in received}) == 1
     assert any(0.0 < share < 0.5 for share in shares)
     assert shares[-1] == 1.0 or workers == 1
+
+
+def test_a_stage_before_the_first_frame_is_no_half_of_a_run() -> None:
+    """As while an estimator compiles; a stage after the frames is a smoother's solve, the second half."""
+    received: list[tuple[int, int, str]] = []
+
+    class Listening:
+        def advance(self, done: int, total: int, stage: str = "") -> None:
+            received.append((done, total, stage))
+
+    def works(_unit: int, progress: Progress) -> None:
+        progress.advance(0, 1, "compiling")
+        progress.advance(1, 2)
+        progress.advance(0, 9, "solving")
+
+    list(results_of([0], 1, works, Listening()))
+    assert received == [(0, 100, "compiling"), (25, 100, ""), (50, 100, "solving, iteration 1")]
 
 
 def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(tmp_path, starts_group):

@@ -55,13 +55,12 @@ class _Bar:
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Show that ``done`` of ``total`` steps are taken."""
-        if stage != self._stage:
-            self._stage = stage
-            self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label, refresh=False)
         if total != self._bar.total or done < self._bar.n:
             self._bar.reset(total)
-        if done > self._bar.n:
-            self._bar.update(done - self._bar.n)
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label)
+        self._bar.update(done - self._bar.n)  # by none as well: the time is drawn anew
 
     def close(self) -> None:
         """Take the line away."""

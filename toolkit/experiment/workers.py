@@ -47,7 +47,7 @@ usable_cpus: Callable[[], int] = cpu_count
 # Signals that a terminal sends to every process of its group, and that the parent alone handles.
 _OF_A_TERMINAL = (signal.SIGINT, signal.SIGHUP)
 # Progress of a unit, written by its process and read by the parent.
-_ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
+_ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("solving", np.bool_), ("stage", "S64")])
 # Progress steps of each unit: its frames are the first half, a smoother's final solve the second.
 _STEPS = 100
 
@@ -304,17 +304,18 @@ class _Board:
         self._under_way[place] = False
 
     def progress(self) -> tuple[int, int, str]:
-        """Return the steps done, of how many, and the current step of the first smoother in its final solve."""
+        """Return the steps done, of how many, and the current stage of the first unit that is in one."""
         entries, half = np.array(self.entries[: self._under_way.size])[self._under_way], _STEPS // 2
-        done = half * entries["done"] // np.maximum(entries["total"], 1) + half * (entries["stages"] > 0)
-        ending = entries[entries["stage"] != b""][:1]
-        stage = "".join(f"{one['stage'].decode()}, iteration {one['done'] + 1}" for one in ending)
+        done = half * entries["done"] // np.maximum(entries["total"], 1) + half * entries["solving"]
+        stage = ""
+        for one in entries[entries["stage"] != b""][:1]:
+            stage = one["stage"].decode() + (f", iteration {one['done'] + 1}" if one["solving"] else "")
         return self._total - _STEPS * entries.size + int(done.sum()), self._total, stage
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
     entries = np.memmap(board, dtype=_ENTRY, mode="r+")
-    entries[place] = (0, 1, 0, b"")
+    entries[place] = (0, 1, False, b"")
     try:
         return work(unit, _Entry(entries, place))
     except MemoryError:
@@ -326,10 +327,10 @@ class _Entry:
 
     def __init__(self, entries: Any, place: int, report: Callable[[], None] = lambda: None) -> None:
         self._entries, self._place, self._report = entries, place, report
-        self._stages: set[str] = set()
+        self._has_begun = False
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Write how far the unit has come."""
-        self._stages |= {stage} - {""}
-        self._entries[self._place] = (done, total, len(self._stages), stage.encode("ascii", "replace"))
+        """Write how far the unit has come; a stage before the first frame is no solve, but what a run waits for."""
+        self._has_begun |= not stage
+        self._entries[self._place] = (done, total, bool(stage) and self._has_begun, stage.encode("ascii", "replace"))
         self._report()
