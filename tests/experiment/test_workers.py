@@ -316,7 +316,6 @@ def test_no_process_outlives_one_that_is_killed(tmp_path, starts_group):
         import time
         from toolkit.experiment.workers import Workers
         from toolkit.progress import SILENT
-from toolkit.verify.promises import arrays_of
         workers = Workers(2)
         list(workers.results([1, 2], lambda unit, progress: unit, SILENT))
         print("started", flush=True)
