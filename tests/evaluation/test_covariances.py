@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.covariances import CONVENTIONS, written_as
 from toolkit.estimate import Trajectory
-from toolkit.geometry import quaternion_from_rotation, se3_exp
+from toolkit.geometry import quaternion_from_rotation, se3_adjoint, se3_exp
 
 # Heading and forward position are the least certain (rad, m); and the position depends on the heading.
 ROOT = np.diag([2e-3, 2e-3, 1e-2, 0.3, 0.05, 0.05])
@@ -101,6 +101,33 @@ def test_an_overconfident_estimate_is_no_wrong_convention(scene, vislam):
     run = run_of(vislam)
     assert run["metrics"]["nees_pose_mean"] > 50.0
     assert "said to be" not in run["notes"].get("nees_pose_mean", "")
+
+
+def reckoned(scene, times: float) -> Trajectory:
+    """Dead reckoning of the truth's motion with stated noise, of which so much is told: it errs as the rest of it."""
+    t_ns = scene.stamps(10.0)
+    true = scene.poses_at(t_ns)
+    root = 0.05 * ROOT
+    noise = se3_exp(np.random.default_rng(3).standard_normal((t_ns.size - 1, 6)) @ root.T)
+    poses, covs = [true[0]], [root @ root.T]
+    for step, error in zip(np.linalg.inv(true[:-1]) @ true[1:], noise, strict=True):
+        back = se3_adjoint(np.linalg.inv(step @ error))
+        poses.append(poses[-1] @ step @ error)
+        covs.append(back @ covs[-1] @ back.T + root @ root.T)
+    return Trajectory(t_ns, np.array(poses), cov=times * np.array(covs))
+
+
+@pytest.mark.parametrize("times", [1.0, 0.001])
+@pytest.mark.parametrize("said", CONVENTIONS)
+def test_covariances_show_by_how_they_follow_the_motion_what_they_mean(scene, vislam, said: str, times: float) -> None:
+    """Of an overconfident estimate as well, whose errors are not those that it states."""
+    written(reckoned(scene, times), said, "rot-pos/right")
+    note = run_of(vislam)["notes"].get("nees_pose_mean", "")
+    if said == "rot-pos/right":
+        assert "said to be" not in note
+    else:
+        assert re.match(rf"the covariances are said to be {said} and (fit the errors|follow the motion) only as ", note)
+        assert note.partition(" only as ")[2].startswith("rot-pos/right: ")
 
 
 def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam, capsys):
