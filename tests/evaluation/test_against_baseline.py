@@ -127,42 +127,30 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(scene, vis
     assert failures(vislam) == []
 
 
+GIVEN, BASE = "check --trajectories results --baseline", "check --trajectories results --baseline base.json"
+
+
 @pytest.mark.parametrize(
     ("words", "status", "wanted"),
     [
-        (("check", "--trajectories", "nowhere", "--baseline", "base.json"), 3, "nowhere: it is no folder"),
-        (("check", "--trajectories", "empty", "--baseline", "base.json"), 3, "no SEQUENCE.tum"),
-        (("check", "--trajectories", "results", "--baseline", "spoilt.json"), 3, "bounds.ate_yaw_m is not among"),
-        (("check", "--trajectories", "results", "--baseline", "truth/lap.tum"), 3, "cannot be read as JSON"),
-        (("check", "--baseline", "base.json", "--truth", "truth"), 2, "--truth goes with --trajectories"),
-        (("check", "--trajectories", "results", "--baseline", "estimators.json"), 3, "leave --trajectories out"),
-        (("check", "--baseline", "base.json"), 3, "is a baseline of trajectories; check it with --trajectories DIR"),
-        (("check", "--baseline", "empty"), 3, "empty: it holds no baseline (*.json); make the baseline with"),
-        (
-            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "lop=truth/lap.tum"),
-            3,
-            "--truth names the truth of lop: no sequence is called lop (did you mean lap?)",
-        ),
-        (
-            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "lap=truth/lop.tum"),
-            3,
-            "--truth lap=truth/lop.tum: there is no such file; check the path",
-        ),
-        (
-            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "nowhere"),
-            3,
-            "nowhere: there is no such truth; give a file, or a folder that has SEQUENCE.tum",
-        ),
-        (
-            ("check", "--trajectories", "results", "--baseline", "base.json", "--junit", "same", "--json", "./same"),
-            2,
-            "--junit and --json are files of their own",
-        ),
-        (("baseline", "--trajectories", "results"), 3, "lap: no truth is given; name it with --truth"),
-        (("baseline", "--trajectories", "results", "--truth", "results"), 3, "results: it has 5 truths for maze"),
-        (("baseline", "--trajectories", "truth", "--truth", "truth", "--plan"), 3, "no sequence has 3 runs"),
-        (("baseline", "drive", "--trajectories", "results"), 2, "--trajectories takes no SEQUENCE"),
-        (("baseline", "drive", "--gap", "3"), 2, "--gap, --bound and --plan go with --trajectories"),
+        ("check --trajectories nowhere --baseline base.json", 3, "nowhere: it is no folder"),
+        ("check --trajectories empty --baseline base.json", 3, "no SEQUENCE.tum"),
+        (f"{GIVEN} spoilt.json", 3, "bounds.ate_yaw_m is not among"),
+        (f"{GIVEN} truth/lap.tum", 3, "cannot be read as JSON"),
+        (f"{GIVEN} estimators.json", 3, "leave --trajectories out"),
+        ("check --baseline base.json --truth truth", 2, "--truth goes with --trajectories"),
+        ("check --baseline base.json", 3, "is a baseline of trajectories; check it with --trajectories DIR"),
+        ("check --baseline empty", 3, "empty: it holds no baseline (*.json); make the baseline with"),
+        (f"{BASE} --truth lop=truth/lap.tum", 3, "--truth names the truth of lop: no sequence is called lop (did you"),
+        (f"{BASE} --truth lap=truth/lop.tum", 3, "--truth lap=truth/lop.tum: there is no such file; check the path"),
+        (f"{BASE} --truth nowhere", 3, "nowhere: there is no such truth; give a file, or a folder that has"),
+        (f"{BASE} --truth truth --truth results", 2, "--truth names two folders, truth and results; give one"),
+        (f"{BASE} --junit same --json ./same", 2, "--junit and --json are files of their own"),
+        ("baseline --trajectories results", 3, "lap: no truth is given; name it with --truth"),
+        ("baseline --trajectories results --truth results", 3, "results: it has 5 truths for maze"),
+        ("baseline --trajectories truth --truth truth --plan", 3, "no sequence has 3 runs"),
+        ("baseline drive --trajectories results", 2, "--trajectories takes no SEQUENCE"),
+        ("baseline drive --gap 3", 2, "--gap, --bound and --plan go with --trajectories"),
     ],
 )
 def test_trouble_is_reported_in_one_line(vislam, capsys, words, status, wanted):
@@ -171,7 +159,7 @@ def test_trouble_is_reported_in_one_line(vislam, capsys, words, status, wanted):
     spoilt["bounds"]["ate_yaw_m"] = 5.0
     Path("spoilt.json").write_text(json.dumps(spoilt))
     Path("estimators.json").write_text('{"schema": "vislam.baseline/1"}')
-    assert vislam(*words) == status
+    assert vislam(*words.split()) == status
     printed = capsys.readouterr().err
     assert printed.count("\n") == 1
     assert wanted in printed

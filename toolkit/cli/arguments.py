@@ -123,9 +123,13 @@ class Group(NamedTuple):
             one.add_to(group)
 
 
-def arg(usage: str, help: str, kind: Callable[[str], Any] | None = str, **how: Any) -> Argument:
-    """Return an argument with a value, named as ``--out DIR`` or ``sequences SEQUENCE``; a default ends its help."""
+def arg(usage: str, help: str, kind: Callable[[str], Any] | None = str, sets: str = "", **how: Any) -> Argument:
+    """Return an argument with a value, named as ``--out DIR`` or ``sequences SEQUENCE``; a default ends its help.
+
+    One that ``sets`` a setting is short for it; a command line has its value as OPTION=KEY.
+    """
     name, _, metavar = usage.partition(" ")
+    how |= {"dest": f"{name}={sets}"} if sets else {}
     default = how.get("default")
     shown = f"{default:g}" if isinstance(default, float) else default
     end = "" if default in (None, (), []) else f" (default: {shown})"
@@ -281,23 +285,14 @@ REPAIR = Group(
 )
 
 
-def setting(key: str, made: Argument) -> Argument:
-    """Return the option as one that is short for the setting ``key``; a command line has its value as OPTION=KEY."""
-    return Argument(made.name, {**made.how, "dest": f"{made.name}={key}"})
-
-
-TOPICS = setting(
-    "frontend.topics",
-    arg(
-        "--topics ROLE=TOPIC,...",
-        f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
-        topics,
-    ),
+TOPICS = arg(
+    "--topics ROLE=TOPIC,...",
+    f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
+    topics,
+    sets="frontend.topics",
 )
-TRACKS = setting(
-    "frontend.tracks",
-    choice("--tracks", ("auto", "images", "simulated"), "made of images, or simulated along the truth (default: auto)"),
-)
+_TRACKS = ("auto", "images", "simulated")
+TRACKS = choice("--tracks", _TRACKS, "of images, or along the truth (default: auto)", sets="frontend.tracks")
 RECORDING = (
     arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
     REPAIR,
@@ -320,8 +315,8 @@ class _Once(argparse.Action):
 
 SETTINGS = (
     arg("--config FILE", "settings in TOML, or the manifest.json of a run to repeat", Path, action=_Once),
-    setting("outliers.policy", arg("--outliers POLICY", "how outliers are treated (see docs/settings.md)")),
-    setting("window.lag_s", arg("--window SECONDS", "length of the windows of estimators", positive_seconds)),
+    arg("--outliers POLICY", "how outliers are treated (see docs/settings.md)", sets="outliers.policy"),
+    arg("--window SECONDS", "length of the windows of estimators", positive_seconds, sets="window.lag_s"),
     arg("--set KEY=VALUE", "one setting (see 'vislam list settings'); may be repeated", action="append", default=[]),
 )
 

@@ -33,7 +33,6 @@ from toolkit.cli.arguments import (
     output,
     requested_changes,
     seconds_from_start,
-    setting,
 )
 from toolkit.errors import VislamError, printable
 
@@ -52,18 +51,12 @@ SEQUENCES = ("drive", "kitti00")
 _HOW = (
     *PART,
     REPAIR,
-    setting(
-        "start",
-        choice("--start", ("measurements", "truth"), "source of the first state, labelled (default: measurements)"),
-    ),
+    choice("--start", ("measurements", "truth"), "source of the first state (default: measurements)", sets="start"),
     TRACKS,
     TOPICS,
-    setting("first_seed", arg("--seed N", "of simulated sequences (default: 0)", at_least(0))),
-    setting("seeds", arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1))),
-    setting(
-        "vary",
-        choice("--vary", ("noise", "world"), "what a seed draws: the noise, or the whole world too (default: noise)"),
-    ),
+    arg("--seed N", "of simulated sequences (default: 0)", at_least(0), sets="first_seed"),
+    arg("--seeds N", "repeat simulated sequences over N seeds, from --seed", at_least(1), sets="seeds"),
+    choice("--vary", ("noise", "world"), "what a seed draws: noise, or the whole world (default: noise)", sets="vary"),
     *SETTINGS,
 )
 _SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
