@@ -20,7 +20,8 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth
 from toolkit.errors import DataError, VislamError
 from toolkit.estimator import Estimator, Setup
-from toolkit.experiment import Comparison, Plan
+from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.pipeline import Plan
 from toolkit.metrics import describe
 from toolkit.registry import LADDER, defaults, find
 from toolkit.report.comparison_table import comparison_table

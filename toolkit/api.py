@@ -23,10 +23,11 @@ from msgspec import Meta
 from toolkit.answers import Output, Run
 from toolkit.errors import VislamError, did_you_mean, no_such, type_of
 from toolkit.estimator import Build
-from toolkit.experiment import Comparison, Plan, Record
-from toolkit.experiment import run as run_plan
+from toolkit.experiment.comparison import Comparison, Record
 from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
 from toolkit.experiment.explanation import Explanation, default_ends, run_explanation
+from toolkit.experiment.pipeline import Plan
+from toolkit.experiment.pipeline import run as run_plan
 from toolkit.experiment.sweep import Sweep, run_sweep
 from toolkit.progress import silent
 from toolkit.registry import discover, find_all

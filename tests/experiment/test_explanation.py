@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit
-from toolkit.experiment import Plan, recording
+from toolkit.experiment import recording
 from toolkit.experiment.explanation import ERROR, GATE, Explanation, run_explanation
+from toolkit.experiment.pipeline import Plan
 from toolkit.report.explanation import explanation_document
 from toolkit.settings.reading import settings_of
 

@@ -8,7 +8,8 @@ import pytest
 from toolkit.audit import Audit, Finding
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
-from toolkit.experiment import Plan, recording, run
+from toolkit.experiment import recording
+from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measurements import MotionNoise
 from toolkit.sequence import Observations, Sequence

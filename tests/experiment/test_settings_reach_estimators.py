@@ -7,7 +7,7 @@ import pytest
 
 from toolkit import discovery, runner
 from toolkit.errors import EstimatorError
-from toolkit.experiment import Plan, prepared_cases, run
+from toolkit.experiment.pipeline import Plan, prepared_cases, run
 from toolkit.experiment.workers import Workers
 from toolkit.registry import ENTRY_POINT_GROUP, find
 from toolkit.settings.reading import settings_of

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from toolkit.cli import main
-from toolkit.experiment import Plan, run
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.pipeline import Plan, run
 from toolkit.noise import card_of, measured_noise
 from toolkit.report.card import card_lines, card_record
 from toolkit.report.comparison_text import comparison_text, report_text

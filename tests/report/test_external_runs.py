@@ -14,8 +14,9 @@ from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
-from toolkit.experiment import Comparison, Plan, run
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.references import ExternalFile, external_runs, reference_runs
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp

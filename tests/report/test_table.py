@@ -10,9 +10,9 @@ import pytest
 from tests.report.conftest import rescored
 from toolkit.audit import Finding
 from toolkit.errors import VislamError
-from toolkit.experiment import Plan, run
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.pipeline import Plan, run
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Scores, known_metrics
 from toolkit.noise import MeasuredNoise, MotionScale, TrackWeight

@@ -112,8 +112,8 @@ def compare(options: argparse.Namespace) -> int:
     with report, metrics, trajectories, landmarks and figures.
     """
     from toolkit.cli.progress_display import of_this_process, print_above
-    from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.experiment.configuration import plan_of
+    from toolkit.experiment.pipeline import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.files.documents import to_line
     from toolkit.report.comparison_table import requested_columns
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
