@@ -1,6 +1,6 @@
 """Faults that show only where vision is compared with the measured motion, at once or from some time on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -10,18 +10,7 @@ from scipy.special import stdtrit
 
 from toolkit.audit.alignment import ForceBesideCamera
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
-from toolkit.audit.intervals import (
-    FORCES,
-    LEAST_INTERVALS,
-    MOST_FORCE_RATIO,
-    MOST_RATIO,
-    RATES,
-    SPEEDS,
-    Intervals,
-    force_ratio,
-    rotation_ratio,
-    speed_ratio,
-)
+from toolkit.audit.intervals import FORCE, LEAST_INTERVALS, RATE, SPEED, Intervals
 from toolkit.audit.one_step import errors_are_independent
 from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, MEDIAN_TO_MEAN_ERROR, Scalar, median_error
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -35,9 +24,6 @@ from toolkit.sequence import Sequence
 RATIO_SIGMAS = 5.0
 # Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
 NEAR_UNIT = 0.08
-# Units that are named and not converted: their factors are too near to those of other units or other faults.
-OTHER_SPEEDS, OTHER_FORCES = {"knots": 1.944}, {"ft/s^2": 3.281}
-OTHER_RATES = {"turns a minute": 30.0 / np.pi, "mrad/s": 1000.0}
 # Velocities in the faster half whose median angle exceeds this have a wrong sign, or axes that no repair corrected.
 MOST_ANGLE_DEG = 60.0
 
@@ -75,26 +61,14 @@ def _direction(intervals: Intervals) -> Iterator[str]:
 
 def _ratios(sequence: Sequence, intervals: Intervals) -> Iterator[str]:
     """Yield a description of each size of the motion that differs from the camera's, or gravity, by a factor."""
-    speed, rotation, force = speed_ratio(intervals), rotation_ratio(intervals), force_ratio(sequence)
-    if speed is not None and _is_off(speed, 1.0 / MOST_RATIO, MOST_RATIO):
-        meant = _units_meant(speed.value, SPEEDS | OTHER_SPEEDS)
-        yield f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}"
-    if _is_off(rotation, 0.0, MOST_RATIO):
-        meant = _units_meant(rotation.value, RATES | OTHER_RATES)
-        yield f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}"
-    if force is not None and _is_off(force, 1.0 / MOST_FORCE_RATIO, MOST_FORCE_RATIO):
-        meant = _units_meant(force.value, FORCES | OTHER_FORCES)
-        yield f"the accelerometer reads {force.value:.3g} times gravity (median){meant}"
-
-
-def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:
-    units = [unit for unit, factor in factors.items() if abs(ratio / factor - 1.0) < NEAR_UNIT]
-    return f", as if in {' or '.join(units)}" if units else ""
-
-
-def _is_off(ratio: Scalar, least: float, most: float) -> bool:
-    margin = RATIO_SIGMAS * ratio.error
-    return not least - margin <= ratio.value <= most + margin
+    for quantity in (SPEED, RATE, FORCE):
+        ratio = quantity.ratio_of(sequence, intervals)
+        margin = np.inf if ratio is None else RATIO_SIGMAS * ratio.error
+        if ratio is None or quantity.least - margin <= ratio.value <= quantity.most + margin:
+            continue
+        factors = {**quantity.units, **quantity.named}
+        units = [unit for unit, factor in factors.items() if abs(ratio.value / factor - 1.0) < NEAR_UNIT]
+        yield quantity.summary.format(*ratio) + (f", as if in {' or '.join(units)}" if units else "")
 
 
 # A mean is reported from this many of its standard deviations on; the largest mean of a sound recording has 3 to 9.

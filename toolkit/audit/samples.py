@@ -9,10 +9,10 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.intervals import (
-    FORCES,
-    RATES,
-    SPEEDS,
-    Intervals,
+    FORCE,
+    RATE,
+    SPEED,
+    Quantity,
     force_ratio,
     is_from_scatter,
     ratio_of_speeds,
@@ -496,8 +496,6 @@ def _range_of_force(sequence: Sequence) -> float:
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 # A unit is named where the ratio is within this factor of the unit's, and this many standard errors from one.
 WITHIN_FACTOR, UNIT_SIGMAS = 1.25, 5.0
-# Vision's speed is accurate to 5 % in sound recordings, which distinguishes km/h from ft/s, a factor of 1.1 apart.
-WITHIN_FACTOR_OF_SPEED = 1.08
 # The stamps are wrong if the ratios of speeds and rates are beyond the first factor, and alike within the second.
 LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
 # Limits of the time (s) between two frames of a vehicle's camera.
@@ -526,7 +524,7 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
     """
     now, stamps = evidence, _stamps(evidence) or _frame_rate(evidence)
     found = [] if stamps is None else [stamps]
-    of_samples = (partial(_of_samples, quantity=quantity) for quantity in _QUANTITIES)
+    of_samples = (partial(_of_samples, quantity=quantity) for quantity in (SPEED, RATE, FORCE))
     measures: tuple[Callable[[Evidence], _WrongUnit | None], ...] = (_baseline, _lever_arm, *of_samples, _truth)
     for measure in measures if stamps is None else ():
         wrong = measure(now)
@@ -610,51 +608,16 @@ def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
     return _WrongUnit(f"{summary}: its translation is in {unit}", remedy)
 
 
-class _Quantity(NamedTuple):
-    """A quantity of the samples that may be in another unit: its ratio to another source, and the units' factors."""
-
-    summary: str
-    ratio_of: Callable[[Sequence, Intervals | None], Scalar | None]
-    factors: Mapping[str, float]
-    within: float
-    columns: slice
-    by_camera: bool = True
-
-
-_QUANTITIES = (
-    _Quantity(
-        "the samples' speed is {:.3g} +- {:.1g} times the camera's",
-        lambda _, intervals: speed_ratio(intervals),
-        SPEEDS,
-        WITHIN_FACTOR_OF_SPEED,
-        _LINEAR,
-    ),
-    _Quantity(
-        "the gyro turns {:.3g} +- {:.1g} times as fast as the camera",
-        lambda _, intervals: None if intervals is None else rotation_ratio(intervals),
-        RATES,
-        WITHIN_FACTOR,
-        _ANGULAR,
-    ),
-    _Quantity(
-        "the accelerometer reads {:.3g} times gravity (median)",
-        lambda sequence, _: None if _lacks_gravity(sequence) else force_ratio(sequence),
-        FORCES,
-        WITHIN_FACTOR,
-        _LINEAR,
-        by_camera=False,
-    ),
-)
-
-
-def _of_samples(evidence: Evidence, quantity: _Quantity) -> _WrongUnit | None:
+def _of_samples(evidence: Evidence, quantity: Quantity) -> _WrongUnit | None:
     """Judge a quantity of the samples; both halves of the recording must have the unit."""
     sequence, intervals = evidence.sequence, evidence.intervals
+    if quantity is FORCE and _lacks_gravity(sequence):
+        return None
     ratio = quantity.ratio_of(sequence, intervals)
-    unit = None if ratio is None else _in_other_unit(ratio, quantity.factors, quantity.within, UNIT_SIGMAS)
+    unit = None if ratio is None else _in_other_unit(ratio, quantity.units, quantity.within, UNIT_SIGMAS)
     if ratio is None or unit is None:
         return None
-    factor, summary = quantity.factors[unit], f"{quantity.summary.format(*ratio)}: it is in {unit}"
+    factor, summary = quantity.units[unit], f"{quantity.summary.format(*ratio)}: it is in {unit}"
     if quantity.by_camera and intervals is not None:
         first = np.arange(intervals.interval.size) < intervals.interval.size // 2
         halves = (quantity.ratio_of(sequence, intervals.select(rows)) for rows in (first, ~first))
