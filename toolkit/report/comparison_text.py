@@ -42,34 +42,25 @@ _MOST_NOTES, _MOST_LINES = 3, 7
 
 _HOW_TO_READ_ONE = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
-estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like.
-A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
-read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
-the matched pairs and the coverage above the table, or in it where the rows differ. `metrics.json` has every metric,
-and for each one that is missing the reason."""
+estimator estimated at each frame, a **final** line on its answer after the last frame; compare like with like. A line
+named for a file, as in `openvins (est.txt)`, was not run here but read from it and scored by the same rules. An error
+over half a recording is not half an error: read it beside the matched pairs and the coverage. `metrics.json` has every
+metric, and for each one that is missing the reason."""
 _HOW_TO_READ_MANY = """\
 Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
-means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
-quartiles over all runs. The runs that did not end well are named above and are in no mean; the median over all runs in
-the notes has them, each as infinitely bad.
-
-The NEES band is the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided 95 %
-chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their errors,
-so the share itself scatters widely from one set of seeds to another. `ekf` and other filters that neglect correlations
-stay above it by design (docs/metrics.md)."""
+means over the runs that are ok; `seeds.json` has each seed's value of every metric, and quartiles over all runs. The
+NEES band is the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided 95 %
+chi-square band for that many runs: 95 % on average for a consistent estimator, with much scatter between sets of
+seeds."""
 _HOW_TO_READ = """\
-`overconfident` or `timid` beside how a run ended: its errors, or without a truth its innovations, are larger or smaller
-than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that rejected many;
-`contradicted`: the corrections by its tracks have one direction, by more than its covariance allows. The notes have the
-figures.
+Beside how a run ended, `overconfident` and `timid` say that its errors, or without a truth its innovations, are larger
+or smaller than the uncertainty it states allows; `heavy-tailed` and `contradicted` are in the notes.
 
 The verdict names a winner only where a paired test supports it: over seeds by the seeds, of one run by the drift over
 up to 40 stretches of the path, or by withheld tracks in ten stretches of time. Each interval has 99 %.
 
-Causal and held-out describe what an estimator is given. Before its first packet, the same for all: with raw IMU
-samples the start, where the recording has none, is found from about the first 1.5 s of sightings that are not
-withheld, so causal answers of that time use a little of their future; and the audit looks for faults in the whole
-recording, withheld tracks included. Its findings are above."""
+What no estimator is given: withheld tracks, and in a causal answer the future; only the start of raw IMU recordings
+uses the first 1.5 s, and the audit the whole recording, the same for all."""
 
 
 def comparison_text(comparison: Comparison, columns: Columns = None, width: Width = WIDTH) -> str:

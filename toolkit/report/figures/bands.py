@@ -69,25 +69,18 @@ class Drawn(NamedTuple):
 
 
 def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: str, title: str) -> Figure:
-    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it.
-
-    A panel whose values leave the figure says how large they become.
-    """
+    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it."""
     figure, panels = style.panels_of(panels_for)
     shares: dict[str, list[float]] = {}
-    largest: dict[str, float] = {}
     least = most = 1.0
     for estimator, colour, output, series in drawn:
         axes, shown = panels[estimator], np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
         axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(output), linewidth=1.0)
         shares.setdefault(estimator, []).append(series.in_band_percent)
-        largest[estimator] = np.nanmax([largest.get(estimator, 0.0), *series.value])
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
-        text = ", ".join(f"{percent:.0f} %" for percent in percents)
-        beyond = f", up to {largest[estimator]:.0e}" if largest[estimator] > RANGE[1] else ""
-        style.annotate(panels, estimator, (f"{text} in band{beyond}", f"{text}{beyond}", text))
+        style.annotate(panels[estimator], ", ".join(f"{percent:.0f} %" for percent in percents))
     style.scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     style.finish(
         figure,
@@ -96,7 +89,7 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
         title,
         [
             *style.output_entries({one.output for one in drawn}),
-            Entry("95 % band", (Patch(color=style.BAND_COLOUR, linewidth=0.0),)),
+            Entry("95 % band", Patch(color=style.BAND_COLOUR, linewidth=0.0)),
         ],
     )
     return figure
@@ -166,7 +159,7 @@ def _errors(over: Comparison) -> NamedFigure:
         axes.plot(t_s, median, color=colour, linestyle=style.line_of(kind), linewidth=1.2)
         kinds.add(kind)
     title = f"{over.name}, {len(over.seeds)} seeds: position error from the common start"
-    quartiles = Entry("quartiles (lines: medians)", (Patch(color=style.MUTED_COLOUR, alpha=0.2),))
+    quartiles = Entry("quartiles (lines: medians)", Patch(color=style.MUTED_COLOUR, alpha=0.2))
     style.finish(figure, panels, "position error [m]", title, [*style.output_entries(kinds), quartiles])
     next(iter(panels.values())).set_ylim(bottom=0.0)
     caption = (
@@ -217,7 +210,7 @@ def draw_reprojection(comparison: Comparison) -> Iterator[NamedFigure]:
         for kind, error_px in kinds.items():
             _histogram(panels[name], kind, error_px, style.colour_of(comparison, name))
         medians = " / ".join(f"{float(np.median(error_px)):.2f}" for error_px in kinds.values())
-        style.annotate(panels, name, (f"median {medians} px", f"{medians} px"))
+        style.annotate(panels[name], f"{medians} px")
     first = next(iter(panels.values()))
     first.set_xscale("log")
     first.set_xlim(_SMALLEST_PX, CAP_PX)
@@ -243,7 +236,7 @@ def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
         "held-out": Line2D([], [], color=style.MUTED_COLOUR, linewidth=1.5),
     }
     shown = {kind for kinds in drawable.values() for kind in kinds}
-    return [Entry(kind, (sample,)) for kind, sample in samples.items() if kind in shown]
+    return [Entry(kind, sample) for kind, sample in samples.items() if kind in shown]
 
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:

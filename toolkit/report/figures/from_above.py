@@ -163,10 +163,10 @@ def _entries(
     entries = [] if truth is None else [Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH)]
     for run in runs:
         line = Line2D([], [], linewidth=1.8, **style.stroke_of(comparison, run.estimator, shown_output(run)))
-        entries.append(Entry(_name(run), (line,)))
+        entries.append(Entry(_name(run), line))
     if mapper is not None and len(mapper.landmarks):
         dot = Line2D([], [], color=style.LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
-        entries.append(Entry(f"landmarks of {mapper.estimator}", (dot,)))
+        entries.append(Entry(f"landmarks of {mapper.estimator}", dot))
     return entries
 
 

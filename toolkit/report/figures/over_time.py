@@ -192,7 +192,7 @@ def _entries(found: list[tuple[Row, Components]], what: str, colour: str) -> lis
         if one.sigma is not None:
             alpha = _BAND_ALPHA if style.shown_as(row) == "final" else 0.0
             band = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
-            entries.append(Entry(f"{name}: ± 3 standard deviations", (band,)))
+            entries.append(Entry(f"{name}: ± 3 standard deviations", band))
     return entries
 
 

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
-from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
@@ -125,41 +124,31 @@ def label_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 
 
 class Entry(NamedTuple):
-    """An entry of a legend: what it is called, and samples of the lines that are drawn for it, side by side."""
+    """An entry of a legend: what it is called, and a sample of what is drawn for it."""
 
     label: str
-    samples: tuple[Artist, ...]
+    sample: Artist
 
     @classmethod
     def of_line(cls, label: str, colour: str, dashes: Dashes = "-", width: float = 1.5) -> Self:
-        """Return the entry of a single line."""
-        return cls(label, (Line2D([], [], color=colour, linestyle=dashes, linewidth=width),))
+        """Return the entry of a line."""
+        return cls(label, Line2D([], [], color=colour, linestyle=dashes, linewidth=width))
 
 
-def entries_of(comparison: "Comparison", drawn: Iterable[tuple[str, Output]]) -> list[Entry]:
-    """Return an entry for each estimator of which outputs are drawn, the final one's line first."""
-    outputs: dict[str, list[Output]] = {}
-    for name, output in drawn:
-        outputs.setdefault(name, []).append(output)
-    return [
-        Entry(name, tuple(_sample(comparison, name, output) for output in sorted(kinds, reverse=True)))
-        for name, kinds in outputs.items()
-    ]
-
-
-def _sample(comparison: "Comparison", name: str, output: Output) -> Line2D:
-    return Line2D([], [], linewidth=1.8, **stroke_of(comparison, name, output))
+def entries_of(comparison: "Comparison", drawn: Sequence[tuple[str, Output]]) -> list[Entry]:
+    """Return an entry for each estimator of which outputs are drawn, with the line of the final one where it is."""
+    output_of = dict(sorted(drawn, key=lambda pair: pair[1]))  # causal before final
+    strokes = {name: stroke_of(comparison, name, output_of[name]) for name, _ in drawn}
+    return [Entry.of_line(name, stroke["color"], stroke["linestyle"], 1.8) for name, stroke in strokes.items()]
 
 
 def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **place: Any) -> Legend:
     """Put a legend somewhere (``loc`` and the like), with as many columns as there is room for unless it is said."""
-    long = 2.4 if all(len(entry.samples) == 1 for entry in entries) else 5.2
-    widest_pt = LEGEND_PT * (long + 2.5 + _EM_A_LETTER * max(len(entry.label) for entry in entries))
+    widest_pt = LEGEND_PT * (2.4 + 2.5 + _EM_A_LETTER * max(len(entry.label) for entry in entries))
     return owner.legend(
-        handles=[entry.samples if len(entry.samples) > 1 else entry.samples[0] for entry in entries],
+        handles=[entry.sample for entry in entries],
         labels=[entry.label for entry in entries],
-        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.8)},
-        handlelength=long,
+        handlelength=2.4,
         ncols=columns or max(1, min(len(entries), int(WIDTH_IN * 72.0 / widest_pt))),
         columnspacing=1.4,
         frameon=False,
@@ -231,11 +220,9 @@ def scale_by_decades(axes: Axes, low: float, high: float, which: Literal["x", "y
     axis.set_minor_locator(NullLocator())
 
 
-def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
-    """Write above a panel, to the right: the first of the texts for which there is room."""
-    room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
-    fitting = next((one for one in texts if len(name) + len(one) <= room), texts[-1])
-    panels[name].set_title(fitting, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+def annotate(axes: Axes, text: str) -> None:
+    """Write above a panel, to the right."""
+    axes.set_title(text, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
 
 
 def output_entries(outputs: Collection[Output]) -> list[Entry]:

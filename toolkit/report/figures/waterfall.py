@@ -99,7 +99,7 @@ def _key(found: ExplanationRecord) -> list[Entry]:
         f"an ingredient at the base nearest to {goal}, drawn from the line of {goal}": (_LAST, 1.0),
         "pale: no more than chance": (_FIRST, _PALE),
     }
-    bars = [Entry(label, (Patch(color=colour, alpha=alpha),)) for label, (colour, alpha) in named.items()]
+    bars = [Entry(label, Patch(color=colour, alpha=alpha)) for label, (colour, alpha) in named.items()]
     return [*bars, Entry.of_line(f"95 % interval over {over(found)}{what}", "black", width=1.0)]
 
 
