@@ -39,7 +39,6 @@ FIGURES = {
     "trajectory_error.png": ("realistic", "figures/trajectory_error.png"),
     "components_ekf.png": ("realistic", "figures/components_ekf.png"),
     "components_batch.png": ("realistic", "figures/components_batch.png"),
-    "reprojection.png": ("realistic", "figures/reprojection.png"),
     "against_bound.png": ("bound", "figures/against_bound.png"),
     "nees_over_seeds.png": ("seeds", "figures/nees_over_seeds.png"),
     "report_page.png": ("realistic", "page.png"),

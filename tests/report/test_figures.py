@@ -91,7 +91,7 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert "astray" in position.get_title(loc="right")
 
 
-@pytest.mark.parametrize("draw", [bands.draw_reprojection, over_time.draw_errors, from_above.draw_all])
+@pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)

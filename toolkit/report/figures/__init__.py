@@ -42,7 +42,6 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
         over_time.draw_bound,
     )
     more = (
-        bands.draw_reprojection,
         bands.draw_nis,
         from_above.draw_trajectories,
         over_time.draw_other_components,
