@@ -164,13 +164,17 @@ def body_of(
     what = str(file.path)
     check_clock(what, reference, t_ns)
     _check_length_unit(what, reference, t_ns, file.T_world_imu[:, :3, 3])
-    if matched is not None:
-        # The effect of a reflection on orientations resembles other mistakes in them, so it is checked first.
-        check_mirrored(what, *matched)
-    turn = _body(file, reference, t_ns, matched, readings)
-    if matched is not None and (turn is None or not turn.is_other_body):
-        check_axes(what, *matched)
-    return turn
+    fit = None if matched is None else _fit(*matched)
+    other_axes = None if fit is None else _exchange(fit)
+    # The effect of a reflection on orientations resembles other mistakes in them, so it is refused first.
+    is_mirrored = fit is not None and fit.is_mirrored
+    turn = None if is_mirrored else _body(file, reference, t_ns, matched, fit, readings)
+    if other_axes is None or (turn is not None and turn.is_other_body):
+        return turn
+    raise DataError(
+        f"{what}: it fits the truth with {other_axes}, and not as given; one of the two is written in other axes than "
+        "it is read in: write both in the same"
+    )
 
 
 # Clock and unit of length --------------------------------------------------------------------------------------------
@@ -386,6 +390,7 @@ def _body(
     reference: Reference,
     t_ns: IntArray,
     matched: tuple[Array, Array] | None,
+    fit: "_Fit | None",
     readings: tuple[Reading, ...],
 ) -> BodyTurn | None:
     """Judge every reading by what it leaves of the orientations once the positions are laid over each other.
@@ -394,7 +399,6 @@ def _body(
     """
     what, order = str(file.path), file.other_order
     others = (*(() if order is None else (in_other_order(order),)), _INVERTED, _BACKWARDS, *readings)
-    fit = None if matched is None else _fit(*matched)
     if fit is not None and fit.turns:
         given, left = fit.body, {one: fit.reread(one).body for one in others}
         most_rad = min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
@@ -530,39 +534,20 @@ def exchanges() -> tuple[Exchange, ...]:
     return tuple(exchange for _, exchange in sorted(found, key=lambda one: one[0]))
 
 
-def check_mirrored(what: str, truth: Array, estimate: Array) -> None:
-    """Raise DataError where positions of poses (n, 4, 4) fit the truth's (n, 4, 4), of the same times, mirrored alone.
+def exchanged(truth: Array, estimate: Array) -> str | None:
+    """Say under which exchange of axes alone poses (n, 4, 4) fit the truth's (n, 4, 4), of the same times.
 
-    The effect of a reflection on orientations resembles other mistakes in them, so it is checked first.
+    None where they do as given, or under none.
     """
     fit = _fit(truth, estimate)
-    if fit is not None and fit.is_mirrored:
-        raise _refused(what, _named(fit) or "its positions mirrored")
+    return None if fit is None else _exchange(fit)
 
 
-def check_axes(what: str, truth: Array, estimate: Array) -> None:
-    """Raise DataError where poses (n, 4, 4) fit the truth's (n, 4, 4), of the same times, in exchanged axes alone."""
-    found = exchanged(truth, estimate)
-    if found is not None:
-        raise _refused(what, found)
-
-
-def exchanged(truth: Array, estimate: Array) -> str | None:
-    """Say under which exchange of axes alone poses fit the truth's; None where they do as given, or under none."""
-    fit = _fit(truth, estimate)
-    if fit is None:
-        return None
+def _exchange(fit: "_Fit") -> str | None:
     if fit.is_mirrored:
         return _named(fit) or "its positions mirrored"
     turns_alike = fit.turned_rad(_AS_GIVEN) < _WRONG_RAD or fit.body.scatter_rad < _FITTING_RAD
     return None if turns_alike or not fit.turns else _named(fit)
-
-
-def _refused(what: str, found: str) -> DataError:
-    return DataError(
-        f"{what}: it fits the truth with {found}, and not as given; one of the two is written in other axes than it is "
-        "read in: write both in the same"
-    )
 
 
 def _named(fit: "_Fit") -> str | None:
