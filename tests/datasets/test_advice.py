@@ -660,7 +660,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (
             both(text("all.tar", bytes(257) + b"ustar" + bytes(9)), say("check-data", "@/all.tar")),
-            "unpack it and name what was in it",
+            "and name what was in it",
         ),
         (say("check-data", "@/.."), "is not a recording, but contains some: name drive.odometry in it"),
         (say("check-data", "https://example.org/a.npz"), "it is an address: download it and name the file"),

@@ -91,18 +91,18 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     """Return the recording that tables describe, as :func:`save` takes them; raises DataError as it does."""
     sightings, measured = _columns("tracks", tracks), _columns("motion", motion)
     place, calibration = _calibration(rig)
-    frames_t_ns, observations, unseen = _observations(sightings)
+    fields, (frames_t_ns, observations, unseen) = _fields(place, calibration), _observations(sightings)
     samples, noise, joined = _motion(measured, place, calibration.get(_NOISE, {}))
     facts = (*(() if _has_two_rows(sightings) else (ONE_ROW_FOR_BOTH,)), *unseen, *joined)
     sequence = Sequence(
         name=name,
-        rig=_rig(place, calibration, 2 if TWO_ROWS[0] in sightings.values else 1),
+        rig=_rig(fields, 2 if TWO_ROWS[0] in sightings.values else 1),
         noise=noise,
         frames_t_ns=frames_t_ns,
         observations=observations,
         motion=samples,
         provenance=Provenance("own-tables", ", ".join(str(table.what) for table in (sightings, measured)), facts),
-        gravity_world=_gravity(place, calibration),
+        gravity_world=fields.constant(_OPTIONAL[1], 3) if _OPTIONAL[1] in fields else np.array(GRAVITY_WORLD),
     )
     if truth is not None:
         sequence = with_truth(sequence, *_truth(truth))
@@ -257,8 +257,7 @@ def _array(value: Any) -> Any:
         return np.asarray(str(value))
 
 
-def _rig(place: Path, calibration: Mapping[str, Any], rows_averaged: int) -> StereoRig:
-    fields = _fields(place, calibration)
+def _rig(fields: Fields, rows_averaged: int) -> StereoRig:
     fields.require(*_RIG)
     fx_px, fy_px, cx_px, cy_px, baseline_m = (
         fields.positive(key) if key[0] in "fb" else fields.number(key) for key in _RIG[:-1]
@@ -266,11 +265,6 @@ def _rig(place: Path, calibration: Mapping[str, Any], rows_averaged: int) -> Ste
     sigma_px = fields.positive(_OPTIONAL[0]) if _OPTIONAL[0] in fields else TRACKED_PIXEL_SIGMA_PX
     cov_uv_px2 = sigma_px**2 * np.diag([1.0, 1.0, 1.0 / rows_averaged])
     return StereoRig(fx_px, fy_px, cx_px, cy_px, baseline_m, fields.rigid(_RIG[-1]), cov_uv_px2)
-
-
-def _gravity(place: Path, calibration: Mapping[str, Any]) -> Array:
-    fields = _fields(place, calibration)
-    return fields.constant(_OPTIONAL[1], 3) if _OPTIONAL[1] in fields else np.array(GRAVITY_WORLD)
 
 
 def _truth(given: Table) -> TruthRead:

@@ -9,17 +9,14 @@ from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular, open_input
 
-_ARCHIVES = {
-    b"\x1f\x8b": "gzip",
-    b"\x28\xb5\x2f\xfd": "zstd",
-    b"BZh": "bzip2",
-    b"\xfd7zXZ": "xz",
-    b"PK\x03\x04": "zip",
-    b"7z\xbc\xaf": "7-zip",
-}
+# What unpacks a file, by how it begins.
 _UNPACKED_BY = {
-    **{"gzip": "gunzip", "zstd": "unzstd", "bzip2": "bunzip2", "xz": "unxz"},
-    **{"zip": "unzip", "7-zip": "7z x", "tar": "tar xf"},
+    b"\x1f\x8b": "gunzip",
+    b"\x28\xb5\x2f\xfd": "unzstd",
+    b"BZh": "bunzip2",
+    b"\xfd7zXZ": "unxz",
+    b"PK\x03\x04": "unzip",
+    b"7z\xbc\xaf": "7z x",
 }
 # Archives of NumPy arrays, which need not be unpacked.
 _ARRAYS = ".npz"
@@ -58,10 +55,10 @@ def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
 
 def _packed_in(folder: Path) -> str:
     files = [entry for entry in islice(sorted(folder.iterdir()), _LOOKED_AT) if is_regular(entry)]
-    packed = {file.name: how for file in files if file.suffix != _ARRAYS and (how := _archive(file)) is not None}
+    packed = [f"{file.name} with {how}" for file in files if (how := _unpacked_by(file))]
     if not packed:
         return ""
-    named = printable(", ".join(f"{name} with {_UNPACKED_BY[how]}" for name, how in list(packed.items())[:_NAMED]))
+    named = printable(", ".join(packed[:_NAMED]))
     of_rosbag2 = any(ending in name for name in packed for ending in (".db3", ".mcap"))
     lost = " (metadata.yaml is missing; a single one is read without it)" if of_rosbag2 else ""
     return f"holds packed files: unpack {named}{lost} and remove what was packed; as it stands it is of no known format"
@@ -70,12 +67,13 @@ def _packed_in(folder: Path) -> str:
 def _of_file(path: Path) -> str:
     if path.stat().st_size == 0:
         return "the file is empty and so of no known format"
-    archive = None if path.suffix == _ARRAYS else _archive(path)
-    if archive is not None:
-        return f"is packed ({archive}), unpack it and name what was in it: as it stands it is of no known format"
-    if _is_trajectory(path):
-        return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
-    return ""
+    if how := _unpacked_by(path):
+        return f"is packed, unpack it with {how} and name what was in it: as it stands it is of no known format"
+    try:
+        read_poses(path)
+    except DataError:
+        return ""
+    return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
 
 
 def _recordings_in(path: Path, recognised: Callable[[Path], bool]) -> list[Path]:
@@ -90,16 +88,11 @@ def _recordings_in(path: Path, recognised: Callable[[Path], bool]) -> list[Path]
     return []
 
 
-def _archive(path: Path) -> str | None:
+def _unpacked_by(path: Path) -> str:
     with open_input(path) as file:
         begin = file.read(_TAR_AT + len(_TAR))
+    if path.suffix == _ARRAYS:
+        return ""
     if begin[_TAR_AT:] == _TAR:
-        return "tar"
-    return next((name for magic, name in _ARCHIVES.items() if begin.startswith(magic)), None)
-
-
-def _is_trajectory(path: Path) -> bool:
-    try:
-        return len(read_poses(path)) > 0
-    except DataError:
-        return False
+        return "tar xf"
+    return next((how for magic, how in _UNPACKED_BY.items() if begin.startswith(magic)), "")
