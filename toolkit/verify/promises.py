@@ -148,29 +148,21 @@ def copies_of(value: object) -> tuple[Array, ...]:
     return tuple(array.copy() for array in arrays_of(value))
 
 
-def look_ahead(watched: Watched, counts: tuple[int, ...] = ()) -> str:
+def look_ahead(watched: Watched) -> str:
     """Say at which frame an answer changes when later packets are withheld."""
-    frames = len(watched.online)
-    for count in counts or (2, frames // 2):
+    for count in (2, len(watched.online) // 2):
         early = answers(watched.build, watched.sequence.truncated(count))
         for k, (answer, full) in enumerate(zip(early, watched.online, strict=False)):
-            if difference(answer, full):
-                return (
-                    f"its answer to frame {k} differs where the packets from frame {count} on are withheld: "
-                    f"{difference(answer, full)}"
-                )
+            if found := difference(answer, full):
+                where = f"its answer to frame {k} differs where the packets from frame {count} on are withheld"
+                return f"{where}: {found}"
     return ""
 
 
-def other_answers(watched: Watched) -> str:
-    """Say at which frame a second run over the same packets gives another answer."""
-    return other_in_second_run(watched.packets, watched)
-
-
-def other_in_second_run(packets: tuple[Packet, ...], first: Watched) -> str:
-    """Say at which frame an estimator answers differently than before; empty where answers are the same."""
+def other_answers(first: Watched, packets: tuple[Packet, ...] = ()) -> str:
+    """Say at which frame a second run over the same packets, or others that are equal, gives another answer."""
     estimator = first.build(first.setup)
-    for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
+    for k, (packet, before) in enumerate(zip(packets or first.packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
             return f"a second run differs at frame {k}: {found}"
     found = difference(estimator.finish(), first.finished)
@@ -252,22 +244,17 @@ def not_finite(watched: Watched) -> str:
 
 def states_covariance(watched: Watched) -> bool:
     """Say whether any answer has a covariance."""
-    return any(e is not None and e.cov is not None for e in watched.online) or (
-        watched.finished.trajectory.cov is not None
-    )
+    return any(True for _ in _stated(watched))
 
 
 def unsound_covariance(watched: Watched) -> str:
     """Say which covariance is not finite, of a wrong size, not symmetric or not positive definite."""
-    for where, cov in _stated(watched):
-        found = covariance_fault(cov, COV_SIZES)
-        if found:
-            return f"the covariance of {where} {found}"
-    landmarks = watched.finished.landmarks
-    for i, cov in enumerate(() if landmarks.cov is None else landmarks.cov):
-        found = covariance_fault(cov, (3,))
-        if found:
-            return f"the covariance of landmark {i} {found}"
+    landmarks = watched.finished.landmarks.cov
+    of_landmarks = ((f"landmark {i}", cov) for i, cov in enumerate(() if landmarks is None else landmarks))
+    for stated, sizes in ((_stated(watched), COV_SIZES), (of_landmarks, (3,))):
+        for where, cov in stated:
+            if found := covariance_fault(cov, sizes):
+                return f"the covariance of {where} {found}"
     return ""
 
 
