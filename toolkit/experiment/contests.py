@@ -140,6 +140,12 @@ def accuracy_of(rows: Iterable[Row]) -> str:
     return _SE3 if tilted else _YAW
 
 
+def error_of(rows: Sequence[Row]) -> str:
+    """Return the key of the error that rows have: the ATE, or without a truth that of withheld tracks."""
+    key = accuracy_of(rows)
+    return key if any(row.value(key) is not None for row in rows) else HELD_OUT
+
+
 def _contest(
     question: Question, metric: str, rows: Iterable[Row], labels: tuple[str, ...], test: Compared
 ) -> Contest | None:

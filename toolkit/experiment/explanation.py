@@ -29,7 +29,7 @@ import numpy as np
 from toolkit.answers import Output
 from toolkit.errors import EstimatorError
 from toolkit.experiment.comparison import NEES, Row
-from toolkit.experiment.contests import HELD_OUT, accuracy_of
+from toolkit.experiment.contests import HELD_OUT, error_of
 from toolkit.experiment.grid import Grid, Trial, prepared_case, run_grid
 from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.recording import Prepared
@@ -309,8 +309,7 @@ def _all(found: Pairings) -> tuple[Variant, ...]:
 def explained(found: Pairings, grid: Grid) -> Explanation:
     """Return what the outcomes of all variants tell."""
     rows = {one: grid.row(one.trial, one.output) for one in _all(found)}
-    metric = accuracy_of(rows.values())
-    metric = metric if any(row.value(metric) is not None for row in rows.values()) else HELD_OUT
+    metric = error_of(list(rows.values()))
     measures = _over_seeds(metric) if len(grid.plan.seeds) > 1 else _over_stretches(metric)
     series = {(key, one): measure.values(row) for one, row in rows.items() for key, measure in measures.items()}
 

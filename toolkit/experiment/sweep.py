@@ -25,7 +25,7 @@ from toolkit.answers import Output
 from toolkit.audit import faults
 from toolkit.errors import no_such
 from toolkit.experiment.comparison import NEES, Row
-from toolkit.experiment.contests import COST, HELD_OUT, accuracy_of
+from toolkit.experiment.contests import COST, HELD_OUT, error_of
 from toolkit.experiment.grid import Grid, Trial, run_grid
 from toolkit.experiment.pipeline import Plan, located, workers_of
 from toolkit.experiment.recording import found_where_planted
@@ -152,9 +152,7 @@ class Sweep:
     @cached_property
     def metric(self) -> str:
         """The metric of the error: ATE, or without a truth the error of withheld tracks."""
-        rows = [self._row(name, CLEAN) for name in self.estimators]
-        key = accuracy_of(rows)
-        return key if any(row.value(key) is not None for row in rows) else HELD_OUT
+        return error_of([self._row(name, CLEAN) for name in self.estimators])
 
     @property
     def over_seeds(self) -> bool:
