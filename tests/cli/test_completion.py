@@ -1,4 +1,4 @@
-"""A shell completes commands, options, choices and the names that are known here (8 s)."""
+"""A shell completes commands, options, choices and the names that are known here (5 s)."""
 
 import os
 import shutil
@@ -12,12 +12,10 @@ from toolkit.cli import main
 
 OFFERED = {
     "comp": ["compare", "completion"],
-    "evaluate --max": ["--max-dt"],
     "evaluate --format m": ["markdown"],
     "compare --estimators ekf,msckf-s": ["ekf,msckf-slam"],
     "compare fli": ["flight", "flight-realistic"],
     "compare --set noise.pix": ["noise.pixel_sigma_px="],
-    "evaluate --metric ate_se3_m": ["ate_se3_m"],
     "report no": ["notes.txt"],  # files
 }
 
