@@ -63,8 +63,8 @@ _SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host
 _TRUTH = arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE")
 _OUT = arg(
     "--out DIR",
-    "run directory (default: runs/<date and time>); every run over seeds is kept there as it ends, and the same "
-    "command continues where it stopped",
+    "run directory (default: runs/<date and time>); runs are kept there as they end (of compare with --seeds), and the "
+    "same command continues where it stopped",
     Path,
 )
 
