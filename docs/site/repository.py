@@ -7,6 +7,7 @@ source code, workflows, the licence. Formulas become MathML, which browsers draw
 import ast
 import base64
 import json
+import os
 import posixpath
 import re
 from collections.abc import Iterator
@@ -25,6 +26,23 @@ _PAGES = ("README.md", "docs/*.md", "notebooks/README.md", "data/README.md", ".g
 _ASSETS = ("docs/images/*", "docs/schemas/*.json", "docs/site/site.css")
 _LINK = re.compile(r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FORMULA = re.compile(r"\\\((?P<inline>.*?)\\\)|\\\[(?P<block>.*?)\\\]", re.DOTALL)
+# Colab opens what is in a branch of a repository: there the workflow puts these, with a first cell that installs it.
+_IN_COLAB = ("01_quickstart", "03_why_the_smoother_wins", "05_the_course_exercises")
+_COLAB = "https://colab.research.google.com/github"
+_FIRST_CELL = """\
+# Where the toolkit is not installed, as in Colab, fetch and install it, and go where the notebooks are.
+import importlib.util
+import os
+import subprocess
+import sys
+
+if importlib.util.find_spec("toolkit") is None:
+    subprocess.run(["git", "clone", "-q", "--depth", "1", "{address}", "vislam-toolkit"], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "./vislam-toolkit"], check=True)
+    os.chdir("vislam-toolkit/notebooks")
+    sys.path.insert(0, os.getcwd())
+    importlib.invalidate_caches()
+"""
 _LANGUAGES = {".py": "python", ".yml": "yaml", ".toml": "toml"}
 
 
@@ -106,10 +124,11 @@ def _modules(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _notebook(path: Path, config: MkDocsConfig) -> Iterator[File]:
-    """Yield the page of an executed notebook, and its pictures."""
+    """Yield the page of an executed notebook, its pictures, and, where the repository is known, one for Colab."""
     name = path.relative_to(ROOT)
     parts: list[str] = []
-    for place, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    for place, cell in enumerate(notebook["cells"]):
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
             parts.append(source)
@@ -119,7 +138,12 @@ def _notebook(path: Path, config: MkDocsConfig) -> Iterator[File]:
             picture = f"{name.stem}-{place}.png"
             parts.append(_output(output, picture))
             if "image/png" in output.get("data", {}):
-                yield _picture(name.with_name(picture).as_posix(), output["data"]["image/png"], config)
+                data = base64.b64decode(output["data"]["image/png"])
+                yield _bytes(name.with_name(picture).as_posix(), data, config)
+    if (repository := os.environ.get("GITHUB_REPOSITORY")) and name.stem in _IN_COLAB:
+        parts.insert(1, f"[Open in Colab]({_COLAB}/{repository}/blob/colab/{path.name})")
+        installing = json.dumps(with_first_cell(notebook, f"https://github.com/{repository}")).encode()
+        yield _bytes(f"{name.parent}/colab/{path.name}", installing, config)
     yield _shown(name.as_posix(), "\n\n".join(parts), config, InclusionLevel.INCLUDED)
 
 
@@ -132,7 +156,14 @@ def _output(output: dict[str, Any], picture: str) -> str:
     return "".join(output["data"]["text/markdown"])
 
 
-def _picture(name: str, data: str, config: MkDocsConfig) -> File:
+def with_first_cell(notebook: dict[str, Any], address: str) -> dict[str, Any]:
+    """Return a notebook that installs the toolkit from the address of its repository first, where it is not there."""
+    source = _FIRST_CELL.format(address=address)
+    code = {"execution_count": None, "id": "install", "metadata": {}, "outputs": [], "source": source}
+    return {**notebook, "cells": [{"cell_type": "code", **code}, *notebook["cells"]]}
+
+
+def _bytes(name: str, data: bytes, config: MkDocsConfig) -> File:
     file = File(name, None, config.site_dir, config.use_directory_urls)
-    file.content_bytes = base64.b64decode(data)
+    file.content_bytes = data
     return _placed(file, InclusionLevel.INCLUDED)
