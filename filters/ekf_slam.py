@@ -29,7 +29,6 @@ from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InverseDepthBelief
 from filters.kalman.joint import AtFirstEstimates, JointBelief, Linearisation, linearisation, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
-from filters.kalman.tracks import TrackSightings
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
@@ -132,7 +131,8 @@ class JointEkf:
         new = new.select(near & (rig.fx_px * rig.baseline_m > LEAST_DEPTH_M * stereo.disparity_px(new.uvs_px)))
         if len(new.track_ids):
             points = stereo.triangulate_world(new.uvs_px, joint.clones[-1], rig)
-            sightings = TrackSightings(new.track_ids, new.uvs_px[:, None], np.ones((len(points), 1), dtype=bool))
-            linearised = joint_landmarks.linearise(sightings, points, joint.clones, self._at.clones(joint), rig)
-            weighted = linearised.scaled(np.full(len(points), np.sqrt(rig.track_weight)))
-            joint_landmarks.add_tracks(joint, new.track_ids, points, weighted)
+            there = joint_landmarks.linearised_images(points, self._at.clones(joint), rig)
+            d_point_d_uv = np.linalg.inv(there.d_uv_d_point[:, 0])
+            by_pose = -d_point_d_uv @ there.d_uv_d_pose[:, 0]
+            covs = d_point_d_uv @ (rig.cov_uv_px2 / rig.track_weight) @ np.swapaxes(d_point_d_uv, 1, 2)
+            joint.add_landmarks(new.track_ids, points, by_pose.reshape(-1, 6), covs)

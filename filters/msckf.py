@@ -15,20 +15,20 @@ from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, 
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
 from filters.kalman.tracks import (
-    AcceptedTracks,
     TrackSightings,
     WindowPoses,
     WindowTracks,
-    accepted_tracks,
+    correct_by_landmarks,
+    eliminated_tracks,
     given_tracks_in_view,
     load_kernels,
 )
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import BoolArray, IntArray
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
-from toolkit.models.gating import FEWEST_SIGHTINGS, FrameGate
+from toolkit.models.gating import FrameGate
 
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
@@ -74,7 +74,7 @@ class Msckf:
         self._clone_t_ns = np.append(self._clone_t_ns, frame.t_ns)
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, frame, self._memory)
-        joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+        correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
         self._tracks.add_frame(self._without_landmarks(frame))
         leaving = self._clone_t_ns < frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
@@ -117,34 +117,15 @@ class Msckf:
 
     def _correct_by(self, sightings: TrackSightings, gate: FrameGate) -> None:
         """Correct the window by tracks; add those still seen as landmarks, as many as there is room for."""
-        sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        window = self._window()
-        accepted = accepted_tracks(sightings, window, self._rig, gate)
-        if not len(accepted.points):
+        found = eliminated_tracks(sightings, self._window(), self._rig, gate)
+        if not len(found.points):
             return
-        self._memory.remember(accepted.sightings.track_ids, accepted.points)
-        kept = np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room]
+        self._memory.remember(found.track_ids, found.points)
+        kept = np.flatnonzero(found.seen[:, -1])[: self._room]
         if len(kept):
-            self._add_landmarks(accepted, kept, window)
-        first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
-        self._update(accepted.H[:, first:], accepted.residuals)
-
-    def _add_landmarks(self, accepted: AcceptedTracks, kept: IntArray, window: WindowPoses) -> None:
-        """Add accepted tracks (m,) to the state."""
-        sightings, points = accepted.sightings.select(kept), accepted.points[kept]
-        linearised = joint_landmarks.linearise(sightings, points, window.poses, window.poses_at, self._rig)
-        weighted = linearised.scaled(np.sqrt(accepted.weights[kept]))
-        joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, weighted)
-
-    def _update(self, H: Array, residuals: Array) -> None:
-        """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
-        joint, (count, size) = self._joint, H.shape
-        end = joint.clone_columns.stop
-        if count > size and end == joint.cov.shape[0]:
-            joint.inform(H.T @ H, H.T @ residuals)
-            return
-        # With landmarks after the clones in the error state, an update by fewer rows is cheaper.
-        joint.update(*joint_landmarks.compressed(H, residuals), slice(end - size, end))
+            self._joint.add_landmarks(*found.landmarks(kept))
+        first = 6 * int(np.argmax(found.seen.any(axis=0)))
+        self._joint.inform(found.information[first:, first:], found.vector[first:])
 
     def _forget_clones(self, which: BoolArray) -> None:
         """Marginalise poses (C,), which are the oldest."""

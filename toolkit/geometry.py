@@ -28,6 +28,7 @@ def _tails() -> Array:
 
 
 _TAILS = _tails()
+_POWERS = np.arange(len(_TAILS))
 
 
 def _coefficients(phi: Array) -> list[Array]:
@@ -39,10 +40,8 @@ def _coefficients(phi: Array) -> list[Array]:
     x = np.asarray(_squared_norm(phi))
     large = x >= _SMALL_ANGLE_SQUARED
     some_large = large.any()
-    small = (np.where(large, 0.0, x) if some_large else x)[..., None]
-    powers = np.ones((*x.shape, len(_TAILS)))
-    powers[..., 1:] = small
-    values = np.multiply.accumulate(powers, axis=-1, out=powers) @ _TAILS
+    small = np.where(large, 0.0, x) if some_large else x
+    values = small[..., None] ** _POWERS @ _TAILS
     if some_large:
         values[large] = _closed_forms(x[large])
     return [values[..., i, None, None] for i in range(5)]
@@ -119,18 +118,27 @@ def se3(rotation: Array, translation: Array) -> Array:
     return T
 
 
+def _hats() -> Array:
+    """Return the matrix (6, 16) that multiplies a twist to the elements of its matrix (4, 4)."""
+    each = np.zeros((6, 4, 4))
+    each[:3, :3, :3], each[3:, :3, 3] = skew(_IDENTITY), _IDENTITY
+    return each.reshape(6, 16)
+
+
+_HATS, _IDENTITY_4 = _hats(), np.eye(4)
+
+
 def se3_exp(xi: Array) -> Array:
-    """Return T (..., 4, 4) of a twist (..., 6) ordered [rotation, translation] (Barfoot, eq. 7.33)."""
+    """Return T (..., 4, 4) of a twist (..., 6) ordered [rotation, translation] (Barfoot, eq. 7.43)."""
     xi = np.asarray(xi, dtype=float)
-    phi_x = skew(xi[..., :3])
-    return _se3_exp(xi, phi_x, phi_x @ phi_x, _coefficients(xi[..., :3]))
+    return _se3_exp(xi, _coefficients(xi[..., :3]))
 
 
-def _se3_exp(xi: Array, phi_x: Array, squared: Array, coefficients: list[Array]) -> Array:
-    first, second, third, *_ = coefficients
-    rho = xi[..., 3:, None]
-    translation = rho + second * (phi_x @ rho) + third * (squared @ rho)
-    return se3(_IDENTITY + first * phi_x + second * squared, translation[..., 0])
+def _se3_exp(xi: Array, coefficients: list[Array]) -> Array:
+    _, second, third, *_ = coefficients
+    hat = (xi @ _HATS).reshape(*xi.shape[:-1], 4, 4)
+    squared = hat @ hat
+    return np.asarray(_IDENTITY_4 + hat + second * squared + third * (squared @ hat))
 
 
 def se3_exp_and_right_jacobian(xi: Array) -> tuple[Array, Array]:
@@ -138,8 +146,7 @@ def se3_exp_and_right_jacobian(xi: Array) -> tuple[Array, Array]:
     xi = np.asarray(xi, dtype=float)
     phi_x, rho_x, coefficients = skew(xi[..., :3]), skew(xi[..., 3:]), _coefficients(xi[..., :3])
     squared = phi_x @ phi_x
-    T = _se3_exp(xi, phi_x, squared, coefficients)
-    return T, _se3_left_jacobian(-phi_x, -rho_x, squared, coefficients)
+    return _se3_exp(xi, coefficients), _se3_left_jacobian(-phi_x, -rho_x, squared, coefficients)
 
 
 def se3_log(T: Array) -> Array:

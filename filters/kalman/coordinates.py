@@ -20,7 +20,6 @@ Sources: Barrau & Bonnabel 2015, "An EKF-SLAM algorithm with consistency propert
 from copy import copy
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from filters.kalman.joint import JointBelief, Linearisation
 from toolkit.geometry import (
@@ -45,9 +44,9 @@ class LandmarkAnchors(JointBelief):
         self._T_imu_cam = T_imu_cam
         self.anchors: Array = np.empty((0, 4, 4))
 
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, covs: Array) -> None:
         """Add N landmarks as :meth:`JointBelief.add_landmarks` does, anchored in the newest clone."""
-        super().add_landmarks(track_ids, points, jacobian, cov)
+        super().add_landmarks(track_ids, points, jacobian, covs)
         anchor = self.clones[-1] @ self._T_imu_cam
         self.anchors = np.concatenate([self.anchors, np.tile(anchor, (len(track_ids), 1, 1))])
 

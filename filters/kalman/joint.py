@@ -16,7 +16,6 @@ from typing import Any, Protocol, Self
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
-from scipy.sparse import csr_array
 
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
@@ -30,14 +29,14 @@ _LEAST_INDEPENDENT = 1e-12
 
 
 class Jacobian(Protocol):
-    """A matrix (m, k) that is multiplied from the left: dense, sparse, or triangular."""
+    """A matrix (m, k) that is multiplied from the left, dense or sparse."""
 
     def __matmul__(self, right: Any, /) -> Any:
         """Return the product with an array (k, n)."""
 
 
 class JointBelief:
-    """Error state in this order: the IMU's d, six per clone (oldest first), three per landmark (in world axes)."""
+    """Error state in this order: the IMU's d, three per landmark (in world axes), six per clone (oldest first)."""
 
     def __init__(self, core: Belief) -> None:
         self._core = core
@@ -62,15 +61,15 @@ class JointBelief:
         return self._cov
 
     @property
-    def clone_columns(self) -> slice:
-        """Return the columns of the clones in the error state."""
-        d = self._core.layout.size
-        return slice(d, d + 6 * len(self.clones))
-
-    @property
     def landmark_columns(self) -> slice:
         """Return the columns of the landmarks in the error state."""
-        return slice(self.clone_columns.stop, self._cov.shape[0])
+        d = self._core.layout.size
+        return slice(d, d + 3 * len(self.points))
+
+    @property
+    def clone_columns(self) -> slice:
+        """Return the columns of the clones in the error state."""
+        return slice(self.landmark_columns.stop, self._cov.shape[0])
 
     def propagate(self, prediction: Prediction, transition: Array) -> None:
         """Propagate the IMU state by its transition (d, d); the prediction is the first estimate of the new instant."""
@@ -84,8 +83,7 @@ class JointBelief:
 
     def clone(self) -> None:
         """Add a clone of the present pose with all its correlations (stochastic cloning)."""
-        end = self.clone_columns.stop
-        self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, self._cov.shape[0])])
+        self._cov = _of_slices(self._cov, [slice(0, self._cov.shape[0]), slice(0, 6)])
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
 
@@ -104,28 +102,30 @@ class JointBelief:
         self.landmark_ids = self.landmark_ids[~which]
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
-        """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's error, plus noise.
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, covs: Array) -> None:
+        """Add landmarks (N,) at points (N, 3) m of error ``jacobian`` (3 N, 6 C) times the clones' error, plus noise.
 
-        ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
+        ``covs`` (N, 3, 3) are the covariances of that noise, independent of the state and from landmark to landmark.
         """
-        self._add_rows(jacobian, cov)
+        before, end = self._cov, self.landmark_columns.stop
+        cross = jacobian @ before[self.clone_columns]
+        own = cross[:, self.clone_columns] @ jacobian.T
+        own.reshape(len(covs), 3, len(covs), 3)[np.arange(len(covs)), :, np.arange(len(covs))] += covs
+        rows = np.concatenate([before[:end], cross, before[end:]])
+        columns = np.concatenate([cross.T[:end], _symmetric(own), cross.T[end:]])
+        self._cov = np.concatenate([rows[:, :end], columns, rows[:, end:]], axis=1)
         self.landmark_ids = np.concatenate([self.landmark_ids, track_ids])
         self.points = np.concatenate([self.points, points])
         self.first_points = np.concatenate([self.first_points, points])
 
-    def _add_rows(self, jacobian: Array | csr_array, cov: Array) -> None:
-        """Append to the error state entries whose error is ``jacobian`` (m, n) times the state's error, plus noise."""
-        cross = np.asarray(jacobian @ self._cov)
-        before, size = self._cov, len(self._cov) + len(cov)
-        self._cov = np.empty((size, size))
-        self._cov[: len(before), : len(before)] = before
-        self._cov[len(before) :, : len(before)], self._cov[: len(before), len(before) :] = cross, cross.T
-        self._cov[len(before) :, len(before) :] = _symmetric(jacobian @ cross.T + cov)
-
     def update(self, H: Jacobian, residual: Array, columns: slice) -> None:
         """Correct the whole state by whitened residuals (m,) with Jacobian (m, k) to ``columns`` of the error state."""
-        root, half_gain = self._half_gain(H, columns)
+        self.update_carried(*self._carried_innovation(H, columns), residual)
+
+    def update_carried(self, carried: Array, innovation_cov: Array, residual: Array) -> None:
+        """Correct the whole state by whitened residuals (m,), given H P (m, n) and H P H^T + 1 (m, m), overwritten."""
+        root = cholesky_root(innovation_cov)
+        half_gain = divided_by_root(root, carried)
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
@@ -151,20 +151,20 @@ class JointBelief:
 
     def reduce_covariance(self, H: Jacobian, columns: slice) -> None:
         """Reduce the covariance by whitened measurements with Jacobian (m, k); the estimates stay."""
-        self._reduce(self._half_gain(H, columns)[1])
+        carried, innovation_cov = self._carried_innovation(H, columns)
+        self._reduce(divided_by_root(cholesky_root(innovation_cov), carried))
 
     def _reduce(self, half_gain: Array) -> None:
         # NumPy's product of a matrix with its own transpose is exactly symmetric.
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
 
-    def _half_gain(self, H: Jacobian, columns: slice) -> tuple[Array, Array]:
-        """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
+    def _carried_innovation(self, H: Jacobian, columns: slice) -> tuple[Array, Array]:
+        """Return H P and the innovations' covariance H P H^T + 1."""
         carried = np.asarray(H @ self._cov[columns])
         innovation_cov = np.asarray(H @ carried[:, columns].T)
         innovation_cov.flat[:: len(carried) + 1] += 1.0
-        root = cholesky_root(innovation_cov)
-        return root, divided_by_root(root, carried)
+        return carried, innovation_cov
 
     def move(self, delta: Array) -> None:
         """Move every estimate by an error (n,); first estimates stay."""

@@ -27,7 +27,7 @@ from toolkit.geometry import Array, BoolArray, IntArray
 _BEGAN_CPU_S = time.process_time()
 # Levenberg-Marquardt. The landmark is eliminated to first order afterwards, so a fit to better than a hundredth of a
 # sigma has no effect. A step that raises the error by no more than rounding is accepted.
-ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING = 6, 1e-3, 1e-4, 1e-12
+ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING = 6, 1e-2, 1e-4, 1e-12
 # Information added to where rays meet: that of rays that are parallel to within a thousandth of a radian.
 LEAST_RAY = 1e-6
 
@@ -49,8 +49,12 @@ def compiled(function: Callable[..., Any]) -> Any:
     """Return a function that kernels may call; it is compiled for the first of them that does, and inlined.
 
     LLVM by itself leaves some as calls that pass every array as ten values; the kernels then take 1.2 times as long.
+    numba would compile a function anew for each number that it is called with literally; here it does not.
     """
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True, **_OPTIONS)(function)
+    dispatcher = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True, **_OPTIONS)(function)
+    template_for = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda args, named: template_for([types.unliteral(arg) for arg in args], named)
+    return dispatcher
 
 
 def kernel(*signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -124,19 +128,19 @@ def linearise_point(
     intrinsics, whitener, left_whitener, _ = camera
     fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     x, y, depth = moved(T_cam_world, j, points, f)
-    z = divisible(depth)
-    r0 = uvs_px[t, j, 0] - (fx * x / z + cx)
-    r1 = uvs_px[t, j, 1] - (fx * (x - baseline_m) / z + cx)
-    r2 = uvs_px[t, j, 2] - (fy * y / z + cy)
+    per_z = 1.0 / divisible(depth)
+    r0 = uvs_px[t, j, 0] - (fx * x * per_z + cx)
+    r1 = uvs_px[t, j, 1] - (fx * (x - baseline_m) * per_z + cx)
+    r2 = uvs_px[t, j, 2] - (fy * y * per_z + cy)
     W = whitener
     if math.isnan(r1):
         W, r1 = left_whitener, 0.0
     x, y, z = moved(T_cam_world_at, j, points, f)
-    z = divisible(z)
+    per_z = 1.0 / divisible(z)
+    across, down = fx * per_z, fy * per_z
     for i in range(3):
-        a = (W[i, 0] + W[i, 1]) * fx / z
-        b = W[i, 2] * fy / z
-        c = -((W[i, 0] * x + W[i, 1] * (x - baseline_m)) * fx + W[i, 2] * fy * y) / (z * z)
+        a, b = (W[i, 0] + W[i, 1]) * across, W[i, 2] * down
+        c = -((W[i, 0] * x + W[i, 1] * (x - baseline_m)) * across + W[i, 2] * y * down) * per_z
         for d in range(3):
             A[at + i, d] = a * T_cam_world_at[j, 0, d] + b * T_cam_world_at[j, 1, d] + c * T_cam_world_at[j, 2, d]
         A[at + i, 3] = W[i, 0] * r0 + W[i, 1] * r1 + W[i, 2] * r2
@@ -320,21 +324,20 @@ def triangulate(
     if not started:
         return False
     tried, N, damping = np.empty((2, 3)), np.empty((2, 4, 4)), FIRST_DAMPING
-    now, other = 0, 1
+    now, other, cost, depth = 1, 0, np.nan, 0.0
     for i in range(3):
-        tried[now, i] = points[f, i]
-    cost, depth = normal_equations(tried, now, uvs_px, f, where, m, window, camera, N)
-    for _ in range(ITERATIONS):
-        x, y, z = solve(N, now, damping, 1e-12, right_side(N, now))
-        tried[other, 0], tried[other, 1], tried[other, 2] = tried[now, 0] + x, tried[now, 1] + y, tried[now, 2] + z
+        tried[other, i] = points[f, i]
+    for _ in range(1 + ITERATIONS):
         cost_there, depth_there = normal_equations(tried, other, uvs_px, f, where, m, window, camera, N)
-        if cost_there < (1.0 + ROUNDING) * cost:
+        if cost_there >= (1.0 + ROUNDING) * cost:  # not so for the first guess, which has none to compare with
+            damping *= 10.0
+        else:
             settled = cost_there >= (1.0 - RELATIVE_DECREASE) * cost
             now, other, cost, depth, damping = other, now, cost_there, depth_there, 0.1 * damping
             if settled:
                 break
-        else:
-            damping *= 10.0
+        x, y, z = solve(N, now, damping, 1e-12, right_side(N, now))
+        tried[other, 0], tried[other, 1], tried[other, 2] = tried[now, 0] + x, tried[now, 1] + y, tried[now, 2] + z
     for i in range(3):
         points[f, i] = tried[now, i]
     return (determined or is_determined(N, now, depth)) and depth > least_m
@@ -452,77 +455,112 @@ def worst_sighting(S: Array, m: int, V: Array, r: Array, B: Array) -> int:
 
 
 @compiled
-def constrain(rows: Arrays, where: IntArray, m: int, V: Array, G: Array, H: Array, residuals: Array, end: int) -> int:
-    """Append the rows of ``Q^T [H_x r]`` from the fourth on to H (n, 6 W) and ``residuals`` (n,); return the new end.
-
-    The reflections ``Q^T = (1 - v_3 v_3^T) (1 - v_2 v_2^T) (1 - v_1 v_1^T)`` take ``sum_k v_k g_k^T`` from H_x, with
-    ``g_k = H_x^T v_k - sum_{l < k} (v_l^T v_k) g_l``. A row of H_x depends on its own pose alone. G is work space for
-    g_k (3, 6 m); H is zero where it was not yet written.
-    """
+def scale(rows: Arrays, first: int, end: int, weight: float) -> None:
+    """Multiply some rows of A and J by the root of a weight."""
     A, J = rows
-    n = 3 * m
-    reflect_landmark_away(A, n, V)
-    for k in range(3):
-        for c in range(6 * m):
-            G[k, c] = 0.0
-        for i in range(k, n):
-            at = np.uint64(6 * (i // 3))
-            for c in range(np.uint64(6)):
-                G[k, at + c] += V[k, i] * J[i, c]
-        for before in range(k):
-            overlap = 0.0
-            for i in range(k, n):
-                overlap += V[before, i] * V[k, i]
-            for c in range(6 * m):
-                G[k, c] -= overlap * G[before, c]
-    for i in range(3, n):
-        x, y, z = V[0, i], V[1, i], V[2, i]
-        for k in range(m):
-            at, to = np.uint64(6 * k), np.uint64(6 * where[k])
-            for c in range(np.uint64(6)):
-                own = J[i, c] if i // 3 == k else 0.0
-                H[end, to + c] = own - x * G[0, at + c] - y * G[1, at + c] - z * G[2, at + c]
-        residuals[end] = A[i, 3]
-        end += 1
-    return end
+    root = math.sqrt(weight)
+    for i in range(first, end):
+        for c in range(4):
+            A[i, c] *= root
+        for c in range(6):
+            J[i, c] *= root
 
 
-@kernel(types.Tuple((_STACK, _MASK)), _WINDOW, _MATRIX, _CAMERA, _LIMITS, types.Tuple((_ROW, types.float64)))
-def test_tracks(
-    sightings: Arrays, window: Arrays, P: Array, camera: Arrays, limits: Arrays, gate: Arrays
-) -> tuple[Array, BoolArray, Array, IntArray, IntArray, Array, Array, IntArray]:
-    """Triangulate F tracks, linearise them, eliminate their landmarks and test their constraints on the window.
+@compiled
+def add_pose(rows: Arrays, at: int, D: Array, d: Array, j: int) -> None:
+    """Add ``J^T J`` of a sighting's three rows to block j of D (W, 6, 6), and ``J^T r`` to d (6 W,)."""
+    A, J = rows
+    for a in range(6):
+        x, y, z = J[at, a], J[at + 1, a], J[at + 2, a]
+        d[6 * j + a] += x * A[at, 3] + y * A[at + 1, 3] + z * A[at + 2, 3]
+        for c in range(np.uint64(6)):
+            D[j, a, c] += x * J[at, c] + y * J[at + 1, c] + z * J[at + 2, c]
+
+
+@compiled
+def add_cross(rows: Arrays, at: int, B: Array, f: int, j: int) -> None:
+    """Add ``H_f^T J`` of a sighting's three rows to the block of track f and pose j of B (3 F, 6 W)."""
+    A, J = rows
+    for a in range(6):
+        for b in range(3):
+            for row in range(at, at + 3):
+                B[3 * f + b, 6 * j + a] += A[row, b] * J[row, a]
+
+
+@compiled
+def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
+    """Overwrite the three rows B of a track by ``C^-1 B``, with ``C C^T = H_f^T H_f``, and write ``C^-1 H_f^T r`` to e.
+
+    What the track then says of the poses is the information ``H_x^T H_x - E^T E`` and the vector ``H_x^T r - E^T e``:
+    that of its residuals on the left null space of H_f, without forming the null space (the Schur complement).
+    """
+    l00 = math.sqrt(N[f, 0, 0])
+    l10, l20 = N[f, 1, 0] / l00, N[f, 2, 0] / l00
+    l11 = math.sqrt(N[f, 1, 1] - l10 * l10)
+    l21 = (N[f, 2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(N[f, 2, 2] - l20 * l20 - l21 * l21)
+    for c in range(E.shape[1]):
+        x = E[3 * f, c] / l00
+        y = (E[3 * f + 1, c] - l10 * x) / l11
+        E[3 * f, c], E[3 * f + 1, c] = x, y
+        E[3 * f + 2, c] = (E[3 * f + 2, c] - l20 * x - l21 * y) / l22
+    e[3 * f] = N[f, 3, 0] / l00
+    e[3 * f + 1] = (N[f, 3, 1] - l10 * e[3 * f]) / l11
+    e[3 * f + 2] = (N[f, 3, 2] - l20 * e[3 * f] - l21 * e[3 * f + 1]) / l22
+
+
+_WEIGHER = types.Tuple((_ROW, _ROW))
+
+
+@compiled
+def weight_of(nis: float, dof: int, weigher: Arrays) -> float:
+    """Return Huber's weight of an innovation of some NIS, 0 where the gate rejects it.
+
+    ``weigher`` has the bound of the NIS and Huber's threshold at each number of degrees of freedom.
+    """
+    bounds, thresholds = weigher
+    return min(1.0, thresholds[dof] / math.sqrt(max(nis, 1e-12))) if nis < bounds[dof] else 0.0
+
+
+@kernel(types.Tuple((_STACK, _MASK)), _WINDOW, _MATRIX, _CAMERA, _LIMITS, _WEIGHER, types.Tuple((types.float64,) * 2))
+def eliminate_tracks(
+    sightings: Arrays, window: Arrays, P: Array, camera: Arrays, limits: Arrays, weigher: Arrays, factors: Arrays
+) -> tuple[Array, BoolArray, Array, IntArray, IntArray, Array, Arrays]:
+    """Triangulate F tracks, linearise them, test their constraints on the window, eliminate their landmarks.
 
     ``sightings`` are (uL, uR, v) (F, W, 3) px and which were seen (F, W); P (6 W, 6 W) is the covariance of the poses;
-    ``gate`` has the bound of the NIS at each number of degrees of freedom (3 W - 2,), and how many times that bound is
-    far above it.
+    ``factors`` say how many times its bound a NIS is far above it, and what every weight is multiplied by.
 
     Returns the landmarks (F, 3); which are reliable (F,) (the other results are undefined for the others); the NIS (F,)
-    and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not far above its bound; and the n
-    stacked constraints of the tracks below their bounds: H (n, 6 W), residuals (n,) and the track of each row (n,).
+    and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not far above its bound; the weight
+    (F,), 0 of a track that is not accepted; and the normal equations of the accepted, weighted: ``[H_f r]^T [H_f r]``
+    (F, 4, 4), E (3 F, 6 W) and e (3 F,) of :func:`eliminate`, zero for the others, ``H_x^T H_x``, one block (W, 6, 6) a
+    pose, and ``H_x^T r`` (6 W,).
     """
     uvs_px, seen = sightings
-    bounds, mismatched_factor = gate
+    mismatched_factor, common_weight = factors
     T_cam_world = in_camera(window[0], camera)
     here, window_at = (T_cam_world, T_cam_world, window[0]), (T_cam_world, in_camera(window[1], camera), window[1])
     count, longest = seen.shape
     most = 3 * longest
-    points, reliable, nis = np.zeros((count, 3)), np.empty(count, dtype=np.bool_), np.empty(count)
+    points, reliable, nis, weights = (
+        np.zeros((count, 3)),
+        np.empty(count, dtype=np.bool_),
+        np.empty(count),
+        np.zeros(count),
+    )
     dof, worst = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-    where = np.empty(longest, dtype=np.int64)
-    A, whitened, B, J = np.empty((most, 4)), np.empty((most, 4)), np.empty((most, 4)), np.empty((most, 6))
-    S, V, G = np.empty((most, most)), np.empty((3, most)), np.empty((3, 2 * most))
-    rows = 0
-    for f in range(count):
-        rows += max(3 * sighted(seen, f, where) - 3, 0)
-    H, residuals, tracks, end = np.zeros((rows, 2 * most)), np.empty(rows), np.empty(rows, dtype=np.int64), 0
+    N, E, e = np.zeros((count, 4, 4)), np.zeros((3 * count, 2 * most)), np.zeros(3 * count)
+    D, d, where = np.zeros((longest, 6, 6)), np.zeros(2 * most), np.empty(longest, dtype=np.int64)
+    A, J, whitened, B = np.empty((most, 4)), np.empty((most, 6)), np.empty((most, 4)), np.empty((most, 4))
+    S, V = np.empty((most, most)), np.empty((3, most))
     for f in range(count):
         m = sighted(seen, f, where)
         n, nis[f], dof[f], worst[f] = 3 * m, np.inf, 3 * m - 3, -1
         for k in range(m):
             dof[f] -= math.isnan(uvs_px[f, where[k], 1])
-        reliable[f] = triangulate(points, f, uvs_px, where, m, here, camera, limits)
-        if not reliable[f] or m < 2:
+        reliable[f] = m >= 2 and triangulate(points, f, uvs_px, where, m, here, camera, limits)
+        if not reliable[f]:
             continue
         linearise(points, f, uvs_px, where, m, window_at, camera, (A, J))
         carry_cov(where, m, J, P, S)
@@ -535,13 +573,17 @@ def test_tracks(
         nis[f] = 0.0
         for i in range(3, n):
             nis[f] += whitened[i, 3] * whitened[i, 3]
-        if nis[f] < bounds[dof[f]]:
-            begin, end = end, constrain((A, J), where, m, V, G, H, residuals, end)
-            for i in range(begin, end):
-                tracks[i] = f
-        elif nis[f] > mismatched_factor * bounds[dof[f]]:
+        weights[f] = common_weight * weight_of(nis[f], dof[f], weigher)
+        if weights[f] > 0.0:
+            scale((A, J), 0, n, weights[f])
+            add_normals(A, 0, n, N, f)
+            for k in range(m):
+                add_pose((A, J), 3 * k, D, d, where[k])
+                add_cross((A, J), 3 * k, E, f, where[k])
+            eliminate(f, N, E, e)
+        elif nis[f] > mismatched_factor * weigher[0][dof[f]]:
             worst[f] = where[worst_sighting(S, m, V, whitened, B)]
-    return points, reliable, nis, dof, worst, H[:end], residuals[:end], tracks[:end]
+    return points, reliable, nis, dof, worst, weights, (N, E, e, D, d)
 
 
 @compiled
@@ -553,16 +595,6 @@ def start_landmark(sightings: Arrays, points: Array, f: int, where: IntArray, he
         m = sighted(seen, f, where)
         if m < 2 or not start_point(points, f, uvs_px, where, m, T_cam_world, camera, least_px)[0]:
             points[f, 0] = np.nan
-
-
-@compiled
-def add_pose(J: Array, A: Array, at: int, D: Array, d: Array, j: int) -> None:
-    """Add ``J^T J`` of a sighting's three rows to block j of D (W, 6, 6), and ``J^T r`` to d (6 W,)."""
-    for a in range(6):
-        x, y, z = J[at, a], J[at + 1, a], J[at + 2, a]
-        d[6 * j + a] += x * A[at, 3] + y * A[at + 1, 3] + z * A[at + 2, 3]
-        for c in range(np.uint64(6)):
-            D[j, a, c] += x * J[at, c] + y * J[at + 1, c] + z * J[at + 2, c]
 
 
 _TRACKS = types.Tuple((_STACK, _MASK, _MATRIX, _MATRIX))
@@ -600,12 +632,7 @@ def normals_in_view(
         last = 3 * m - 3
         for k in range(m):
             left_only = left_only or math.isnan(uvs_px[f, where[k], 1])
-            root = math.sqrt(weights[f, where[k]])
-            for i in range(3 * k, 3 * k + 3):
-                for c in range(4):
-                    A[i, c] *= root
-                for c in range(6):
-                    J[i, c] *= root
+            scale((A, J), 3 * k, 3 * k + 3, weights[f, where[k]])
         add_normals(A, 0, last, N, f)
         if not nearest > least_m or (left_only and not is_determined(N, f, nearest)):
             points[f, 0] = np.nan
@@ -618,13 +645,9 @@ def normals_in_view(
                 A_newest[3 * f + i, c] = A[last + i, c]
             for c in range(6):
                 J_newest[3 * f + i, c] = J[last + i, c]
-        for i in range(0, last, 3):
-            j = where[i // 3]
-            add_pose(J, A, i, D, d, j)
-            for a in range(6):
-                for b in range(3):
-                    for row in range(i, i + 3):
-                        B[3 * f + b, 6 * j + a] += A[row, b] * J[row, a]
+        for k in range(m - 1):
+            add_pose((A, J), 3 * k, D, d, where[k])
+            add_cross((A, J), 3 * k, B, f, where[k])
     return depths, N, A_newest, B, J_newest, D, d
 
 
@@ -654,36 +677,18 @@ def innovate(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array, S: Arra
     S[0, 2, 0], S[0, 2, 1], S[0, 2, 2] = S[0, 2, 0] + s20, S[0, 2, 1] + s21, S[0, 2, 2] + s22
 
 
-@compiled
-def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
-    """Overwrite B R by ``C^-1 B R``, with C the root of a track's ``H_f^T H_f``, and write ``C^-1 H_f^T r`` to e."""
-    l00 = math.sqrt(N[f, 0, 0])
-    l10, l20 = N[f, 1, 0] / l00, N[f, 2, 0] / l00
-    l11 = math.sqrt(N[f, 1, 1] - l10 * l10)
-    l21 = (N[f, 2, 1] - l20 * l10) / l11
-    l22 = math.sqrt(N[f, 2, 2] - l20 * l20 - l21 * l21)
-    for c in range(E.shape[1]):
-        x = E[3 * f, c] / l00
-        y = (E[3 * f + 1, c] - l10 * x) / l11
-        E[3 * f, c], E[3 * f + 1, c] = x, y
-        E[3 * f + 2, c] = (E[3 * f + 2, c] - l20 * x - l21 * y) / l22
-    e[3 * f] = N[f, 3, 0] / l00
-    e[3 * f + 1] = (N[f, 3, 1] - l10 * e[3 * f]) / l11
-    e[3 * f + 2] = (N[f, 3, 2] - l20 * e[3 * f] - l21 * e[3 * f + 1]) / l22
-
-
 @kernel(
     _TRACKS,
     types.Tuple((_ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW)),
     types.Tuple((_MATRIX, _MATRIX)),
-    types.Tuple((_ROW, _ROW)),
+    _WEIGHER,
 )
-def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, gate: Arrays) -> Array:
+def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, weigher: Arrays) -> Array:
     """Gate the newest sightings of F tracks, add them, and eliminate the landmarks.
 
     ``normals`` are those of :func:`normals_in_view` without B; ``by_root`` are J R of the newest sightings (3 F, 6 W)
-    and B R (3 F, 6 W), with R the root of the covariance of the poses; ``gate`` has, at 0 to 3 degrees of freedom, the
-    bound of the NIS (4,) and Huber's threshold (4,).
+    and B R (3 F, 6 W), with R the root of the covariance of the poses; ``weigher`` has the gate's bound of the NIS (4,)
+    and Huber's threshold (4,).
 
     Returns the landmarks' part e (3 F,) of the vector. In place, the newest sightings get their weights, B R becomes E,
     ``H_x^T H_x`` and ``H_x^T r`` those of all sightings, and the landmarks move by a Gauss-Newton step of at most a
@@ -693,7 +698,6 @@ def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, gate: Arrays) -
     uvs_px, _, weights, points = tracks
     depths, N, A, J, D, d = normals
     JR, BR = by_root
-    bounds, thresholds = gate
     count, last = depths.size, D.shape[0] - 1
     e, H, S = np.zeros(3 * count), np.empty((3, JR.shape[1])), np.empty((1, 4, 4))
     for f in range(count):
@@ -702,19 +706,15 @@ def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, gate: Arrays) -
         innovate(f, N, A, JR, BR, H, S)
         x, y, z = solve(S, 0, 0.0, 0.0, right_side(S, 0))
         nis = x * S[0, 3, 0] + y * S[0, 3, 1] + z * S[0, 3, 2]
-        dof = 2 if math.isnan(uvs_px[f, last, 1]) else 3
-        weights[f, last] = min(1.0, thresholds[dof] / math.sqrt(max(nis, 1e-12))) if nis < bounds[dof] else 0.0
+        weights[f, last] = weight_of(nis, 2 if math.isnan(uvs_px[f, last, 1]) else 3, weigher)
         root = math.sqrt(weights[f, last])
+        scale((A, J), 3 * f, 3 * f + 3, weights[f, last])
         for i in range(3 * f, 3 * f + 3):
-            for c in range(4):
-                A[i, c] *= root
-            for c in range(6):
-                J[i, c] *= root
             for b in range(3):
                 for c in range(BR.shape[1]):
                     BR[3 * f + b, c] += root * A[i, b] * JR[i, c]
         add_normals(A, 3 * f, 3 * f + 3, N, f)
-        add_pose(J, A, 3 * f, D, d, last)
+        add_pose((A, J), 3 * f, D, d, last)
         x, y, z = solve(N, f, 0.0, 0.0, right_side(N, f))
         share = min(1.0, 0.2 * depths[f] / max(math.sqrt(x * x + y * y + z * z), 1e-9))
         points[f, 0] += share * x
@@ -724,9 +724,81 @@ def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, gate: Arrays) -
     return e
 
 
+@kernel(
+    types.Tuple((_STACK, _MATRIX, _MATRIX)),
+    _WINDOW,
+    types.Tuple((_MATRIX, types.int64)),
+    _CAMERA,
+    _WEIGHER,
+    types.float64,
+)
+def test_landmarks(
+    sightings: Arrays, window: Arrays, belief: Arrays, camera: Arrays, weigher: Arrays, common_weight: float
+) -> tuple[Array, IntArray, BoolArray, Array, Array, Array]:
+    """Linearise the sightings of L landmarks of the state from the newest pose and test the innovation of each.
+
+    ``sightings`` are (uL, uR, v) (L, 1, 3) px, and the landmarks (L, 3), at present and where Jacobians are evaluated;
+    ``window`` has the newest pose alone; ``belief`` is the covariance P (n, n) of the whole state and the first column
+    of the landmarks, the newest pose having the last six.
+
+    Returns the NIS (L,), its degrees of freedom (L,), which are accepted (L,); and of the m rows of those, weighted,
+    H P (m, n), the lower half of ``H P H^T + 1`` (m, m) and the residuals (m,).
+    """
+    uvs_px, points, points_at = sightings
+    P, first = belief
+    count, n, end = points.shape[0], P.shape[0], 0
+    T_cam_world, T_cam_world_at, where = (
+        in_camera(window[0], camera),
+        in_camera(window[1], camera),
+        np.zeros(1, np.int64),
+    )
+    nis, dof, accepted = np.empty(count), np.full(count, 3), np.zeros(count, dtype=np.bool_)
+    A, J, columns = np.empty((3 * count, 4)), np.empty((3 * count, 6)), np.empty(count, dtype=np.int64)
+    here, HP, N = np.empty((3, 4)), np.empty((3 * count, n)), np.zeros((1, 4, 4))
+    for f in range(count):
+        depth = linearise_point(points, f, uvs_px, f, 0, (T_cam_world, T_cam_world, window[0]), camera, here, 0)
+        own, at = (A[end : end + 3], J[end : end + 3]), first + 3 * f
+        linearise(points_at, f, uvs_px, where, 1, (T_cam_world_at, T_cam_world_at, window[1]), camera, own)
+        for i in range(3):
+            own[0][i, 3] = N[0, 3, i] = here[i, 3]
+            for c in range(n):
+                HP[end + i, c] = 0.0
+            for b in range(9):
+                row, factor = (at + b, own[0][i, b]) if b < 3 else (n - 9 + b, own[1][i, b - 3])
+                for c in range(n):
+                    HP[end + i, c] += factor * P[row, c]
+            for k in range(i + 1):
+                N[0, i, k] = 1.0 if i == k else 0.0
+                for b in range(3):
+                    N[0, i, k] += HP[end + i, at + b] * own[0][k, b]
+                for b in range(6):
+                    N[0, i, k] += HP[end + i, n - 6 + b] * own[1][k, b]
+        x, y, z = solve(N, 0, 0.0, 0.0, right_side(N, 0))
+        nis[f] = x * N[0, 3, 0] + y * N[0, 3, 1] + z * N[0, 3, 2]
+        dof[f] -= math.isnan(uvs_px[f, 0, 1])
+        weight = common_weight * weight_of(nis[f], dof[f], weigher) if depth > 0.0 else 0.0
+        accepted[f] = weight > 0.0
+        if accepted[f]:
+            scale(own, 0, 3, weight)
+            for i in range(end, end + 3):
+                for c in range(n):
+                    HP[i, c] *= math.sqrt(weight)
+            columns[end // 3], end = at, end + 3
+    S, residuals = np.empty((end, end)), np.empty(end)
+    for i in range(end):
+        residuals[i] = A[i, 3]
+        for k in range(i + 1):
+            S[i, k] = 1.0 if i == k else 0.0
+            for b in range(3):
+                S[i, k] += HP[i, columns[k // 3] + b] * A[k, b]
+            for b in range(6):
+                S[i, k] += HP[i, n - 6 + b] * J[k, b]
+    return nis, dof, accepted, HP[:end], S, residuals
+
+
 def _what_was_compiled() -> tuple[str, ...]:
     """Return a line about the compilation, if it was not done before."""
-    stats = [each.stats for each in (test_tracks, normals_in_view, add_newest)]
+    stats = [each.stats for each in (eliminate_tracks, normals_in_view, add_newest, test_landmarks)]
     if all(each.cache_hits for each in stats):
         return ()
     kept = all(each.cache_path for each in stats)

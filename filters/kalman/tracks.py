@@ -28,6 +28,7 @@ import numpy as np
 
 from filters.kalman.joint import (
     JointBelief,
+    Linearisation,
     cholesky_root,
     divided_by_root,
     regular_root,
@@ -40,12 +41,10 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import (
-    FEWEST_SIGHTINGS,
     LEAST_DEPTH_M,
     LEAST_DISPARITY_PX,
     MISMATCHED_TRACK_FACTOR,
     FrameGate,
-    huber_threshold,
 )
 from toolkit.models.state import POSE, Belief
 from toolkit.progress import Progress
@@ -78,10 +77,6 @@ class TrackSightings(NamedTuple):
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return the tracks of a mask (F,) or of some rows."""
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
-
-    def joined(self, other: "TrackSightings") -> "TrackSightings":
-        """Return the tracks of both, concatenated."""
-        return TrackSightings(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 class WindowTracks:
@@ -158,58 +153,109 @@ def camera_for_kernels(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
     return intrinsics, np.array(rig.whitener, order="C"), stereo.left_whitener(rig), se3_inverse(rig.T_imu_cam)
 
 
-class AcceptedTracks(NamedTuple):
-    """F tracks that passed: their accepted sightings, points (F, 3), weights (F,), and their constraints.
+class EliminatedTracks(NamedTuple):
+    """F tracks that passed, by which poses they were seen (F, W), their points (F, 3), and what they say of the poses.
 
-    The constraints on the W poses are whitened, weighted and stacked: H (n, 6 W), residuals (n,).
+    ``information`` (6 W, 6 W) and ``vector`` (6 W,) are those of all the tracks, whitened and weighted, with their
+    landmarks eliminated. ``normals`` (F, 4, 4) are ``[H_f r]^T [H_f r]``; with C the root of its block ``H_f^T H_f``,
+    ``halves`` (F, 3, 6 W) is ``C^-1 H_f^T H_x``.
     """
 
-    sightings: TrackSightings
+    track_ids: IntArray
+    seen: BoolArray
     points: Array
-    weights: Array
-    H: Array
-    residuals: Array
+    normals: Array
+    halves: Array
+    information: Array
+    vector: Array
 
-    def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
-        """Return the tracks of both, concatenated."""
-        pairs = zip(self[1:], other[1:], strict=True)
-        return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
+    def joined(self, other: "EliminatedTracks") -> "EliminatedTracks":
+        """Return the tracks of both."""
+        ids, seen, points, normals, halves = (np.concatenate(pair) for pair in zip(self[:5], other[:5], strict=True))
+        information, vector = self.information + other.information, self.vector + other.vector
+        return EliminatedTracks(ids, seen, points, normals, halves, information, vector)
+
+    def landmarks(self, rows: IntArray) -> tuple[IntArray, Array, Array, Array]:
+        """Return some tracks (K,) as landmarks: what :meth:`JointBelief.add_landmarks` takes.
+
+        The error of a landmark is ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``, that of its least-squares point.
+        """
+        root_inverse = np.linalg.inv(np.linalg.cholesky(self.normals[rows, :3, :3]))
+        to_point = np.swapaxes(root_inverse, 1, 2)
+        jacobian = -(to_point @ self.halves[rows]).reshape(3 * len(rows), len(self.vector))
+        return self.track_ids[rows], self.points[rows], jacobian, to_point @ root_inverse
 
 
-def accepted_tracks(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate) -> AcceptedTracks:
-    """Return the tracks that pass, some of them without one of their sightings.
+def eliminated_tracks(
+    sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate
+) -> EliminatedTracks:
+    """Return the tracks that pass, some of them without one of their sightings, with their landmarks eliminated.
 
-    ``gate`` counts every test, so a track that is tested twice counts twice.
+    A track without two sightings is not tested. ``gate`` counts every test, so a track that is tested twice counts
+    twice.
     """
-    accepted, again = _tested(sightings, window, rig, gate)
-    return accepted.joined(_tested(again, window, rig, gate)[0]) if len(again.track_ids) else accepted
+    passed, again = _tested(sightings, window, rig, gate)
+    return passed.joined(_tested(again, window, rig, gate)[0]) if len(again.track_ids) else passed
 
 
 def _tested(
     sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate
-) -> tuple[AcceptedTracks, TrackSightings]:
+) -> tuple[EliminatedTracks, TrackSightings]:
     """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, to retest."""
     from filters.kalman import kernels
 
-    points, reliable, nis, dof, worst, H, residuals, track = kernels.test_tracks(
-        (sightings.uvs_px, sightings.seen),
-        (window.poses, window.poses_at),
-        np.ascontiguousarray(window.cov),
-        camera_for_kernels(rig),
-        (LEAST_DISPARITY_PX, LEAST_DEPTH_M),
-        (gate.bounds(3 * sightings.seen.shape[1]), MISMATCHED_TRACK_FACTOR),
+    count, width = sightings.seen.shape
+    points, reliable, nis, dof, worst, weights, (normals, halves, of_halves, of_poses, vector) = (
+        kernels.eliminate_tracks(
+            (sightings.uvs_px, sightings.seen),
+            (window.poses, window.poses_at),
+            np.ascontiguousarray(window.cov),
+            camera_for_kernels(rig),
+            (LEAST_DISPARITY_PX, LEAST_DEPTH_M),
+            gate.limits(3 * width),
+            (MISMATCHED_TRACK_FACTOR, gate.track_weight),
+        )
     )
-    accepted = np.zeros(len(reliable), dtype=bool)
-    accepted[reliable] = gate.accepts(nis[reliable], dof[reliable])
-    weights = gate.weights(nis, dof, accepted)
-    if gate.weighs:
-        roots = np.sqrt(weights)[track]
-        H, residuals = roots[:, None] * H, roots * residuals
-    passed = AcceptedTracks(sightings.select(accepted), points[accepted], weights[accepted], H, residuals)
+    accepted = weights > 0.0
+    gate.count(nis[reliable], dof[reliable], accepted[reliable])
+    information = -(halves.T @ halves)
+    information.reshape(width, 6, width, 6)[np.arange(width), :, np.arange(width)] += of_poses
+    passed = EliminatedTracks(
+        sightings.track_ids[accepted],
+        sightings.seen[accepted],
+        points[accepted],
+        normals[accepted],
+        halves.reshape(count, 3, 6 * width)[accepted],
+        information,
+        vector - halves.T @ of_halves,
+    )
     mismatched = np.flatnonzero(worst >= 0)
     less = sightings.select(mismatched)
     less.seen[np.arange(mismatched.size), worst[mismatched]] = False
-    return passed, less.select(less.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+    return passed, less
+
+
+def correct_by_landmarks(
+    joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate
+) -> None:
+    """Do as :func:`joint_landmarks.correct`: correct the whole state by its landmarks, all shown by the frame."""
+    from filters.kalman import kernels
+
+    if not len(joint.landmark_ids):
+        return
+    order = np.argsort(frame.track_ids)
+    uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
+    nis, dof, accepted, *innovation = kernels.test_landmarks(
+        (uvs_px[:, None], joint.points, at.points(joint)),
+        (joint.clones[-1:], at.clones(joint)[-1:]),
+        (joint.cov, joint.landmark_columns.start),
+        camera_for_kernels(rig),
+        gate.limits(3),
+        gate.track_weight,
+    )
+    gate.count(nis, dof, accepted)
+    if accepted.any():
+        joint.update_carried(*innovation)
 
 
 def given_tracks_in_view(
@@ -232,20 +278,11 @@ def given_tracks_in_view(
     size = len(root)
     by_root = H_newest @ root[-6:], times_root(between, root)
     normals = depths_m, *of_points, H_newest, of_poses, vector
-    eliminated = kernels.add_newest(in_view, normals, by_root, _limits(gate.probability, gate.huber))
+    eliminated = kernels.add_newest(in_view, normals, by_root, gate.limits(3))
 
     matrix = transposed_root_times(root, (of_poses @ root.reshape(-1, 6, size)).reshape(size, size))
     matrix, vector = without_products(matrix, by_root[1]), root.T @ vector - by_root[1].T @ eliminated
     return _corrected(joint, root, rig.track_weight * matrix, rig.track_weight * vector)
-
-
-@lru_cache(maxsize=4)
-def _limits(probability: float | None, huber: float | None) -> tuple[Array, Array]:
-    """Return the bound of the NIS (4,) and Huber's threshold (4,), infinite without that loss, at 0 to 3 degrees."""
-    thresholds = np.full(4, np.inf)
-    if huber is not None:
-        thresholds[2:] = huber_threshold(np.array([2, 3]), huber)
-    return FrameGate(probability).bounds(3), thresholds
 
 
 def _corrected(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:

@@ -25,7 +25,7 @@ def test_a_landmark_is_outdated_once_it_has_moved_by_its_share_of_the_distance()
     joint = JointBelief(motion_model(sequence.noise, sequence.gravity_world).initial_belief(sequence.prior))
     joint.clone()
     eye, ahead = joint.clones[0, :3, 3], np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
-    joint.add_landmarks(np.array([3, 5]), eye + ahead, np.zeros((6, joint.cov.shape[0])), np.eye(6))
+    joint.add_landmarks(np.array([3, 5]), eye + ahead, np.zeros((6, 6)), np.tile(np.eye(3), (2, 1, 1)))
     joint.points = joint.points + np.array([[-2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     assert AtFirstEstimates(0.2).outdated(joint).tolist() == [True, False]
     assert not AtFirstEstimates().outdated(joint).any()

@@ -57,12 +57,12 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     joint, frame, rig = scene(scenario, belief)
     n, part = joint.cov.shape[0], joint_landmarks.columns(joint)
     delta = 0.02 * np.random.default_rng(3).standard_normal(n)
-    delta[part][:6] = delta[:6]
+    delta[-6:] = delta[:6]
     measurement = Scene(joint, frame, rig).measurement()
 
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
-        moved = joint.displaced(delta + np.r_[change[:6], np.zeros(part.start - 6), change])
+        moved = joint.displaced(delta + np.r_[change[-6:], np.zeros(part.start - 6), change])
         return measurement.stacked(joint_landmarks.linearise_sightings(moved, frame, AT, rig))[1]
 
     seen = joint_landmarks.linearise_sightings(joint.displaced(delta), frame, AT, rig)
@@ -119,7 +119,7 @@ class LagZero:
 
     def __init__(self, given: Scene) -> None:
         self._joint, part = given.joint, joint_landmarks.columns(given.joint)
-        self._keys = [X(0), *(L(i) for i in given.joint.landmark_ids.tolist())]
+        self._keys = [*(L(i) for i in given.joint.landmark_ids.tolist()), X(0)]
         noise = gtsam.noiseModel.Gaussian.Covariance(given.joint.cov[part, part])
         self._sightings = list(StereoFactors(given.rig).of(given.frame, 0))
         self._graph = gtsam.NonlinearFactorGraph()
@@ -139,12 +139,12 @@ class LagZero:
     def values(self, T_world_imu: Array, points: Array) -> gtsam.Values:
         values = gtsam.Values()
         values.insert(X(0), gtsam.Pose3(T_world_imu))
-        for key, point in zip(self._keys[1:], points, strict=True):
+        for key, point in zip(self._keys[:-1], points, strict=True):
             values.insert(key, point)
         return values
 
     def sightings_information(self, T_world_imu: Array, points: Array) -> Array:
-        """Return H^T H of GTSAM's own linearisation of the sightings, pose first."""
+        """Return H^T H of GTSAM's own linearisation of the sightings, the pose last."""
         graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
         for factor in self._sightings:
             graph.add(factor)
@@ -153,18 +153,18 @@ class LagZero:
         return np.asarray(graph.linearize(self.values(T_world_imu, points)).hessian(ordering)[0])
 
     def _residual(self, this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        T, points = values.atPose3(X(0)).matrix(), np.array([values.atPoint3(k) for k in self._keys[1:]])
+        T, points = values.atPose3(X(0)).matrix(), np.array([values.atPoint3(k) for k in self._keys[:-1]])
         error = self._error(T, points)
         if jacobians is not None:
-            jacobians[0] = numerical_jacobian(lambda d: self._error(T @ se3_exp(d), points), 6)
+            jacobians[len(points)] = numerical_jacobian(lambda d: self._error(T @ se3_exp(d), points), 6)
             for i in range(len(points)):
-                jacobians[i + 1] = numerical_jacobian(
+                jacobians[i] = numerical_jacobian(
                     lambda d, i=i: self._error(T, points + np.eye(len(points))[i][:, None] * d), 3
                 )
         return error
 
     def _error(self, T: Array, points: Array) -> Array:
-        """Return the move (k,) that leads here from the prediction: a pose, and relative inverse depths."""
+        """Return the move (k,) that leads here from the prediction: relative inverse depths, and a pose."""
         T_imu_world, turn = se3_inverse(self._joint.core.T_world_imu), self._joint.core.T_world_imu[:3, :3]
         predicted, anchors = self._joint.points, self._joint.anchors
         pose = se3_log(T_imu_world @ T)
@@ -173,7 +173,7 @@ class LagZero:
         change = (inverse_depth(now) - inverse_depth(at_first))[..., None]
         relative = anchors[:, :3, :3] @ np.linalg.solve(inverse_depth_jacobian(at_first), change)
         with_pose = turn @ pose[3:] - skew(predicted - self._joint.core.T_world_imu[:3, 3]) @ (turn @ pose[:3])
-        return np.concatenate([pose, (relative[..., 0] + with_pose).reshape(-1)])
+        return np.concatenate([(relative[..., 0] + with_pose).reshape(-1), pose])
 
 
 @both_kinds
@@ -183,7 +183,7 @@ def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario) -> Non
     pose = smoothed.atPose3(X(0)).matrix()
     points = np.array([smoothed.atPoint3(L(i)) for i in joint.landmark_ids.tolist()])
     measurement = given.measurement()
-    nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.clone_columns.start))
+    nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.landmark_columns.start))
     single = joint.displaced(measurement.after(measurement.step(nothing).pull).delta)
     gate = FrameGate(probability=1.0)
     iekf.correct(joint, frame, AT, rig, gate)

@@ -27,7 +27,7 @@ def belief(sequence) -> InverseDepthBelief:
     joint = InverseDepthBelief(core, sequence.rig.T_imu_cam, AtFirstEstimates())
     joint.clone()
     points = transform(core.T_world_imu @ sequence.rig.T_imu_cam, POINTS_CAM)
-    joint.add_landmarks(IDS, points, np.zeros((6, joint.cov.shape[0])), np.eye(6))
+    joint.add_landmarks(IDS, points, np.zeros((6, 6)), np.tile(np.eye(3), (2, 1, 1)))
     return joint
 
 

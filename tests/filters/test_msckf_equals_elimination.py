@@ -1,4 +1,4 @@
-"""Eliminating the landmarks by null space and compressing by QR is one Gauss-Newton step over poses and landmarks.
+"""Eliminating the landmarks by the Schur complement is one Gauss-Newton step over poses and landmarks.
 
 The parts are compared at full noise, where both sides linearise at the same values. The filter as a whole is
 compared with the batch on a problem that is linear in effect, as in test_joint_ekf_equals_batch.py.
@@ -12,9 +12,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.kalman import joint_landmarks
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
-from filters.kalman.tracks import AcceptedTracks, WindowPoses, WindowTracks, accepted_tracks
+from filters.kalman.tracks import EliminatedTracks, WindowPoses, WindowTracks, eliminated_tracks
 from filters.msckf import Msckf
 from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
 from toolkit.geometry import Array, se3_inverse, se3_log
@@ -34,7 +33,7 @@ class Window(NamedTuple):
     """A belief with a clone a frame and no correction yet, and the tracks that its clones saw."""
 
     joint: JointBelief
-    tracks: AcceptedTracks
+    tracks: EliminatedTracks
 
 
 def window_of(recording) -> Window:
@@ -48,16 +47,7 @@ def window_of(recording) -> Window:
     taken = tracks.take(tracks.seen.sum(axis=1) >= 2)
     columns = joint.clone_columns
     poses = WindowPoses(joint.clones, joint.clones, joint.cov[columns, columns])
-    return Window(joint, accepted_tracks(taken, poses, setup.rig, FrameGate(None)))
-
-
-def step_to_least_squares(linearised: joint_landmarks.Linearised) -> Array:
-    """Return the Gauss-Newton step (F, 3) of points, the poses held, to the least squares of their sightings."""
-    residuals, _, H = linearised
-    rows = 3 * H.shape[1]
-    H, residuals = H.reshape(-1, rows, 3), residuals.reshape(-1, rows, 1)
-    H_T = np.swapaxes(H, 1, 2)
-    return np.linalg.solve(H_T @ H, H_T @ residuals)[..., 0]
+    return Window(joint, eliminated_tracks(taken, poses, setup.rig, FrameGate(None)))
 
 
 class GaussNewtonStep:
@@ -72,11 +62,11 @@ class GaussNewtonStep:
         for c, pose in enumerate(joint.clones):
             values.insert(X(c), gtsam.Pose3(pose))
             terms.append((X(c), prior[:, self.rest + 6 * c :][:, :6]))
-        for track_id, point in zip(window.tracks.sightings.track_ids.tolist(), window.tracks.points, strict=True):
+        for track_id, point in zip(window.tracks.track_ids.tolist(), window.tracks.points, strict=True):
             values.insert(L(track_id), point)
         seen = gtsam.NonlinearFactorGraph()
         for packet in recording.sequence.packets():
-            used = np.isin(packet.frame.track_ids, window.tracks.sightings.track_ids)
+            used = np.isin(packet.frame.track_ids, window.tracks.track_ids)
             for factor in StereoFactors(recording.sequence.rig).of(packet.frame.select(used), packet.index):
                 seen.add(factor)
         linear = seen.linearize(values)
@@ -88,15 +78,15 @@ class GaussNewtonStep:
         self._marginals = gtsam.Marginals(linear, self._delta)
 
     def of(self, landmarks: list[int]) -> tuple[Array, Array]:
-        """Return the correction of the state, clones and some landmarks, and their covariance."""
-        keys = self._keys + [L(i) for i in landmarks]
+        """Return the correction of the state, some landmarks and the clones, and their covariance."""
+        keys = [self._keys[0], *(L(i) for i in landmarks), *self._keys[1:]]
         joint = self._marginals.jointMarginalCovariance(keys)
         cov = np.block([[joint.at(one, other) for other in keys] for one in keys])
         return np.concatenate([self._delta.at(key) for key in keys]), cov
 
 
 def moved(before, after: JointBelief, first_points: Array) -> Array:
-    """Return by how much an update moved what lies behind the pose, the clones and the landmarks."""
+    """Return by how much an update moved what lies behind the pose, the landmarks and the clones."""
     core, clones = before
     bias = after.core.bias - core.bias
     if core.layout.velocity is None:
@@ -104,7 +94,7 @@ def moved(before, after: JointBelief, first_points: Array) -> Array:
     else:
         rest = np.concatenate([core.T_world_imu[:3, :3].T @ (after.core.v_world - core.v_world), bias])
     poses = se3_log(se3_inverse(clones) @ after.clones)
-    return np.concatenate([rest, poses.ravel(), (after.points - first_points).ravel()])
+    return np.concatenate([rest, (after.points - first_points).ravel(), poses.ravel()])
 
 
 @every_scenario
@@ -112,30 +102,18 @@ def moved(before, after: JointBelief, first_points: Array) -> Array:
 def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept):
     recording = recorded(scenario, 1.0)
     window = window_of(recording)
-    joint, (sightings, points, _, H, residuals) = window
+    joint, tracks = window
     step = GaussNewtonStep(window, recording)
     before = joint.core, joint.clones
-    first = sightings.select(np.arange(kept))
-    linearised = joint_landmarks.linearise(first, points[:kept], joint.clones, joint.clones, recording.sequence.rig)
-    joint_landmarks.add_tracks(joint, first.track_ids, points[:kept], linearised)
-    joint.update(*joint_landmarks.compressed(H, residuals), joint.clone_columns)
-    mean, cov = step.of(sightings.track_ids[:kept].tolist())
+    track_ids, points, jacobian, covs = tracks.landmarks(np.arange(kept))
+    joint.add_landmarks(track_ids, points, jacobian, covs)
+    joint.inform(tracks.information, tracks.vector)
+    mean, cov = step.of(track_ids.tolist())
     # A landmark is added as if it were at its least squares; the search ends micrometres before.
-    mean[len(mean) - 3 * kept :] -= step_to_least_squares(linearised).ravel()
-    assert np.abs(moved(before, joint, points[:kept]) - mean).max() < 1e-7
+    mean[step.rest :][: 3 * kept] -= (covs @ tracks.normals[:kept, 3, :3, None]).ravel()
+    assert np.abs(moved(before, joint, points) - mean).max() < 1e-7
     assert np.abs(mean).max() > 1e-3, "there was something to agree on"
     assert_covariances_agree(joint.cov[6:, 6:], cov, 1e-6)
-
-
-def test_what_many_rows_are_compressed_to_is_the_same_in_products_from_either_side():
-    rng = np.random.default_rng(4)
-    rows, residuals, P = rng.normal(size=(50, 12)), rng.normal(size=50), rng.normal(size=(30, 30))
-    triangle, compressed = joint_landmarks.compressed(rows, residuals)
-    H = triangle @ np.eye(12)
-    np.testing.assert_allclose(H.T @ H, rows.T @ rows, atol=1e-12 * 50)
-    np.testing.assert_allclose(H.T @ compressed, rows.T @ residuals, atol=1e-12 * 50)
-    np.testing.assert_allclose(triangle @ P[3:15], H @ P[3:15], atol=1e-12)
-    np.testing.assert_allclose(triangle @ P[:, 3:15].T, H @ P[:, 3:15].T, atol=1e-12)
 
 
 @pytest.mark.parametrize("rows", [5, 60])

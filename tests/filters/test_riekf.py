@@ -77,7 +77,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     H, residuals = joint_landmarks.stacked(joint, seen).weighed(np.ones(len(seen.depth_m)))
     H_plain = np.zeros((residuals.size, convert.shape[0]))
     H_wide, d = H.toarray(), joint.core.layout.size
-    H_plain[:, :6], H_plain[:, d:] = H_wide[:, :6], H_wide[:, 6:]
+    H_plain[:, :6], H_plain[:, d:] = H_wide[:, -6:], H_wide[:, :-6]
     H = H_plain @ np.linalg.inv(convert)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
     xi = gain @ residuals
@@ -160,8 +160,8 @@ def gauge(joint: JointBelief, turns: Array) -> Array:
     if core.layout.velocity is not None:
         rows.append(np.hstack([still, -core.T_world_imu[:3, :3].T @ skew(core.v_world) @ turns]))
     rows.append(np.zeros((core.layout.size - sum(map(len, rows)), 3 + turns.shape[1])))
-    rows += [of_pose(T) for T in joint.clones]
     rows += [np.hstack([np.eye(3), -skew(point) @ turns]) for point in joint.points]
+    rows += [of_pose(T) for T in joint.clones]
     return np.vstack(rows)
 
 

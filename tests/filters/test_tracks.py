@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import least_squares
 
 from filters import msckf, msckf_fej
@@ -19,8 +19,8 @@ from filters.kalman.tracks import (
     TrackSightings,
     WindowPoses,
     WindowTracks,
-    accepted_tracks,
     camera_for_kernels,
+    eliminated_tracks,
     given_tracks_in_view,
 )
 from tests.filters.conftest import recorded, with_clones
@@ -85,14 +85,14 @@ def least_squares_point(uvs_px, seen, start, window, rig):
 
 def found_of(sightings, window, rig, probability=0.95):
     """Return what the kernel finds of tracks."""
-    bounds = chi2_bound(np.arange(3 * sightings.seen.shape[1] + 1), probability)
-    return kernels.test_tracks(
+    return kernels.eliminate_tracks(
         (sightings.uvs_px, sightings.seen),
         (window.poses, window.poses_at),
         np.ascontiguousarray(window.cov),
         camera_for_kernels(rig),
         (LEAST_DISPARITY_PX, LEAST_DEPTH_M),
-        (bounds, 2.0),
+        FrameGate(probability).limits(3 * sightings.seen.shape[1]),
+        (2.0, 1.0),
     )
 
 
@@ -130,24 +130,29 @@ def sightings_in(rig, window, left_only=0.0) -> TrackSightings:
 def test_tracks_are_tested_as_in_the_textbook(flight, left_only):
     rig, _, window = flight
     sightings = sightings_in(rig, window, left_only)
-    points, reliable, nis, dof, worst, H, residuals, track = found_of(sightings, window, rig)
+    points, reliable, nis, dof, worst, weights, (_, halves, of_halves, of_poses, vector) = found_of(
+        sightings, window, rig
+    )
     assert reliable.sum() > 25 and not reliable[7]
-    assert (worst[reliable] >= 0).any() and len(track) > 100
+    assert (worst[reliable] >= 0).any() and np.unique(weights).tolist() == [0.0, 1.0]
     missing = sightings.seen & np.isnan(sightings.uvs_px[..., 1])
     assert dof.tolist() == (3 * sightings.seen.sum(axis=1) - missing.sum(axis=1) - 3).tolist()
+    information, right = np.zeros((6 * WIDTH, 6 * WIDTH)), np.zeros(6 * WIDTH)
     for f in np.flatnonzero(reliable):
-        uvs_px, weights = sightings.uvs_px[f], sightings.seen[f].astype(float)
-        assert nis[f] == pytest.approx(nis_of(uvs_px, weights, points[f], window, rig), rel=TOLERANCE)
-        r, H_dense = without_landmark(*rows_of(uvs_px, weights, points[f], window, rig))
-        own, information = track == f, H_dense.T @ H_dense
-        assert own.any() == (nis[f] < chi2_bound(dof[f], 0.95))
-        if own.any():
-            assert H[own].T @ H[own] == pytest.approx(information, abs=TOLERANCE * np.abs(information).max())
-            assert H[own].T @ residuals[own] == pytest.approx(H_dense.T @ r, abs=TOLERANCE * np.abs(information).max())
+        uvs_px, seen = sightings.uvs_px[f], sightings.seen[f].astype(float)
+        assert nis[f] == pytest.approx(nis_of(uvs_px, seen, points[f], window, rig), rel=TOLERANCE)
+        assert weights[f] == (nis[f] < chi2_bound(dof[f], 0.95))
+        r, H = without_landmark(*rows_of(uvs_px, seen, points[f], window, rig))
+        information += weights[f] * H.T @ H
+        right += weights[f] * H.T @ r
         if worst[f] >= 0 and sightings.seen[f].sum() > 2:  # of two sightings one is as bad as the other
-            without = [nis_of(uvs_px, weights * (np.arange(WIDTH) != j), points[f], window, rig) for j in range(WIDTH)]
+            without = [nis_of(uvs_px, seen * (np.arange(WIDTH) != j), points[f], window, rig) for j in range(WIDTH)]
             without = np.where(sightings.seen[f], without, np.inf)
             assert without[worst[f]] == pytest.approx(without.min(), rel=1e-6)
+    assert block_diag(*of_poses) - halves.T @ halves == pytest.approx(
+        information, abs=TOLERANCE * np.abs(information).max()
+    )
+    assert vector - halves.T @ of_halves == pytest.approx(right, abs=TOLERANCE * np.abs(right).max())
 
 
 @pytest.mark.parametrize("left_only", [0.0, 0.3])
@@ -230,31 +235,35 @@ def gated(scene, sightings, mismatches=()):
     uvs_px, gate = sightings.uvs_px.copy(), FrameGate(0.95)
     for n, (track, view) in enumerate(mismatches):
         uvs_px[track, view] += [[40.0, 40.0, -30.0], [-35.0, -30.0, 25.0]][n]
-    accepted = accepted_tracks(sightings._replace(uvs_px=uvs_px), window_of(joint), rig, gate)
-    return accepted, (gate.tested, gate.accepted)
+    passed = eliminated_tracks(sightings._replace(uvs_px=uvs_px), window_of(joint), rig, gate)
+    return passed, (gate.tested, gate.accepted)
 
 
 @pytest.mark.parametrize("view", [None, 0, 2, VIEWS - 1])
 def test_a_mismatched_sighting_costs_a_track_that_sighting_alone(scene, view):
-    accepted, counts = gated(scene, scene[2], () if view is None else [(4, view)])
-    assert sorted(accepted.sightings.track_ids) == list(range(SOUND))
-    row = accepted.sightings.track_ids.tolist().index(4)
-    assert accepted.sightings.seen[row].tolist() == [other != view for other in range(VIEWS)]
+    passed, counts = gated(scene, scene[2], () if view is None else [(4, view)])
+    assert sorted(passed.track_ids) == list(range(SOUND))
+    row = passed.track_ids.tolist().index(4)
+    assert passed.seen[row].tolist() == [other != view for other in range(VIEWS)]
     assert counts == (SOUND + (view is not None), SOUND)
-    assert len(accepted.H) == len(accepted.residuals) == SOUND * (3 * VIEWS - 3) - 3 * (view is not None)
+    without = scene[2]._replace(seen=scene[2].seen.copy())
+    if view is not None:
+        without.seen[4, view] = False
+    expected = gated(scene, without)[0].information
+    np.testing.assert_allclose(passed.information, expected, atol=TOLERANCE * np.abs(expected).max())
 
 
 def test_two_mismatches_cost_the_track_and_so_does_one_of_two_sightings(scene):
-    accepted, counts = gated(scene, scene[2], [(7, 0), (7, 3)])
-    assert 7 not in accepted.sightings.track_ids and counts == (SOUND + 1, SOUND - 1)
+    passed, counts = gated(scene, scene[2], [(7, 0), (7, 3)])
+    assert 7 not in passed.track_ids and counts == (SOUND + 1, SOUND - 1)
     twice = scene[2]._replace(seen=np.tile(np.arange(VIEWS) < 2, (SOUND, 1)))
-    accepted, counts = gated(scene, twice, [(3, 1)])
-    assert 3 not in accepted.sightings.track_ids and counts == (SOUND, SOUND - 1)
+    passed, counts = gated(scene, twice, [(3, 1)])
+    assert 3 not in passed.track_ids and counts == (SOUND, SOUND - 1)
 
 
 def test_no_track_at_all_is_no_test(scene):
-    accepted, counts = gated(scene, scene[2].select(np.zeros(SOUND, dtype=bool)))
-    assert len(accepted.points) == len(accepted.H) == 0 and counts == (0, 0)
+    passed, counts = gated(scene, scene[2].select(np.zeros(SOUND, dtype=bool)))
+    assert len(passed.points) == 0 and not passed.information.any() and counts == (0, 0)
 
 
 # The answer given the tracks in view.

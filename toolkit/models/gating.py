@@ -108,9 +108,11 @@ class FrameGate:
     accepted: int = 0
     unconverged: int = 0
 
-    def bounds(self, most: int) -> Array:
-        """Return the gate's bound of the NIS at each number of degrees of freedom from 0 to ``most``, (most + 1,)."""
-        return self._table(most).bound[: most + 1]
+    def limits(self, most: int) -> tuple[Array, Array]:
+        """Return the bound of the NIS and Huber's threshold, infinite without that loss, at 0 to ``most`` degrees."""
+        bits = _bits(most)
+        thresholds = np.full(2**bits, np.inf) if self.huber is None else _thresholds(self.huber, bits)
+        return self._table(most).bound, thresholds
 
     def bound(self, dof: IntArray | int) -> Array:
         """Return the gate's bound of the NIS at each number of degrees of freedom (N,)."""
@@ -140,11 +142,6 @@ class FrameGate:
             self.nis_expected += float(table.expected[dof][accepted].sum())
         self.tested += accepted.size
         self.accepted += count
-
-    @property
-    def weighs(self) -> bool:
-        """Say whether accepted innovations may have a weight below 1."""
-        return self.huber is not None or self.track_weight != 1.0
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
         """Return the weights (N,) of innovations of NIS (N,) and ``dof`` (N,); 0 where not ``accepted`` (N,).
