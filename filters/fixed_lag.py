@@ -7,9 +7,6 @@ the window. Three faults are recovered from, and the log lists them:
 - a landmark that has fallen behind the camera is dropped and started again from its next sighting;
 - a variable that makes the window's system indeterminate is held at its value;
 - a landmark whose gate has rejected more sightings than it was built from is started again, if the rejected ones agree.
-
-With other ``marginals`` than those at first estimates, or without their cross-covariances, the window is not GTSAM's
-but ``relinearised_window``: what left it is linearised at the estimates of every frame, as in a Kalman filter.
 """
 
 from collections.abc import Collection
@@ -22,26 +19,14 @@ from filters.kalman.thinning import Thinned
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery
-from filters.smoothing.relinearised_window import (
-    AT_FIRST,
-    Coordinates,
-    InBody,
-    InWorld,
-    Kept,
-    RelinearisedWindow,
-    whole,
-    without_cross_covariances,
-)
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet
 from toolkit.models.factors import points_of
-from toolkit.settings.records import Scalar
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
-OPTIONS = {"marginals": ("first", "latest", "invariant"), "cross_covariances": (True, False)}
 INGREDIENTS = (
     "landmark uncertainty",
     "biases",
@@ -51,13 +36,7 @@ INGREDIENTS = (
     "long-lived landmarks",
     "relinearisation",
 )
-# Not without consistent linearisation: marginals at the latest estimates take fourteen times as long, and the filters
-# show what that brings.
-WITHOUT = {
-    "biases": {"noise.biases": "fixed"},
-    "cross-covariances": {"cross_covariances": False},
-    "past poses": {"window.most_states": 1},
-}
+WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 
 class LagWindow(Protocol):
@@ -82,18 +61,7 @@ class LagWindow(Protocol):
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     lag_s = setup.settings.window.seconds(setup.motion_kind)
-    return Thinned(setup, FixedLag(setup, lag_s, window_of(setup, round(lag_s * NS_PER_S))))
-
-
-def window_of(setup: Setup, lag_ns: int) -> LagWindow:
-    """Return the window that the options ask for; by default GTSAM's incremental one."""
-    in_body = InBody(setup.rig.T_imu_cam)
-    marginals: dict[Scalar, Coordinates] = {"first": AT_FIRST, "latest": InWorld(), "invariant": in_body}
-    kept: dict[Scalar, Kept] = {True: whole, False: without_cross_covariances}
-    coordinates, kept_of = setup.choice("marginals", marginals), setup.choice("cross_covariances", kept)
-    if coordinates is AT_FIRST and kept_of is whole:
-        return FixedLagTree(lag_ns)
-    return RelinearisedWindow(lag_ns, coordinates, kept_of)
+    return Thinned(setup, FixedLag(setup, lag_s))
 
 
 class FixedLag:

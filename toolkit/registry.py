@@ -184,7 +184,9 @@ class EstimatorEntry:
         for option, value in settings.options_of(self.name).items():
             if option not in known:
                 names = ", ".join(sorted(known)) or "none"
-                raise EstimatorError(f"estimator {self.name} has no option {option}; it has {names}")
+                others = [name for name, entry in discover().items() if option in entry.options()]
+                there = f"; {' and '.join(others)} has it" if others else ""
+                raise EstimatorError(f"estimator {self.name} has no option {option}; it has {names}{there}")
             if known[option] and value not in known[option]:
                 values = " or ".join(str(one).lower() if isinstance(one, bool) else str(one) for one in known[option])
                 raise EstimatorError(f"estimator {self.name}: option {option} is {value!r}; it takes {values}")

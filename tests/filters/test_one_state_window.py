@@ -1,4 +1,4 @@
-"""The window of `fixed-lag` at its one end: the newest state alone is the iterated Kalman filter (4 s).
+"""The window at its one end: the newest state alone is a joint Kalman filter, and of `sliding-window` `iekf` (4 s).
 
 At its other end, with all states in it, it is the batch: test_infinite_lag.py.
 """
@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from filters import fixed_lag, iekf
+from filters import fixed_lag, iekf, sliding_window
 from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
 from toolkit import runner
 from toolkit.settings import Settings
@@ -25,25 +25,32 @@ SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=20)) for s in SCENAR
 ONE_STATE = Window(most_states=1)
 
 
-def last_answer(recording, marginals):
+def last_answer(recording, build, options):
     """Return the causal answer of a window of one state at the last frame of a recording."""
-    setup = replace(recording.setup, settings=Settings(window=ONE_STATE), options={"marginals": marginals})
-    estimator = fixed_lag.build(setup)
+    setup = replace(recording.setup, settings=Settings(window=ONE_STATE), options=options)
+    estimator = build(setup)
     return [estimator.step(packet) for packet in recording.sequence.packets()][-1]
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-@pytest.mark.parametrize("marginals", fixed_lag.OPTIONS["marginals"])
-def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, marginals):
+@pytest.mark.parametrize(
+    ("build", "options"),
+    [
+        (fixed_lag.build, {}),
+        *((sliding_window.build, {"marginals": kind}) for kind in sliding_window.OPTIONS["marginals"]),
+    ],
+    ids=["first", *sliding_window.OPTIONS["marginals"]],
+)
+def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, build, options):
     """As a joint Kalman filter: wherever it linearises, forgetting loses nothing. Errors and bounds are as there."""
     recording = recorded(scenario, 1e-4)
     last = recording.sequence.frame_count - 1
     mean, _ = BatchAtTruth(recording, recording.track_ids).state(last)
-    assert np.abs(recording.error_of(last_answer(recording, marginals), last) - mean).max() < 1e-8
+    assert np.abs(recording.error_of(last_answer(recording, build, options), last) - mean).max() < 1e-8
     assert np.abs(mean).max() > 1e-6, "there was something to agree on"
     exact = recorded(scenario, 1e-7)
     _, cov = BatchAtTruth(exact, exact.track_ids).state(last)
-    assert_covariances_agree(last_answer(exact, marginals).cov, cov, 1e-5)
+    assert_covariances_agree(last_answer(exact, build, options).cov, cov, 1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +68,7 @@ def flown():
 
 def test_in_flight_the_newest_state_alone_with_invariant_marginals_is_the_iterated_filter(flown):
     """Held equal but for the velocity's coordinates, to second order. The filter stops at 1e-4 standard deviations."""
-    filtered, smoothed = flown(iekf.build), flown(fixed_lag.build, marginals="invariant")
+    filtered, smoothed = flown(iekf.build), flown(sliding_window.build)
     sigma = np.sqrt(np.diagonal(filtered.cov, axis1=1, axis2=2))
     assert np.abs(smoothed.positions - filtered.positions).max() < 1e-3 * sigma[:, 3:6].max()
     np.testing.assert_allclose(np.sqrt(np.diagonal(smoothed.cov, axis1=1, axis2=2)), sigma, rtol=1e-3)
@@ -69,17 +76,17 @@ def test_in_flight_the_newest_state_alone_with_invariant_marginals_is_the_iterat
 
 def test_marginals_at_the_latest_estimates_gain_information_that_nothing_measured(flown):
     """Of the attitude, whose heading no camera observes; and without cross-covariances of the position as well."""
-    sound, latest = (flown(fixed_lag.build, marginals=kind).cov[-1] for kind in ("invariant", "latest"))
-    decoupled = flown(fixed_lag.build, cross_covariances=False).cov[-1]
+    sound, latest = (flown(sliding_window.build, marginals=kind).cov[-1] for kind in ("invariant", "latest"))
+    decoupled = flown(sliding_window.build, cross_covariances=False).cov[-1]
     assert np.linalg.det(latest[:3, :3]) < 0.5 * np.linalg.det(sound[:3, :3])
     assert np.trace(decoupled[3:6, 3:6]) < 0.1 * np.trace(sound[3:6, 3:6])
 
 
-@pytest.mark.parametrize(("policy", "told"), [("robust", 1), ("none", 0)])
-def test_a_window_that_was_not_solved_to_its_minimum_is_told_once(policy: str, told: int) -> None:
-    """Huber's weights change with every step; without a loss the steps shorten quadratically."""
+@pytest.mark.parametrize(("most_steps", "told"), [(10, 0), (1, 1)])
+def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_steps, told, monkeypatch):
+    """Under the default loss, whose weights change with every step."""
+    monkeypatch.setattr(sliding_window, "_MOST_STEPS", most_steps)
     sequence = simulate(replace(DRIVE, duration_s=0.6), 0)
-    settings = Settings(outliers=POLICIES[policy], estimators={"fixed-lag": {"marginals": "invariant"}})
-    done = runner.run("fixed-lag", fixed_lag.build, sequence, sequence.prior, settings=settings)
+    done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
     assert done.status == "ok"
     assert sum("not solved to its minimum" in line for line in done.log) == told

@@ -14,7 +14,7 @@ from toolkit.settings import Outliers, Settings, Window
 from toolkit.settings.records import Noise
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
+WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "sliding-window", "smart"}
 
 
 @cache

@@ -1,10 +1,11 @@
-"""The window of a fixed-lag smoother that is linearised anew at every frame, with what it marginalises.
+"""Sliding-window smoother that solves its window anew at every frame, what left it included (Sibley et al. 2010).
 
-GTSAM's incremental tree (``fixed_lag_tree``) makes one step a frame and keeps the linearisation of what has left the
-window, with the linearisation points of all variables that this concerns. Here a frame is iterated to convergence, and
-states leave before it corrects: the window of the newest state alone is the iterated Kalman filter (Bell & Cathey
-1993). What leaves becomes a Gaussian on the oldest state of the window and on the landmarks seen before it. Two things
-are chosen outside: the coordinates in which it is Gaussian, and which of its covariances are kept.
+What it approximates: what leaves becomes a Gaussian on the oldest state of the window and on the landmarks seen before
+it. Its mean and its covariance are never computed again, but it is linearised at the estimates of every frame, as the
+past is in a Kalman filter; `fixed-lag` keeps the linearisation points instead. States leave before a frame corrects,
+and a frame is iterated to convergence, so that the window of the newest state alone is the iterated filter (Bell &
+Cathey 1993). Two options say what that Gaussian is: the coordinates in which it is one, and whether its covariances
+between the state and the landmarks are kept. Answers are read as in `fixed-lag`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -14,19 +15,53 @@ from typing import NamedTuple, Protocol
 import gtsam
 import numpy as np
 
+from filters.fixed_lag import FixedLag
 from filters.kalman.coordinates import inverse_depth, inverse_depth_jacobian
+from filters.kalman.thinning import Thinned
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import LAST, Recovery, variable_named
 from toolkit.errors import EstimatorError
+from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, se3_inverse, se3_right_jacobian, skew, transform
+from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, kind_of, linear_factor
+from toolkit.settings.records import Scalar
 
-# A step that lowers the error, half a sum of squares in sigma, by no more than this is the last.
-_NEGLIGIBLE = 1e-6
+CITES = ("sibley2010sliding", "bell1993iterated", "gtsam")
+RUNG, CHANGE = 95, "what left the window linearised anew, a frame iterated to convergence"
+OPTIONS = {"marginals": ("invariant", "latest"), "cross_covariances": (True, False)}
+INGREDIENTS = (
+    "landmark uncertainty",
+    "biases",
+    "cross-covariances",
+    "consistent linearisation",
+    "invariant error",
+    "inverse depth",
+    "past poses",
+    "long-lived landmarks",
+    "relinearisation",
+)
+WITHOUT = {
+    "biases": {"noise.biases": "fixed"},
+    "cross-covariances": {"cross_covariances": False},
+    "past poses": {"window.most_states": 1},
+}
+
+# A step that lowers the error by no more than this, half a squared sigma, is the last: it moves nothing by more than a
+# standard deviation. The weights of a robust loss change with every step, so that shorter steps are many.
+_NEGLIGIBLE = 0.5
 _MOST_STEPS, _MOST_HALVINGS = 10, 6
-# Under a robust loss the weights change with every step, and the steps shorten slowly.
-_UNSOLVED = f"the window was not solved to its minimum in {_MOST_STEPS} steps; further such windows are not listed"
+_UNSOLVED = "the window was not solved to its minimum; further such windows are not listed"
 _UNIT = gtsam.noiseModel.Unit.Create(1)
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    lag_s = setup.settings.window.seconds(setup.motion_kind)
+    coordinates: dict[Scalar, Coordinates] = {"invariant": InBody(setup.rig.T_imu_cam), "latest": InWorld()}
+    kept: dict[Scalar, Kept] = {True: whole, False: without_cross_covariances}
+    chosen = setup.choice("marginals", coordinates), setup.choice("cross_covariances", kept)
+    return Thinned(setup, FixedLag(setup, lag_s, SlidingWindow(round(lag_s * NS_PER_S), *chosen)))
 
 
 class Coordinates(Protocol):
@@ -35,10 +70,6 @@ class Coordinates(Protocol):
     Keys are in the order pose, (velocity,) bias, landmarks.
     """
 
-    @property
-    def is_fixed(self) -> bool:
-        """Say whether variables keep the linearisation points they had when they came into it; a frame is one step."""
-
     def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
         """Return the errors (n,) of values against others, and their Jacobian (n, n) in GTSAM's tangent spaces."""
 
@@ -46,11 +77,8 @@ class Coordinates(Protocol):
         """Take note that the Gaussian is on another state from now on; ``landmarks`` are all that are in it then."""
 
 
-@dataclass(frozen=True)
 class InWorld:
     """GTSAM's own tangent spaces: velocities and landmarks in the axes of the world."""
-
-    is_fixed: bool = False
 
     def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
         """Return the errors (n,), and as their Jacobian the identity, which it is to first order."""
@@ -59,9 +87,6 @@ class InWorld:
 
     def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
         """Change nothing."""
-
-
-AT_FIRST = InWorld(is_fixed=True)
 
 
 @dataclass
@@ -74,7 +99,6 @@ class InBody:
     """
 
     T_imu_cam: Array
-    is_fixed: bool = False
     _anchors: dict[int, Array] = field(default_factory=dict)
 
     def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
@@ -150,14 +174,14 @@ def without_cross_covariances(root: Array, told: Array, size: int) -> tuple[Arra
     return root, root @ mean
 
 
-class RelinearisedWindow:
+class SlidingWindow:
     """Adds factors and values with their stamps; variables older than the lag are marginalised."""
 
     def __init__(self, lag_ns: int, coordinates: Coordinates, kept: Kept) -> None:
         self._lag_ns, self._coordinates, self._kept = lag_ns, coordinates, kept
         self._factors: list[gtsam.NonlinearFactor] = []
         self._left: Gaussian | None = None
-        self._values, self._at = gtsam.Values(), gtsam.Values()
+        self._values = gtsam.Values()
         # The states in the order of time, each with its keys, and the landmarks: both with their last stamps.
         self._states: list[tuple[int, list[int]]] = []
         self._landmarks: dict[int, int] = {}
@@ -173,11 +197,12 @@ class RelinearisedWindow:
         self._landmarks |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
         self._factors += [extension.factors.at(i) for i in range(extension.factors.size())]
         self._values.insert(extension.values)
-        self._at.insert(extension.values)
         oldest_ns = t_ns - self._lag_ns
+        unseen = [key for key, seen_ns in self._landmarks.items() if seen_ns < oldest_ns]
         while self._states[0][0] < oldest_ns:
-            self._marginalise(self._states.pop(0)[1])
-        self._marginalise([key for key, seen_ns in self._landmarks.items() if seen_ns < oldest_ns])
+            leaving = self._states.pop(0)[1]
+            is_last = self._states[0][0] >= oldest_ns
+            self._marginalise([*leaving, *(unseen if is_last else ())])
         return self._solved()
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
@@ -201,7 +226,7 @@ class RelinearisedWindow:
 
     def _marginalise(self, leaving: list[int]) -> None:
         """Marginalise landmarks, or the variables of the state before the oldest one; what they told stays."""
-        gone, values, state = set(leaving), self._at, self._states[0][1]
+        gone, values, state = set(leaving), self._values, self._states[0][1]
         touched = [factor for factor in self._factors if not gone.isdisjoint(factor.keys())]
         linear = gtsam.GaussianFactorGraph()
         for factor in touched:
@@ -223,8 +248,7 @@ class RelinearisedWindow:
         for key in leaving:
             self._landmarks.pop(key, None)
             if values.exists(key):
-                self._values.erase(key)
-                self._at.erase(key)
+                values.erase(key)
 
     def _solved(self) -> Recovery:
         """Iterate to the minimum; landmarks that are indeterminate are dropped."""
@@ -247,44 +271,30 @@ class RelinearisedWindow:
         return Recovery([_UNSOLVED], set())
 
     def _iterate(self, graph: gtsam.NonlinearFactorGraph) -> bool:
-        """Take Gauss-Newton steps, halved until the error falls, until one would lower it negligibly; say if one did.
-
-        With the past at first estimates one step is taken, as in GTSAM's window.
-        """
-        ordering, error = self._order(), self._error(graph, self._at)
-        for _ in range(1 if self._coordinates.is_fixed else _MOST_STEPS):
+        """Take Gauss-Newton steps, halved until the error falls, until one would gain little; say whether one did."""
+        ordering, error = self._order(), self._error(graph, self._values)
+        for _ in range(_MOST_STEPS):
             linear = self._linear(graph)
             self._tree = linear.eliminateMultifrontal(ordering)
             step = self._tree.optimize()
-            gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
-            if self._coordinates.is_fixed or gain <= _NEGLIGIBLE:
-                self._move(self._at.retract(step))
+            if linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step) <= _NEGLIGIBLE:
+                self._values = self._values.retract(step)
                 return True
-            for halvings in range(_MOST_HALVINGS + 1):
-                there = self._at.retract(step.scale(0.5**halvings))
-                now = self._error(graph, there)
-                if now < error:
-                    break
-            else:
+            shortened = (self._values.retract(step.scale(0.5**halvings)) for halvings in range(_MOST_HALVINGS + 1))
+            tried = ((values, self._error(graph, values)) for values in shortened)
+            lower = next(((values, then) for values, then in tried if then < error), None)
+            if lower is None:
                 return False
-            self._move(there)
-            error = now
+            self._values, error = lower
         return False
 
-    def _move(self, there: gtsam.Values) -> None:
-        """Take values, and linearise there from now on what may move."""
-        self._values, at = there, gtsam.Values(there)
-        if self._coordinates.is_fixed and self._left is not None:
-            at.update(self._left.at)
-        self._at = at
-
     def _linear(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.GaussianFactorGraph:
-        linear = graph.linearize(self._at)
+        linear = graph.linearize(self._values)
         if self._left is not None:
-            linear.push_back(self._left.linear(self._at))
+            linear.push_back(self._left.linear(self._values))
         # As in the incremental tree, so that the state before the newest has a clique of its own (``indeterminate``).
         for key in self._states[-1][1]:
-            size = self._at.extract([key]).dim()
+            size = self._values.extract([key]).dim()
             linear.add(gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), _UNIT))
         return linear
 
@@ -292,10 +302,14 @@ class RelinearisedWindow:
         return graph.error(values) + (0.0 if self._left is None else self._left.error(values))
 
     def _order(self) -> gtsam.Ordering:
-        """Return the elimination order: landmarks, those that the Gaussian connects last, then states in time."""
+        """Return the elimination order: landmarks, those that the Gaussian connects last, then states in time.
+
+        The oldest state stands beside the newest, whose covariances are read at every frame.
+        """
         connected = set() if self._left is None else set(self._left.keys)
         landmarks = sorted(self._landmarks, key=lambda key: (key in connected, key))
-        return _ordering([*landmarks, *(key for _, keys in self._states for key in keys), LAST])
+        states = [*self._states[1:-1], *self._states[:1], *self._states[1:][-1:]]
+        return _ordering([*landmarks, *(key for _, keys in states for key in keys), LAST])
 
 
 def _place(key: int) -> int:
