@@ -415,9 +415,6 @@ class ShownTable:
 
     table: Table
 
-    def __str__(self) -> str:
-        return as_text(self.table)
-
     def __repr__(self) -> str:
         return as_text(self.table)
 

@@ -77,7 +77,6 @@ def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan):
     assert {one.status for one in clean} == {"ok"}
     assert {one.status for one in broken} == {"failed"}
     assert "not finite" in broken[0].why
-    assert [record.status for record in grid.records() if record.trial and record.seed == 1] == ["failed"]
 
 
 @pytest.mark.parametrize(

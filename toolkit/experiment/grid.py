@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from toolkit.answers import Output, Status
+from toolkit.answers import Output
 from toolkit.errors import no_such
 from toolkit.experiment.comparison import Row
 from toolkit.experiment.outcome_store import settings_of_a_run
@@ -61,19 +61,6 @@ class Trial(NamedTuple):
         return " ".join([*settings, *faults, *(f"keep:{name}" for name in sorted(self.keep))])
 
 
-class GridRecord(NamedTuple):
-    """One value of one metric of one run, as a long table has it; ``trial`` is what differs from the plan."""
-
-    sequence: str
-    trial: str
-    seed: int
-    estimator: str
-    output: Output
-    metric: str
-    value: float | None
-    status: Status
-
-
 @dataclass(frozen=True, eq=False)
 class Grid:
     """The outcomes of every trial, in the order of the plan's seeds; ``case`` is the recording under the first one."""
@@ -85,17 +72,6 @@ class Grid:
     def row(self, trial: Trial, output: Output) -> Row:
         """Return one kind of output of a trial over the seeds."""
         return Row(output, self.outcomes[trial])
-
-    def records(self) -> Iterator[GridRecord]:
-        """Yield every value of every metric; a run that gave no output has one row, without metric and value."""
-        for trial, outcomes in self.outcomes.items():
-            for one in outcomes:
-                about = (self.case.name, str(trial), one.seed, one.estimator)
-                for output, scored in one.outputs.items():
-                    for key, value in scored.scores.values.items():
-                        yield GridRecord(*about, output, key, value, one.status)
-                if not one.outputs:
-                    yield GridRecord(*about, "final", "", None, one.status)
 
 
 def prepared_case(plan: Plan, progress_for: ProgressFor = silent) -> Prepared:

@@ -176,12 +176,18 @@ class Sweep:
         )
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Yield every value of every metric of every run, a row of the long table; each axis is a column of it."""
-        values = {axis.name: axis.clean for axis in self.axes}
-        by_label = {str(_trial(name, point)): dict(point) for name, point in self.effects}
-        for record in self.grid.records():
-            rest = record._asdict()
-            yield {"sequence": rest.pop("sequence"), **values, **by_label[rest.pop("trial")], **rest}
+        """Yield every value of every metric of every run, a row of the long table; each axis is a column of it.
+
+        A run that gave no output has one row, without metric and value.
+        """
+        clean = {axis.name: axis.clean for axis in self.axes}
+        for point, name in product(self.points, self.estimators):
+            for one in self.grid.outcomes[_trial(name, point)]:
+                about = {"sequence": self.grid.case.name, **clean, **dict(point), "seed": one.seed}
+                given = [(kind, *item) for kind, scored in one.outputs.items() for item in scored.scores.values.items()]
+                for output, key, value in given or [("final", "", None)]:
+                    row = {"estimator": one.estimator, "output": output, "metric": key, "value": value}
+                    yield {**about, **row, "status": one.status}
 
     def _row(self, estimator: str, point: Point) -> Row:
         return self.grid.row(_trial(estimator, point), OUTPUT)
