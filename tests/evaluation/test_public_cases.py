@@ -1,6 +1,5 @@
 """Trajectories as people have them: a table of what is given and what must come of it (2 s)."""
 
-import ast
 import gzip
 import json
 from collections.abc import Callable
@@ -10,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import toolkit
-from toolkit.datasets.trajectories import kitti
+from tests.advice import TOOLKIT, advice_in, is_followed
+from toolkit.datasets.trajectories import kitti, tum
+from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.standings import read_evaluation
 from toolkit.geometry import Array, about_z, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp, so3_exp
 
 S = 10**9
-TOOLKIT = Path(toolkit.__file__).parent
 POINT = np.zeros(3)
 
 
@@ -297,6 +296,11 @@ ADVICE: list[tuple[Lines, list[tuple[str, Lines]]]] = [
         lambda lines: [f"{i} {line}" for i, line in enumerate(lines)],
         [("the first column is the number of the row, and stamps come first; remove it", lambda x: without(x, 0))],
     ),
+    (lambda lines: scaled(lines, 1e-3), [("multiply the stamps by 1000", lambda lines: scaled(lines, 1e3))]),
+    (
+        lambda lines: later(lines, "7200").splitlines(),
+        [("the clocks are about -2 h apart, as time zones are: shift it", lambda x: later(x, "-7200").splitlines())],
+    ),
     (lambda lines: scaled(lines, 1e3), [("milliseconds: divide by 1e3", lambda lines: scaled(lines, 1e-3))]),
     (lambda lines: scaled(lines, 1e6), [("microseconds: divide by 1e6", lambda lines: scaled(lines, 1e-6))]),
     (lambda lines: scaled(lines, 1e9), [("nanoseconds: divide by 1e9", lambda lines: scaled(lines, 1e-9))]),
@@ -317,7 +321,7 @@ ADVICE: list[tuple[Lines, list[tuple[str, Lines]]]] = [
     (
         lambda lines: [f"{Decimal(line.split()[0]) - 1_700_000_000} {line.partition(' ')[2]}" for line in lines],
         [(
-            "add 1700000000.000 s",
+            "1700000000.000 s to it if both start together",
             lambda x: [f"{Decimal(line.split()[0]) + 1_700_000_000} {line.partition(' ')[2]}" for line in x],
         )],
     ),
@@ -394,46 +398,89 @@ ADVICE += [
         [("with a point in numbers", lambda lines: [line.replace(",", ".").replace(";", " ") for line in lines])],
     ),
 ]  # fmt: skip
-# What is followed in a test of its own, or names what is expected and nothing to do.
+# What is followed in a test of its own.
 ELSEWHERE = {
     "multiply each pose by the inverse of the extrinsic (about {}) from the right": "of a body with other axes",
+    "multiply each by the inverse of T_imu_cam from the right": "report/test_external_runs",
     "put {} with a stamp in seconds for each pose beside it, or give both without stamps": "poses of KITTI",
-    "shift the one or the other with --offset, or allow more with --max-dt": "test_evaluate, an offset",
-    "write a pose for each, or a format with stamps": "a file of another length",
-    "write a pose for every frame": "KITTI's lines are frames",
-    "expected {}": "names the columns",
-    "expected {}{}": "names the columns",
-    "give at least two": "a truth of one pose",
-    "leave out the convention of covariances": "an option that is of no use",
-    "choose a format with stamps": "of export",
+    "name it with --cov-convention": "test_covariances",
 }
 
 
-def advice_in(file: str) -> set[str]:
-    """Return what the messages of a module say to do: the end of each text with a semicolon that is no docstring."""
-    tree = ast.parse(Path(TOOLKIT, file).read_text())
-    nodes = list(ast.walk(tree))
-    documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-    inside = {
-        id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node) if part is not node
-    }
-    found = set()
-    for node in nodes:
-        if id(node) in documented | inside or not isinstance(node, ast.JoinedStr | ast.Constant):
-            continue
-        parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-        text = "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in parts)
-        if "; " in text and not text.startswith("#"):
-            found.add(text.rpartition("; ")[2])
-    return {advice for advice in found if advice.replace("{}", "").strip()}
+def without_stamps(lines: list[str], count: int | None = None) -> str:
+    positions, rotations = poses_of(lines[:count])
+    return kitti.text(Trajectory(np.arange(len(positions)), se3(rotations, positions)))
+
+
+def as_text(lines: list[str]) -> str:
+    return "\n".join(lines) + "\n"
+
+
+def later(lines: list[str], by_s: str) -> str:
+    return as_text([f"{Decimal(t) + Decimal(by_s)} {rest}" for t, _, rest in (line.partition(" ") for line in lines)])
+
+
+# What two files are, what is typed besides, the advice, and both as somebody has them who follows it.
+Typed = tuple[Callable[[list[str]], dict[str, str]], str]
+TYPED: list[tuple[Typed, str, Typed]] = [
+    (
+        (lambda lines: {"s.tum": later(lines, "59.93")}, ""),
+        "shift the one or the other with --offset",
+        (lambda lines: {"s.tum": later(lines, "59.93")}, "--offset -59.93"),
+    ),
+    (
+        (lambda lines: {"s.tum": later(lines, "0.01")}, "--max-dt 0.001"),
+        "or allow more with --max-dt",
+        (lambda lines: {"s.tum": later(lines, "0.01")}, "--max-dt 0.02"),
+    ),
+    (
+        (lambda lines: {"truth.tum": without_stamps(lines), "s.tum": without_stamps(lines, 90)}, ""),
+        "write a pose for each, or a format with stamps",
+        (lambda lines: {"truth.tum": without_stamps(lines), "s.tum": without_stamps(lines)}, ""),
+    ),
+    (
+        (lambda lines: {"truth.tum": without_stamps(lines), "s.tum": without_stamps(lines, 9) + "nan " * 12}, ""),
+        "holds a value that is not finite; write a pose for every frame",
+        (lambda lines: {"truth.tum": without_stamps(lines), "s.tum": without_stamps(lines)}, ""),
+    ),
+    (
+        (lambda lines: {"truth.tum": as_text(lines[:1]), "s.tum": as_text(lines)}, ""),
+        "a truth of 1 pose; give at least two",
+        (lambda lines: {"truth.tum": as_text(lines), "s.tum": as_text(lines)}, ""),
+    ),
+]
 
 
 def test_every_advice_about_a_trajectory_is_followed_in_a_test() -> None:
-    followed = [advice for _, steps in ADVICE for advice, _ in steps]
-    modules = ("datasets/trajectories/formats.py", "datasets/trajectories/belonging.py", "evaluation/scoring.py")
-    for advice in set().union(*map(advice_in, modules)) - ELSEWHERE.keys():
-        longest = max(advice.split("{}"), key=len).strip(" :")
-        assert any(longest in one or one in longest for one in followed), advice
+    followed = [advice for _, steps in ADVICE for advice, _ in steps] + [advice for _, advice, _ in TYPED]
+    followed += ["leave out the convention of covariances", "choose a format with stamps"]  # below
+    told = advice_in([*(TOOLKIT / "datasets/trajectories").iterdir(), TOOLKIT / "evaluation/scoring.py"])
+    assert ELSEWHERE.keys() <= told
+    assert not [advice for advice in told - ELSEWHERE.keys() if not is_followed(advice, followed)]
+
+
+@pytest.mark.parametrize(("given", "advice", "followed"), TYPED, ids=[advice for _, advice, _ in TYPED])
+def test_who_follows_an_advice_about_two_files_has_them_compared(
+    scene, vislam, capsys, given, advice, followed
+) -> None:
+    t_ns = scene.stamps(5.0, 0.0, 40.0)
+    lines = rows(t_ns, scene.poses_at(t_ns), TUM).splitlines()
+    for (files, words), status in ((given, 3), (followed, 0)):
+        for name, content in files(lines).items():
+            Path(name).write_text(content)
+        assert vislam("evaluate", "truth.tum", "s.tum", *words.split(), "--quiet") == status
+        assert (advice in capsys.readouterr().err) == (status == 3)
+
+
+def test_who_follows_an_advice_about_a_format_writes_the_file(scene) -> None:
+    poses = scene.poses_at(scene.stamps(5.0))
+    poses[3] = np.nan
+    given = Trajectory(scene.stamps(5.0), poses)
+    with pytest.raises(DataError, match="choose a format with stamps"):
+        kitti.text(given)
+    with pytest.raises(DataError, match="leave out the convention of covariances"):
+        tum.text_with_covariances(given)
+    assert tum.text(given).count("\n") == len(poses)  # a heading, and all but the one
 
 
 @pytest.mark.parametrize("of", range(len(ADVICE)))
