@@ -37,8 +37,8 @@ from toolkit.report.text import (
     section,
 )
 
-# Notes below the printed table, and lines of them with the verdict's; the report has all notes.
-_MOST_NOTES, _MOST_LINES = 3, 7
+# Notes below the printed table; the report has all.
+_MOST_NOTES = 3
 
 _HOW_TO_READ_ONE = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
@@ -70,26 +70,14 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
     """
     lines = [filled(entry, width) for entry in header_lines(comparison, columns)]
     lines += ["", as_text(comparison_table(comparison, columns)), "", filled(verdict(comparison), width, further="")]
-    lines += section("notes", _most_harmful(list(note_lines(comparison, columns)), verdict(comparison)), width)
+    notes = list(note_lines(comparison, columns))
+    shown = notes[:_MOST_NOTES]
+    if notes[_MOST_NOTES:]:
+        shown[-1] += f" ({len(notes) - _MOST_NOTES} more in report.md)"
+    lines += section("notes", shown, width)
     if comparison.card is not None:
         lines += section("card", card_lines(comparison.card), width)
     return "\n".join(lines)
-
-
-def _most_harmful(notes: list[str], above: str) -> list[str]:
-    """Return the first notes, as many as fit with what is above them, the last one with the number of the others."""
-    shown: list[str] = []
-    room = _MOST_LINES - _line_count([above])
-    for i, note in enumerate(notes[:_MOST_NOTES], start=1):
-        left = f" ({len(notes) - i} more in report.md)" if notes[i:] else ""
-        if shown and _line_count([*notes[: i - 1], note + left]) > room:
-            break
-        shown = [*notes[: i - 1], note + left]
-    return shown
-
-
-def _line_count(entries: list[str]) -> int:
-    return "\n".join(section("notes", entries, WIDTH)).count("\n") + 1
 
 
 def comparison_markdown(comparison: Comparison, columns: Columns = None) -> str:
