@@ -42,7 +42,7 @@ def citations(names: Iterable[str]) -> tuple[Cited, ...]:
     Raises EstimatorError for a name nobody knows or a key that references.bib does not have, DataError for a directory
     that is no run's.
     """
-    known = _known()
+    known = {name: entry.found for name, entry in discover().items()} | datasets.modules()
     wanted = [found for name in names for found in _meant(name, known)] or list(known.items())
     return tuple(Cited(name, _entries(module)) for name, module in dict(wanted).items())
 
@@ -61,10 +61,6 @@ def bibtex(cited: Iterable[Cited]) -> str:
     parts += [f"% {', '.join(whose[key])}\n{text}" for key, text in entries.items()]
     parts += [f"% nothing to cite for {', '.join(nothing)}"] if nothing else []
     return "\n\n".join(parts) + "\n"
-
-
-def _known() -> dict[str, FoundModule]:
-    return {name: entry.found for name, entry in discover().items()} | datasets.modules()
 
 
 def _meant(name: str, known: Mapping[str, FoundModule]) -> list[tuple[str, FoundModule]]:

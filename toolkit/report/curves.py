@@ -106,16 +106,12 @@ def from_start(run: Run, output: Output, sequence: Sequence) -> Alignment:
     return placed or NOT_ALIGNED
 
 
-def fit_name(sequence: Sequence) -> str:
-    """Return what is fitted where estimates are aligned to the truth."""
-    return "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
-
-
 def alignment_text(sequence: Sequence) -> str:
     """Say how a figure's estimates are aligned."""
     if sequence.truth is None:
         return "There is no truth; every estimator starts from the same pose and nothing is aligned."
-    return f"Estimates are aligned to the truth by {fit_name(sequence)}."
+    fit = "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
+    return f"Estimates are aligned to the truth by {fit}."
 
 
 def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, sequence: Sequence) -> Errors | None:
@@ -241,14 +237,9 @@ def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: 
     error = -np.einsum("nij,nkj->nki", turn, in_body).reshape(-1, POSE_DOF)
     if covs is None or not np.isfinite(covs[:, :POSE_DOF, :POSE_DOF]).any():
         return Components(t_ns, error, None)
-    deviations = [_deviation(turn, covs[:, block, block]) for block in (ROTATION, POSITION)]
-    return Components(t_ns, error, np.hstack([np.degrees(deviations[0]), deviations[1]]))
-
-
-def _deviation(rotations: Array, covs: Array) -> Array:
-    """Return the standard deviations (n, 3) of covariances (n, 3, 3) in the body frame, along the world's axes."""
-    variance = np.einsum("nij,njk,nik->ni", rotations, covs, rotations)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    variances = [np.einsum("nij,njk,nik->ni", turn, covs[:, of, of], turn) for of in (ROTATION, POSITION)]
+    of_rotation, of_position = (np.sqrt(np.maximum(variance, 0.0)) for variance in variances)
+    return Components(t_ns, error, np.hstack([np.degrees(of_rotation), of_position]))
 
 
 def look_numbers(compared: Iterable[str]) -> dict[str, int]:

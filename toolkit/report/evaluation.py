@@ -97,7 +97,13 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     several, metrics = len(evaluation.sequences) > 1, shown_metrics(evaluation, columns)
     heads: list[tuple[str, ...]] = [("system", "", ""), ("runs", "ok", "")]
     heads += [("mean", "rank", ""), ("first", f"of {len(evaluation.ranked_sequences)}", "")] if several else []
-    medians = {metric: _medians(evaluation, metric, several=several) for metric in (evaluation.ranked_by, *metrics)}
+    found = {
+        metric: [_quartiles_of(evaluation, one, metric, several=several) for one in evaluation.leaderboard]
+        for metric in (evaluation.ranked_by, *metrics)
+    }
+    medians = {
+        metric: [None if one is None else one.median for one in quartiles] for metric, quartiles in found.items()
+    }
     units = {metric: unit_of(metric, values) for metric, values in medians.items()}
     heads += [(evaluation.ranked_by.heading[0], "quartiles", units[evaluation.ranked_by].name)]
     heads += [heading(metric, units[metric]) for metric in metrics]
@@ -105,20 +111,16 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
     for i, standing in enumerate(evaluation.leaderboard):
         counts = [f"{standing.mean_rank:.2f}", str(standing.wins)] if several else []
         ranked_by = evaluation.ranked_by
-        spread = _quartiles_of(evaluation, standing, ranked_by, several=several)
+        spread = found[ranked_by][i]
         cells = [evaluation.cells[standing.estimator, sequence] for sequence in evaluation.sequences]
         count = sum(one.quantiles(ranked_by) is not None for one in cells) if several else standing.runs
-        quartiles = _quartiles(spread, ranked_by, units[ranked_by]) if count > 1 else MISSING
+        ends = () if spread is None or count < 2 else (spread.lower_quartile, spread.upper_quartile)
+        quartiles = " .. ".join(cell(end, ranked_by, units[ranked_by]) for end in ends) or MISSING
         values = [cell(medians[metric][i], metric, units[metric]) for metric in metrics]
         rows.append((standing.estimator, f"{standing.ok} of {standing.runs}", *counts, quartiles, *values))
     before = len(heads) - len(metrics)
     best = {(i, before + j) for j, metric in enumerate(metrics) for i in _best(medians[metric], metric)}
     return Table(tuple(heads), tuple(rows), labels=1, best=frozenset(best))
-
-
-def _medians(evaluation: EvaluatedSystems, metric: Metric, *, several: bool) -> list[float | None]:
-    found = [_quartiles_of(evaluation, one, metric, several=several) for one in evaluation.leaderboard]
-    return [None if quartiles is None else quartiles.median for quartiles in found]
 
 
 def _quartiles_of(
@@ -156,12 +158,6 @@ def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
     if median is None:
         return failed or MISSING
     return f"{cell(median, metric, unit)} ({failed})" if failed else cell(median, metric, unit)
-
-
-def _quartiles(found: Quartiles | None, metric: Metric, unit: ShownUnit) -> str:
-    if found is None:
-        return MISSING
-    return " .. ".join(cell(q, metric, unit) for q in (found.lower_quartile, found.upper_quartile))
 
 
 def uncertainty_table(evaluation: EvaluatedSystems) -> Table | None:

@@ -296,7 +296,11 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
         said = " and ".join(f"{size} with {_listed(some)}" for size, some in by_size.items() if some)
         yield f"Perhaps the error is {said}; among {_tests(found)} tests that may be chance: more data would tell."
     rest = [part for part in silent if part not in likely]
-    if still_open := [part for part in rest if _may_be_twofold(part)]:
+    if still_open := [
+        part
+        for part in rest
+        if any(one.error is not None and (one.error.low < 0.5 or one.error.high > 2.0) for one in part.effects)
+    ]:
         yield f"Too few data to tell of {_listed(still_open)}: a factor of two is not excluded."
     if rest := [part for part in rest if part not in still_open]:
         yield f"The error does not show with {over(found)} that anything is brought by {_listed(rest)}."
@@ -318,23 +322,15 @@ def _helps(part: IngredientRecord) -> bool:
     return any(one.error is not None and one.error.low > 1.0 for one in part.effects)
 
 
-def _may_be_twofold(part: IngredientRecord) -> bool:
-    """Say whether an effect of a factor of two either way is not excluded."""
-    return any(one.error is not None and (one.error.low < 0.5 or one.error.high > 2.0) for one in part.effects)
-
-
 def _listed(parts: Sequence[IngredientRecord]) -> str:
-    return _joined([*map(_with_ranges, parts)])
+    ranges = [dict.fromkeys(one.error.range() for one in part.effects if one.error) for part in parts]
+    told = zip(parts, (" and ".join(known) or "too few runs ended well" for known in ranges), strict=True)
+    return _joined([f"{part.ingredient} ({text})" for part, text in told])
 
 
 def _joined(texts: Sequence[str]) -> str:
     *most, last = texts
     return " and ".join(filter(None, (", ".join(most), last)))
-
-
-def _with_ranges(part: IngredientRecord) -> str:
-    known = dict.fromkeys(one.error.range() for one in part.effects if one.error)
-    return f"{part.ingredient} ({' and '.join(known) or 'too few runs ended well'})"
 
 
 def explanation_table(found: ExplanationRecord) -> Table:

@@ -137,7 +137,7 @@ def write_bundle(directory: Path, target: Path) -> str:
     record = BundleRecord(
         schema="vislam.bundle/1",
         name=directory.resolve().name,
-        hashes=hashes_of(run),
+        hashes=run.scores.hashes if isinstance(run, SeedsFiles) else (run.scores.sequence.hash,),
         packages=installed_packages(),
         files={name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     )
@@ -149,11 +149,6 @@ def write_bundle(directory: Path, target: Path) -> str:
         for name, content in sorted(contents.items()):
             archive.writestr(zipfile.ZipInfo(name, _STAMP), content, zipfile.ZIP_DEFLATED)
     return f"{len(record.files)} files of {record.name}, {len(record.packages)} packages"
-
-
-def hashes_of(run: RunFiles | SeedsFiles) -> tuple[str | None, ...]:
-    """Return the hash of what the estimators read under each seed."""
-    return run.scores.hashes if isinstance(run, SeedsFiles) else (run.scores.sequence.hash,)
 
 
 def installed_packages() -> dict[str, str]:

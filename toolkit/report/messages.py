@@ -351,9 +351,14 @@ class ContestRecord(Struct, frozen=True, kw_only=True):
     ]
 
 
+# The contest that the verdict is about is the first of these that there is.
+_VERDICT_ABOUT: tuple[Question, ...] = ("accuracy in the end", "accuracy at each frame", "withheld tracks")
+
+
 def verdict(comparison: Comparison) -> str:
     """Return the verdict on a comparison in a few sentences."""
-    contest = main_contest(comparison)
+    by_question = {contest.question: contest for contest in comparison.contests}
+    contest = next((by_question[about] for about in _VERDICT_ABOUT if about in by_question), None)
     if contest is None:
         return _of_few(comparison)
     runs = f"{len(comparison.seeds)} seeds" if comparison.over_seeds else "one run"
@@ -364,13 +369,6 @@ def verdict(comparison: Comparison) -> str:
         *(_trust(comparison), _cost(contest), why_sentence(contest)),
     )
     return " ".join(filter(None, sentences))
-
-
-def main_contest(comparison: Comparison) -> Contest | None:
-    """Return the contest that the verdict is about: the accuracy in the end, else by the withheld tracks; or None."""
-    by_question = {contest.question: contest for contest in comparison.contests}
-    wanted = ("accuracy in the end", "accuracy at each frame", "withheld tracks")
-    return next((by_question[question] for question in wanted if question in by_question), None)
 
 
 def _of_few(comparison: Comparison) -> str:

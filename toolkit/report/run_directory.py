@@ -276,7 +276,11 @@ def read_run(directory: Path) -> RunFiles | SeedsFiles:
     if not (directory / REPORT).is_file():
         again = f"repeat it: {manifest.command}" if manifest.command else "repeat the comparison"
         raise DataError(f"{directory} has no {REPORT}: an earlier version wrote it, or that was removed; {again}")
-    return _over_seeds(directory, manifest) if (directory / SEEDS).is_file() else _one_seed(directory, manifest)
+    if not (directory / SEEDS).is_file():
+        return _one_seed(directory, manifest)
+    scores, report = read_seeds(directory / SEEDS), read_seeds_report(directory / REPORT)
+    _check_same_runs(directory, SEEDS, scores.runs, report.runs)
+    return SeedsFiles(directory, scores, report, manifest)
 
 
 def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
@@ -299,12 +303,6 @@ def _inside(directory: Path, name: str) -> bytes:
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise DataError(f"{directory / REPORT} names {name}, which is not in the run directory; repeat the comparison")
     return read_input(directory / name)
-
-
-def _over_seeds(directory: Path, manifest: Manifest) -> SeedsFiles:
-    scores, report = read_seeds(directory / SEEDS), read_seeds_report(directory / REPORT)
-    _check_same_runs(directory, SEEDS, scores.runs, report.runs)
-    return SeedsFiles(directory, scores, report, manifest)
 
 
 def _check_same_runs(

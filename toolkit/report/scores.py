@@ -336,16 +336,9 @@ def _metric(group: Row, metric: Metric) -> MetricOverSeeds:
     described = (
         dict.fromkeys((field.name for field in fields(Spread)), None) | {"n": 0} if spread is None else asdict(spread)
     )
-    return MetricOverSeeds(
-        **described, values=tuple(group.values(metric.key)), quantiles_all=_quantiles_all(group, metric)
-    )
-
-
-def _quantiles_all(group: Row, metric: Metric) -> QuantilesAll | UnsetType:
     found = group.quantiles_of_all(metric)
-    if found is None:
-        return UNSET
-    return of_attributes(QuantilesAll, found, reason=found.reason or UNSET)
+    of_all = UNSET if found is None else of_attributes(QuantilesAll, found, reason=found.reason or UNSET)
+    return MetricOverSeeds(**described, values=tuple(group.values(metric.key)), quantiles_all=of_all)
 
 
 def _whole_runs(group: Row) -> WholeRuns:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from toolkit.experiment.statistics import Interval
-from toolkit.experiment.sweep import BREAKS_AT, Axis, Breaking, Effect, Sweep
+from toolkit.experiment.sweep import BREAKS_AT, Breaking, Sweep
 from toolkit.files.documents import number as finite
 from toolkit.files.documents import of_attributes, reader
 from toolkit.metrics import Metric, known_metrics
@@ -91,6 +91,15 @@ def sweep_document(
 ) -> SweepRecord:
     """Return a sweep as a record; ``figures`` are captions by file, ``files`` what was written beside it."""
     plan, sequence = sweep.grid.plan, sweep.grid.case.sequence
+    axes = [
+        of_attributes(
+            AxisRecord,
+            axis,
+            clean=None if isinstance(axis.clean, float) and math.isinf(axis.clean) else axis.clean,
+            found=tuple(sweep.found[point] for point in axis.points if point in sweep.found),
+        )
+        for axis in sweep.axes
+    ]
     return SweepRecord(
         schema="vislam.sweep/1",
         made=made_here(command),
@@ -101,22 +110,12 @@ def sweep_document(
         estimators=sweep.estimators,
         metric=sweep.metric,
         intervals="seeds" if sweep.over_seeds else "stretches",
-        axes=tuple(_axis(sweep, axis) for axis in sweep.axes),
-        effects=tuple(map(_effect, sweep.effects.values())),
+        axes=tuple(axes),
+        effects=tuple(of_attributes(EffectRecord, e, _in_json, at=dict(e.point)) for e in sweep.effects.values()),
         breaking=sweep.breaking,
         figures=dict(figures or {}),
         files=tuple(files),
     )
-
-
-def _axis(sweep: Sweep, axis: Axis) -> AxisRecord:
-    clean = None if isinstance(axis.clean, float) and math.isinf(axis.clean) else axis.clean
-    found = tuple(sweep.found[point] for point in axis.points if point in sweep.found)
-    return of_attributes(AxisRecord, axis, clean=clean, found=found)
-
-
-def _effect(effect: Effect) -> EffectRecord:
-    return of_attributes(EffectRecord, effect, _in_json, at=dict(effect.point))
 
 
 def _in_json(value: Any) -> Any:

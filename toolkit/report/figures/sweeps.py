@@ -100,10 +100,6 @@ def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> N
     style.scale_by_decades(axes, low, high)
 
 
-def _steps(axis: Axis) -> tuple[Point, ...]:
-    return (CLEAN, *axis.points)
-
-
 def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     metric = metric_of(sweep)
     figure = style.new_figure(3.6)
@@ -139,7 +135,7 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
 
 def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, float]]:
     """Return CPU (ms) and error at each point where all runs are ok; one point where the setting changes neither."""
-    effects = {point: sweep.effects[name, point] for point in _steps(axis)}
+    effects = {point: sweep.effects[name, point] for point in (CLEAN, *axis.points)}
     good = {
         point: (one.cpu_ms, one.error)
         for point, one in effects.items()
