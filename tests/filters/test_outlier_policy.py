@@ -74,36 +74,44 @@ WHOLE = Window(lag_s=2.0)  # no sighting of the scene leaves it
 NOTHING_M = 1e-6
 
 
-def test_ekf_holds_a_sighting_from_one_and_a_half_sigma_on_and_drops_it_beyond_its_gate(pull):
-    """Its whitener holds the landmark's variance as well, here as large as the sighting's: 1.5 becomes 2.1 sigma."""
-    at_one = pull("ekf", 1.0)
-    assert at_one > 100.0 * NOTHING_M
-    assert pull("ekf", 1.5) / at_one == pytest.approx(1.5, rel=0.02)
-    assert pull("ekf", 3.5) / at_one == pytest.approx(2.1, rel=0.1)  # 3.5 would be full weight
-    assert pull("ekf", 6.0) < NOTHING_M
+# By estimator, policy and weight of tracks: how far a sighting off by some sigmas pulls, over the pull of one off by
+# one sigma, to a share of it; and from where on it is dropped, if at all.
+COUNTS_IN_FULL = {12.0: (12.0, 0.1)}
+PULLS: dict[tuple[str, PolicyName, float], tuple[dict[float, tuple[float, float]], float | None]] = {
+    # The whitener of ekf holds the landmark's variance as well, here as large as the sighting's: 1.5 becomes 2.1 sigma.
+    ("ekf", "classic", 1.0): ({1.5: (1.5, 0.02), 3.5: (2.1, 0.1)}, 6.0),
+    # The gate's 2.8 sigma are of an innovation that has the landmark's and the pose's variance in it too: 4.2.
+    ("ekf-slam", "classic", 1.0): ({3.8: (3.8, 0.02)}, 5.0),
+    ("iekf", "classic", 1.0): ({3.8: (3.8, 0.02)}, 5.0),
+    # Loss and gate, 1.5 and 3.37 sigma of the innovation, have both variances in it: the loss begins at 2.1 sigma of
+    # the sighting and the gate at 5.1. A joint filter counts a larger innovation with more noise, and moves the landmark
+    # the less for it, so that its pull still grows up to the gate.
+    ("ekf", "robust", 1.0): ({2.0: (2.0, 0.02), 4.8: (2.1, 0.05)}, 5.6),
+    ("ekf-slam", "robust", 1.0): ({2.0: (2.0, 0.02), 4.8: (3.0, 0.05)}, 5.6),
+    ("iekf", "robust", 1.0): ({2.0: (2.0, 0.02), 4.8: (3.0, 0.05)}, 5.6),
+    # A smoother's fit takes a tenth of the residual. The gate's 3.37 sigma are of an innovation that has the variance
+    # of the landmark in it, which was seen from farther away until then: 4.8 of the sighting, by the stated noise.
+    ("fixed-lag", "robust", 1.0): ({1.5: (1.5, 0.02), 4.4: (1.67, 0.05)}, 5.3),
+    ("isam2", "robust", 0.25): ({1.5: (1.5, 0.02), 4.4: (1.67, 0.05)}, 5.3),
+    ("smart", "robust", 0.25): ({1.5: (1.5, 0.02), 4.4: (1.67, 0.05)}, 5.3),
+    # The loss begins at the gate's bound of 2.8 sigma; beyond 7.9 it is an outlier.
+    **{(name, "classic", 1.0): ({2.5: (2.5, 0.02), 6.5: (3.0, 0.1)}, 12.0) for name in ("fixed-lag", "isam2", "smart")},
+    # A sound sighting is beyond 4.03 sigma once in a thousand; the filters' gate at 95 % would end at 2.8.
+    ("batch", "classic", 1.0): ({3.7: (3.7, 0.02)}, 4.7),
+    **{(name, "none", 1.0): (COUNTS_IN_FULL, None) for name in ("ekf-slam", "fixed-lag", "smart", "batch")},
+    # The report's filter has no gate.
+    ("seed-ekf", "classic", 1.0): (COUNTS_IN_FULL, None),
+}
 
 
-@pytest.mark.parametrize("name", ["ekf-slam", "iekf"])
-def test_joint_filters_count_in_full_what_passes_their_gate_and_nothing_else(pull, name):
-    """The gate's 2.8 sigma are of an innovation that has the landmark's and the pose's variance in it too: 4.2."""
-    at_one = pull(name, 1.0)
-    assert at_one > 100.0 * NOTHING_M
-    assert pull(name, 3.8) / at_one == pytest.approx(3.8, rel=0.02)
-    assert pull(name, 5.0) < NOTHING_M
-
-
-@pytest.mark.parametrize(("name", "held_at"), [("ekf", 2.1), ("ekf-slam", 3.0), ("iekf", 3.0)])
-def test_the_common_policy_holds_from_its_loss_on_and_drops_beyond_its_gate(pull, name, held_at):
-    """Loss and gate, 1.5 and 3.37 sigma of the innovation, have the landmark's variance in it, and the pose's.
-
-    The loss begins at 2.1 sigma of the sighting and the gate at 5.1. A joint filter counts a larger innovation with
-    more noise, and moves the landmark the less for it, so that its pull still grows up to the gate.
-    """
-    at_one = pull(name, 1.0, "robust")
-    assert at_one > 100.0 * NOTHING_M
-    assert pull(name, 2.0, "robust") / at_one == pytest.approx(2.0, rel=0.02)
-    assert pull(name, 4.8, "robust") / at_one == pytest.approx(held_at, rel=0.05)
-    assert pull(name, 5.6, "robust") < NOTHING_M
+@pytest.mark.parametrize(("name", "policy", "weight"), PULLS)
+def test_a_sighting_counts_in_full_is_held_and_is_dropped_where_the_policy_says(pull, name, policy, weight):
+    ratios, dropped_at = PULLS[name, policy, weight]
+    at_one = pull(name, 1.0, policy, weight)
+    assert at_one > 10.0 * NOTHING_M
+    for sigmas, (ratio, share) in ratios.items():
+        assert pull(name, sigmas, policy, weight) / at_one == pytest.approx(ratio, rel=share)
+    assert dropped_at is None or pull(name, dropped_at, policy, weight) < NOTHING_M
 
 
 @pytest.mark.parametrize(("name", "in_view", "later"), [("msckf-fej", 3.2, 3.57), ("msckf-slam", 3.17, 3.47)])
@@ -125,48 +133,11 @@ def test_windowed_filters_weigh_a_sighting_in_view_and_later_its_track_by_the_co
         assert pulled[6.0] < NOTHING_M
 
 
-@pytest.mark.parametrize(("name", "weight"), [("fixed-lag", 1.0), ("isam2", 0.25), ("smart", 0.25)])
-def test_the_common_policy_is_the_smoothers_too(pull, name, weight):
-    """The loss begins at 1.5 sigma of a residual of which the fit takes a tenth.
-
-    The gate's 3.37 sigma are of an innovation that has the variance of the landmark in it, which was seen from farther
-    away until then: they are 4.8 of the sighting. Both are by the stated noise, whatever tracks count.
-    """
-    at_one = pull(name, 1.0, "robust", weight)
-    assert pull(name, 1.5, "robust", weight) / at_one == pytest.approx(1.5, rel=0.02)
-    assert pull(name, 4.4, "robust", weight) / at_one == pytest.approx(1.67, rel=0.05)
-    assert pull(name, 5.3, "robust", weight) < NOTHING_M
-
-
-@pytest.mark.parametrize("name", ["ekf-slam", "fixed-lag", "smart", "batch"])
-def test_without_a_policy_a_mismatch_counts_in_full(pull, name):
-    assert pull(name, 12.0, "none") / pull(name, 1.0, "none") == pytest.approx(12.0, rel=0.1)
-
-
-def test_the_reports_filter_has_no_gate_and_follows_whatever_it_sees(pull):
-    assert pull("seed-ekf", 12.0) / pull("seed-ekf", 1.0) == pytest.approx(12.0, rel=0.1)
-
-
-@pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_online_smoothers_limit_a_sighting_from_the_gates_bound_on_and_drop_outlier_tracks(pull, name):
-    """The gate's bound is 2.8 sigma, of a residual of which the fit takes a tenth; beyond 7.9 it is an outlier."""
-    at_one = pull(name, 1.0)
-    assert at_one > 100.0 * NOTHING_M
-    assert pull(name, 2.5) / at_one == pytest.approx(2.5, rel=0.02)
-    assert pull(name, 6.5) / at_one == pytest.approx(3.0, rel=0.1)  # 6.5 would be full weight
-    assert pull(name, 12.0) < NOTHING_M
-
-
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
 def test_what_the_other_tracks_contradict_is_an_outlier_though_the_motion_allows_it(scene, run_estimator, name):
     """Off by 9.5 sigma: after a motion that is known half as well the gate alone would let it pass."""
     sequence = scene.with_error(9.5)
-    noise = sequence.noise
-    doubtful = replace(
-        noise,
-        velocity_noise_density=2.0 * noise.velocity_noise_density,
-        gyro_noise_density=2.0 * noise.gyro_noise_density,
-    )
+    doubtful = sequence.noise.scaled(2.0)
     settings = Settings(outliers=POLICIES["classic"])
     for known_so_well in (sequence, replace(sequence, noise=doubtful)):
         assert scene.error_m(run_estimator(name, known_so_well, settings=settings)) < NOTHING_M
@@ -186,14 +157,6 @@ def test_where_most_tracks_disagree_none_is_an_outlier(scene, run_estimator, nam
     struck_scene = replace(scene.sequence, observations=replace(seen, uv_px=uv_px))
     run = run_estimator(name, struck_scene, settings=Settings(outliers=POLICIES["classic"]))
     assert (scene.error_m(run) > 100.0 * NOTHING_M) == believed
-
-
-def test_batch_counts_in_full_what_chance_explains_and_nothing_else(pull):
-    """A sound sighting is beyond 4.03 sigma once in a thousand; the filters' gate at 95 % would end at 2.8."""
-    at_one = pull("batch", 1.0)
-    assert at_one > 100.0 * NOTHING_M
-    assert pull("batch", 3.7) / at_one == pytest.approx(3.7, rel=0.02)  # one relinearisation is in it
-    assert pull("batch", 4.7) < NOTHING_M
 
 
 def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_jumped_is_tested_again(scene, run_estimator):
