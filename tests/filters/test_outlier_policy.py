@@ -84,7 +84,7 @@ PULLS: dict[tuple[str, PolicyName, float], tuple[dict[float, tuple[float, float]
     ("ekf-slam", "classic", 1.0): ({3.8: (3.8, 0.02)}, 5.0),
     ("iekf", "classic", 1.0): ({3.8: (3.8, 0.02)}, 5.0),
     # Loss and gate, 1.5 and 3.37 sigma of the innovation, have both variances in it: the loss begins at 2.1 sigma of
-    # the sighting and the gate at 5.1. A joint filter counts a larger innovation with more noise, and moves the landmark
+    # the sighting, the gate at 5.1. A joint filter counts a larger innovation with more noise, and moves the landmark
     # the less for it, so that its pull still grows up to the gate.
     ("ekf", "robust", 1.0): ({2.0: (2.0, 0.02), 4.8: (2.1, 0.05)}, 5.6),
     ("ekf-slam", "robust", 1.0): ({2.0: (2.0, 0.02), 4.8: (3.0, 0.05)}, 5.6),
