@@ -10,15 +10,18 @@ Without an exact truth the bound that the model claims is used, linearised at th
 the error to it is then a test of the model: about 1 where model and estimator are consistent.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
+from toolkit.metrics.parts.against_truth import lengths, rmse
 from toolkit.metrics.parts.consistency import body_errors, stated_errors
 from toolkit.metrics.parts.cramer_rao import claimed_bound, efficient
 from toolkit.metrics.parts.evaluation import Evaluation
-from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.metrics.parts.state_errors import NO_SUCH_BLOCK, state_errors
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
@@ -93,78 +96,63 @@ def against_bound(evaluation: Evaluation) -> AgainstBound:
 def score(evaluation: Evaluation) -> Scores:
     """Score an output against the bound, or against the one the model claims where there is no exact truth."""
     try:
-        found = against_bound(evaluation)
-    except Unavailable as why:
-        return _against_claimed_bound(evaluation, str(why))
-    position_m = _rms(found.bound, POSITION)
-    lost_m = float(np.sqrt(np.square(found.excess[:, POSITION]).sum(axis=1).mean()))
-    values: dict[str, float | None] = {"efficiency_percent": 100.0 * position_m / float(np.hypot(position_m, lost_m))}
-    values |= _sizes(found.bound) | {"error_over_bound": _rms_error_m(evaluation) / position_m}
-    blocks = _blocks(found.layout)
-    per_block: dict[str, float | None] = {
-        f"excess_{key}": None if block is None else _excess(found.excess, found.bound, block)
-        for key, block in blocks.items()
-    } | _claims(found.stated, found.bound, blocks)
-    return _in_order(values | per_block, {key: NO_SUCH_BLOCK for key, value in per_block.items() if value is None})
+        found, why = against_bound(evaluation), ""
+    except Unavailable as reason:
+        found, why = _against_claimed_bound(evaluation), str(reason)
+    position_m, layout = _rms(found.bound, POSITION), found.layout
+    blocks = dict(zip(_BLOCKS, (slice(0, layout.size), POSE, layout.velocity, layout.biases), strict=True))
+
+    def of_excess(compute: Callable[[], float]) -> float:
+        if why:
+            raise Unavailable(why)
+        return compute()
+
+    scores = evaluate(
+        {
+            "efficiency_percent": lambda: of_excess(lambda: 100.0 * position_m / np.hypot(position_m, _lost_m(found))),
+            "bound_position_m": lambda: position_m,
+            "bound_rotation_deg": lambda: float(np.degrees(_rms(found.bound, ROTATION))),
+            # The RMS distance from the true positions is that of the NEES: aligned by the first pose if need be.
+            "error_over_bound": lambda: rmse(body_errors(evaluation).distance_m) / position_m,
+            **{f"excess_{key}": partial(of_excess, partial(_excess, found, block)) for key, block in blocks.items()},
+            **{f"claimed_{key}": partial(_claimed, found, block) for key, block in blocks.items()},
+        }
+    )
+    return scores.remarked(scores.values, f"linearised at its own answer: {why}" if why else "")
 
 
-def _in_order(values: dict[str, float | None], notes: dict[str, str]) -> Scores:
-    return Scores({metric.key: values[metric.key] for metric in METRICS}, notes)
+def _against_claimed_bound(evaluation: Evaluation) -> AgainstBound:
+    """Return an output with the bound at the run's own final estimate, which leaves no errors beyond the efficient one.
 
-
-def _against_claimed_bound(evaluation: Evaluation, why: str) -> Scores:
-    """Score against the bound at the run's own final estimate; ``why`` is the reason for the lack of an exact one."""
+    Raises Unavailable where the output states no covariance of the whole state at every frame.
+    """
     run, sequence, estimate = evaluation.run, evaluation.sequence, evaluation.estimate
     bound = claimed_bound(sequence, run.final or run.causal or estimate, evaluation.output)
-    lost = ["efficiency_percent", *(f"excess_{key}" for key in _BLOCKS)]
-    values: dict[str, float | None] = dict.fromkeys(lost) | _sizes(bound)
-    notes = dict.fromkeys(lost, why)
-    try:
-        values["error_over_bound"] = _rms_error_m(evaluation) / _rms(bound, POSITION)
-    except Unavailable as reason:
-        values["error_over_bound"], notes["error_over_bound"] = None, str(reason)
-    blocks = _blocks(motion_model(sequence.noise, sequence.gravity_world).layout)
-    values |= _claims(_stated(evaluation, bound.shape), bound, blocks)
-    notes |= {f"claimed_{key}": NO_SUCH_BLOCK for key, block in blocks.items() if block is None}
-    return _in_order(values, notes).remarked(values.keys() - notes.keys(), f"linearised at its own answer: {why}")
-
-
-def _stated(evaluation: Evaluation, shape: tuple[int, ...]) -> Array:
-    """Return the covariances (K, d, d) that an output states at the frames. Raises Unavailable where it has none."""
-    estimate, frames_t_ns = evaluation.estimate, evaluation.sequence.frames_t_ns
-    if estimate.cov is None or estimate.cov.shape[1:] != shape[1:]:
+    if estimate.cov is None or estimate.cov.shape[1:] != bound.shape[1:]:
         raise Unavailable("the estimator states no covariance of the whole state")
-    if not np.array_equal(estimate.t_ns, frames_t_ns):
+    if not np.array_equal(estimate.t_ns, sequence.frames_t_ns):
         raise Unavailable("the estimate lacks the state of a frame")
-    return estimate.cov
-
-
-def _rms_error_m(evaluation: Evaluation) -> float:
-    """Return the RMS distance from the true positions as in the NEES: aligned by the first pose if need be."""
-    return float(np.sqrt(np.square(body_errors(evaluation).distance_m).mean()))
-
-
-def _sizes(bound: Array) -> dict[str, float | None]:
-    return {"bound_position_m": _rms(bound, POSITION), "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION)))}
-
-
-def _claims(stated: Array, bound: Array, blocks: dict[str, slice | None]) -> dict[str, float | None]:
-    return {f"claimed_{key}": None if one is None else _claimed(stated, bound, one) for key, one in blocks.items()}
-
-
-def _blocks(layout: Layout) -> dict[str, slice | None]:
-    return dict(zip(_BLOCKS, (slice(0, layout.size), POSE, layout.velocity, layout.biases), strict=True))
+    layout = motion_model(sequence.noise, sequence.gravity_world).layout
+    return AgainstBound(estimate.t_ns, layout, np.empty((0, layout.size)), bound, estimate.cov)
 
 
 def _rms(bound: Array, block: slice) -> float:
     return float(np.sqrt(np.mean(np.trace(bound[:, block, block], axis1=1, axis2=2))))
 
 
-def _excess(excess: Array, bound: Array, block: slice) -> float:
-    squared = mahalanobis_squared(excess[:, block], bound[:, block, block])
+def _lost_m(found: AgainstBound) -> float:
+    return rmse(lengths(found.excess[:, POSITION]))
+
+
+def _excess(found: AgainstBound, block: slice | None) -> float:
+    if block is None:
+        raise Unavailable(NO_SUCH_BLOCK)
+    squared = mahalanobis_squared(found.excess[:, block], found.bound[:, block, block])
     return float(np.mean(squared)) / float(block.stop - block.start)
 
 
-def _claimed(stated: Array, bound: Array, block: slice) -> float:
-    ratio = np.linalg.solve(bound[:, block, block], stated[:, block, block])
+def _claimed(found: AgainstBound, block: slice | None) -> float:
+    if block is None:
+        raise Unavailable(NO_SUCH_BLOCK)
+    ratio = np.linalg.solve(found.bound[:, block, block], found.stated[:, block, block])
     return float(np.mean(np.trace(ratio, axis1=1, axis2=2))) / float(block.stop - block.start)

@@ -191,8 +191,7 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     ``T_world_cam`` (N, 4, 4) is the left camera's pose at each sighting. Every track needs at least two views. The
     results are in the order of the input; they may not be finite where the poses are absurd.
     """
-    T_last_view = _relative_to_last(track_ids, T_world_cam)
-    views = _views(track_ids, uv_px, T_last_view, rig)
+    views, T_last_view = _views(track_ids, uv_px, T_world_cam, rig)
     points = _without_each(views, _solve(views, _start(views, T_last_view, rig), _ITERATIONS))
     again = np.flatnonzero(views.count[views.track] <= _MOST_VIEWS_SOLVED_AGAIN)
     for rows in _in_parts(again, views.count[views.track[again]] - 1):
@@ -218,26 +217,16 @@ def _in_parts(rows: IntArray, others: IntArray) -> Iterator[IntArray]:
     yield from (of_part for of_part in np.split(rows, np.flatnonzero(np.diff(part)) + 1) if of_part.size)
 
 
-def _first_rows(track_ids: IntArray) -> IntArray:
-    return np.flatnonzero(np.concatenate([[True], np.diff(track_ids) != 0]))
-
-
-def _relative_to_last(track_ids: IntArray, T_world_cam: Array) -> Array:
-    """Return T_last_view (N, 4, 4): from each view's camera to the camera of its track's last view."""
-    first = _first_rows(track_ids)
-    last = np.append(first[1:], track_ids.size) - 1
-    counts = np.diff(np.append(first, track_ids.size))
-    return se3_inverse(T_world_cam[np.repeat(last, counts)]) @ T_world_cam
-
-
-def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig) -> Views:
-    first = _first_rows(track_ids)
+def _views(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> tuple[Views, Array]:
+    """Return the views of sorted tracks, and T_last_view (N, 4, 4) from each to the last view of its track."""
+    _, first, track, count = np.unique(track_ids, return_index=True, return_inverse=True, return_counts=True)
+    T_last_view = se3_inverse(T_world_cam[(first + count - 1)[track]]) @ T_world_cam
     T_view_last = se3_inverse(T_last_view)
     # r times the point in the view's camera: R (a, b, 1) + r t, linear in q = (a, b, r).
     linear, constant = T_view_last[:, :3, [0, 1, 3]], T_view_last[:, :3, 2]
     whitener = stereo.whitener(uv_px, rig)
-    return Views(
-        track=np.repeat(np.arange(first.size), np.diff(np.append(first, track_ids.size))),
+    views = Views(
+        track=track,
         first=first,
         uv_px=np.ascontiguousarray(uv_px.T),
         linear=np.ascontiguousarray(linear.transpose(1, 2, 0)),
@@ -245,6 +234,7 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
         rig=rig,
         sqrt_information=whitener if whitener.ndim == 2 else np.ascontiguousarray(whitener.transpose(1, 2, 0)),
     )
+    return views, T_last_view
 
 
 def _start(views: Views, T_last_view: Array, rig: StereoRig) -> Array:
