@@ -24,15 +24,12 @@ from toolkit.sequence import Sequence
 _LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
 FAR_STEP = float(chdtri(6, 1e-6))
-# Mismatches and poor noise figures make up to one step in seven far in healthy runs. Chosen by looking at real
-# recordings; in sound simulated runs no step is far (docs/estimators.md has the figures).
-MOST_FAR_STEPS = 1.0 / 6.0
-# The gate passes nearly all sound measurements, and 65 % where tracks go wrong all the time. One whose covariance does
-# not cover its error rejects nearly all from then on: this share must pass in the whole run and in its last quarter.
-LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
-# A track that is tested as a whole passes only if all of its sightings are sound: of 12 sightings, one in ten of which
-# is an outlier, 28 %. So many sightings may be outliers in a run that works, by the mean length of tracks that pass.
-_MOST_OUTLIERS = 0.2
+# Where the next three are from is told in docs/estimators.md, "How a status is decided". Mismatches and poor noise
+# figures make some steps far in healthy runs too. A filter whose covariance does not cover its error rejects nearly all
+# measurements, and from then on: the second share must pass in the whole run and in its last quarter. A track that is
+# tested as a whole passes only if all of its sightings are sound: this share of them may be outliers.
+MOST_FAR_STEPS, LEAST_ACCEPTED, _MOST_OUTLIERS = 1.0 / 6.0, 0.3, 0.2
+_FEWEST_TESTED = 200
 # What a correction may do beyond the noise of the motion where it corrects a velocity and biases as well:
 # rad/s of turn rate and m/s of velocity.
 _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
@@ -119,10 +116,7 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
 
 
 def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
-    """Return the least share of measurements that must pass, for tracks as long as the accepted ones are on average.
-
-    Their length is in sightings of three degrees of freedom, at least one a measurement.
-    """
+    """Return the least share of measurements that must pass, for tracks as long as the accepted ones are on average."""
     if "nis_dof" not in info or not accepted:
         return LEAST_ACCEPTED
     sightings = float(np.nansum(info["nis_dof"])) / (3.0 * accepted)

@@ -30,8 +30,7 @@ _STRETCH_S = 1.0
 _ROUNDING = 1e-12
 NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
 # A consistent estimator exceeds half of the limit less than once in a million runs. The other half allows for filters
-# that linearise at estimates which they correct later, and so count some information twice. It was chosen by
-# looking at 36 sound simulated runs of each of three filters, of which one exceeds the limit (docs/metrics.md).
+# that linearise at estimates which they correct later, and so count some information twice (docs/metrics.md).
 _BY_CHANCE, _BY_LINEARISATION = 1e-6, 2.0
 METRICS = (
     Metric(

@@ -35,8 +35,7 @@ _FLOOR_PX = 0.1
 # This many tracks, drawn evenly, give the ratio to a few percent; with fewer than the second number it is not computed.
 _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
 # Vision did harm if a run is worse by the first factor, or by the second in the worst of ten stretches, in both cases
-# by more than this many standard errors. In 365 sound simulated runs the ratio is at most 1.03 with twists, and 2.0
-# with an IMU, which is smoother from frame to frame than a corrected causal output. Chosen by looking at these runs.
+# by more than this many standard errors. Chosen by looking at sound simulated runs (docs/metrics.md).
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
 _OF_CAUSAL = ": look for wrong tracks, or corrections it takes back later"
