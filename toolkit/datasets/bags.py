@@ -123,10 +123,10 @@ def _read(
 def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
     if not listed.pairs:
         return (
-            f"no image of {chosen.left.name} has one of {chosen.right.name} within 1 ms ({listed.stamps} left ones); a "
-            "stereo pair is taken at one instant: synchronise the cameras, or correct the stamps"
+            f"no image of {chosen['left'].name} has one of {chosen['right'].name} within 1 ms ({listed.stamps} left "
+            "ones); a stereo pair is taken at one instant: synchronise the cameras, or correct the stamps"
         )
-    moved = chosen.imu or chosen.twist
+    moved = chosen.get("imu") or chosen.get("twist")
     ranges = ((listed.pairs[0].t_ns, listed.pairs[-1].t_ns), (int(motion.t_ns.min()), int(motion.t_ns.max())))
     images, measured = (f"{first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s" for first, last in ranges)
     return (
@@ -154,7 +154,7 @@ def _as_filmed(camera: Mounted, pairs: Sequence[StampedPair], frontend: Frontend
 
 def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     """Return the poses of the body, and of what they are; another frame's are moved to it where the tree knows how."""
-    topic, messages = source.chosen.truth, source.of(source.chosen.truth)
+    topic, messages = source.chosen.get("truth"), source.of(source.chosen.get("truth"))
     if topic is None or not messages:
         return None, ()
     t_ns, rows, values = ros.poses_of(messages, topic.type)
@@ -180,11 +180,11 @@ def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
 
 def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progress) -> tuple[str, ...]:
     """Write the images of both cameras as an ASL folder has them, the stamp the name; return what to know of stamps."""
-    sides = {chosen.left.name: "cam0", chosen.right.name: "cam1"}
+    sides = {chosen["left"].name: "cam0", chosen["right"].name: "cam1"}
     for topic, camera in sides.items():
         spool.call(f"{camera}/data", f"{bag.path}: {topic}")
-    types = {topic.name: topic.type for topic in (chosen.left, chosen.right)}
-    total, unstamped = chosen.left.count + chosen.right.count, 0
+    types = {topic.name: topic.type for topic in (chosen["left"], chosen["right"])}
+    total, unstamped = chosen["left"].count + chosen["right"].count, 0
     for done, message in enumerate(bag.messages(sides.keys())):
         what = f"{bag.path}: {message.topic}: message {done}"
         t_ns = ros.stamp_ns(message.value.header, message.t_ns)
@@ -200,7 +200,7 @@ def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progres
 
 
 def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
-    imu, accel = source.chosen.imu, source.chosen.accel
+    imu, accel = source.chosen.get("imu"), source.chosen.get("accel")
     if imu is None:
         return _twists(source), ()
     t_ns, gyro = _measured(source, imu, "angular velocity")
@@ -210,14 +210,15 @@ def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
 
 
 def _twists(source: Recorded) -> TwistSamples:
-    path, topic = source.path, source.chosen.twist
+    path, topic = source.path, source.chosen.get("twist")
     if topic is None:
-        others = ", ".join(source.chosen.other_twists)
+        others = ", ".join(one.name for one in _usable(source.chosen.topics, ROLES["twist"]))
         missing = "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion"
-        if source.chosen.like_imus and not others:
+        like_imus = [one for one in source.chosen.topics if one.is_like(_LIKE_IMU) or one.type == ros.IMU]
+        if like_imus and not others:
             raise DataError(
                 f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read; "
-                f"{', '.join(source.chosen.like_imus)} may measure the motion: convert it to sensor_msgs/Imu (m/s^2, "
+                f"{', '.join(map(str, like_imus))} may measure the motion: convert it to sensor_msgs/Imu (m/s^2, "
                 "rad/s; its axes, PX4's x forward, y right, z down, are those that the camera stands on)"
             )
         remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one with the images"
@@ -295,62 +296,56 @@ Given = dict[str, Topic | None]
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics of a recording by role, None where there is none, and remarks on the choice.
+    """The topics of a recording by role, all that there are, and remarks on the choice.
 
-    ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
-    transforms that may change, ``other_imus`` those that were not chosen, and ``like_imus`` those of types that are not
-    read.
+    Where the accelerometer has a topic by itself, as ``accel``, ``imu`` is the gyro's.
     """
 
-    left: Topic
-    right: Topic
-    left_info: Topic | None
-    right_info: Topic | None
-    imu: Topic | None
-    accel: Topic | None
-    twist: Topic | None
-    truth: Topic | None
-    transforms: tuple[Topic, ...]
-    moving: tuple[Topic, ...]
-    other_imus: tuple[str, ...]
-    other_twists: tuple[str, ...]
-    like_imus: tuple[str, ...] = ()
-    facts: tuple[str, ...] = ()
+    by_role: Mapping[str, Topic]
+    topics: Sequence[Topic]
+    facts: tuple[str, ...]
+
+    def __getitem__(self, role: str) -> Topic:
+        return self.by_role[role]
+
+    def get(self, role: str) -> Topic | None:
+        """Return the topic of a role, None where there is none."""
+        return self.by_role.get(role)
 
     @property
     def rectified(self) -> bool:
         """Whether the images come rectified, as ROS says it in the last words of a topic's name."""
-        return any(_RECTIFIED in word for word in self.left.name.split("/")[-2:])
+        return any(_RECTIFIED in word for word in self["left"].name.split("/")[-2:])
+
+    def transforms(self, name: str) -> list[Topic]:
+        """Return the topics of transforms whose last word is a name: tf_static, or tf, which may change."""
+        return [one for one in _usable(self.topics, ros.TRANSFORMS) if one.name.rpartition("/")[2] == name]
 
 
 def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
     """Return the topics by role; raises DataError where a requested one, or a pair of images, is missing."""
     given = _requested(path, topics, requested)
-    usable = [topic for topic in topics if topic.type in ros.KNOWN_TYPES and not topic.unreadable and topic.count]
-    left, right = _stereo(path, topics, usable, given)
-    truth = given.get("truth", _truth_topic(usable))
-    imus = _of_types(usable, (ros.IMU,))
+    left, right = _stereo(path, topics, given)
+    imus = _usable(topics, (ros.IMU,))
     imu = given.get("imu") or (None if "twist" in given else _imu(imus))
-    accel = given.get("accel") or _partner(imu, imus)
-    odometry = [topic for topic in _of_types(usable, (ros.ODOMETRY,)) if topic != truth]
-    chosen = Chosen(
-        left=left,
-        right=right,
-        left_info=given.get("left_info") or _info(usable, left),
-        right_info=given.get("right_info") or _info(usable, right),
-        imu=imu,
-        accel=accel,
-        twist=given.get("twist") or (None if imu else _most(odometry)),
-        truth=truth,
-        transforms=tuple(topic for topic in _of_types(usable, ros.TRANSFORMS) if topic.name.endswith(_STATIC)),
-        moving=tuple(topic for topic in _of_types(usable, ros.TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
-        other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
-        other_twists=tuple(topic.name for topic in _of_types(usable, ROLES["twist"])),
-        like_imus=tuple(
-            str(one) for one in topics if one.is_like(_LIKE_IMU) or (one.type == ros.IMU and one.unreadable)
-        ),
-    )
-    return replace(chosen, facts=_facts(topics, chosen, given))
+    truth = given.get("truth", _truth_topic(topics))
+    odometry = [topic for topic in _usable(topics, (ros.ODOMETRY,)) if topic != truth]
+    found = {
+        "left": left,
+        "right": right,
+        "left_info": given.get("left_info") or _info(topics, left),
+        "right_info": given.get("right_info") or _info(topics, right),
+        "imu": imu,
+        "accel": given.get("accel") or _partner(imu, imus),
+        "twist": given.get("twist") or (None if imu else _most(odometry)),
+        "truth": truth,
+    }
+    by_role = {role: topic for role, topic in found.items() if topic is not None}
+    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in by_role.items()]
+    chosen = Chosen(by_role, topics, (f"topics: {', '.join(named)}",))
+    used = {topic.name for topic in (*by_role.values(), *chosen.transforms(_STATIC))}
+    left_out = ", ".join(str(topic) for topic in topics if topic.name not in used)
+    return replace(chosen, facts=(*chosen.facts, f"topics not used: {left_out}")) if left_out else chosen
 
 
 def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Given:
@@ -380,11 +375,11 @@ def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Gi
     return given
 
 
-def _stereo(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
+def _stereo(path: Path, topics: Sequence[Topic], given: Given) -> tuple[Topic, Topic]:
     left, right = given.get("left"), given.get("right")
     if left is not None and right is not None:
         return left, right
-    images = [topic for topic in _of_types(usable, _IMAGES) if topic.count >= _LEAST_IMAGES]
+    images = [topic for topic in _usable(topics, _IMAGES) if topic.count >= _LEAST_IMAGES]
     pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
     pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
     if not pairs:
@@ -444,10 +439,10 @@ def _partner(gyro: Topic | None, imus: Sequence[Topic]) -> Topic | None:
     return next((topic for topic in imus if _differ_by(name, topic.name.lower(), _alone(_GYRO), _ACCEL)), None)
 
 
-def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
+def _info(topics: Sequence[Topic], image: Topic) -> Topic | None:
     """Return the calibration that stands beside a topic of images, as ROS names it: in the same namespace."""
     base = image.name.removesuffix(_COMPRESSED_SUFFIX)
-    infos = {topic.name: topic for topic in _of_types(usable, (ros.CAMERA_INFO,))}
+    infos = {topic.name: topic for topic in _usable(topics, (ros.CAMERA_INFO,))}
     namespace = base
     while namespace:
         namespace = namespace.rpartition("/")[0]
@@ -457,29 +452,19 @@ def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
     return None
 
 
-def _truth_topic(usable: Sequence[Topic]) -> Topic | None:
+def _truth_topic(topics: Sequence[Topic]) -> Topic | None:
     words = re.compile("|".join(map(_alone, _OF_TRUTH)), re.IGNORECASE)
-    return _most(topic for topic in _of_types(usable, _TRUTHS) if words.search(topic.name))
+    return _most(topic for topic in _usable(topics, _TRUTHS) if words.search(topic.name))
 
 
-def _of_types(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:
-    return [topic for topic in topics if topic.type in types]
+def _usable(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:
+    """Return the topics of some types that hold messages which can be read."""
+    return [topic for topic in topics if topic.type in types and topic.count and not topic.unreadable]
 
 
 def _most(topics: Iterable[Topic]) -> Topic | None:
     """Return the topic with the most messages, the first by name of several."""
     return max(sorted(topics, key=lambda topic: topic.name), key=lambda topic: topic.count, default=None)
-
-
-def _facts(topics: Sequence[Topic], chosen: Chosen, given: Given) -> tuple[str, ...]:
-    found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
-    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
-    used = {topic.name for topic in (*found.values(), *chosen.transforms)}
-    left_out = [str(topic) for topic in topics if topic.name not in used]
-    facts = [f"topics: {', '.join(named)}"]
-    if left_out:
-        facts.append(f"topics not used: {', '.join(left_out)}")
-    return tuple(facts)
 
 
 # Calibration ---------------------------------------------------------------------------------------------------------
@@ -550,29 +535,30 @@ class Recorded:
     @property
     def body(self) -> str:
         """The frame of the IMU, or the one whose twists are measured."""
-        imu = self.chosen.imu
-        return self.frame_of(self.chosen.twist, of_child=True) if imu is None else self.frame_of(imu)
+        imu = self.chosen.get("imu")
+        return self.frame_of(self.chosen.get("twist"), of_child=True) if imu is None else self.frame_of(imu)
 
     @property
     def T_imu_left(self) -> Array | None:
         """Where the left camera stands on the body, None where no transform says it."""
-        return self.tree.between(self.body, self.frame_of(self.chosen.left))
+        return self.tree.between(self.body, self.frame_of(self.chosen["left"]))
 
 
 def recorded(bag: Bag, chosen: Chosen) -> Recorded:
     """Read what a bag holds but its images; /tf is read where /tf_static does not join the body and the camera."""
-    wanted = (chosen.imu, chosen.accel, chosen.twist, chosen.truth, *chosen.transforms)
+    fixed, changing = chosen.transforms(_STATIC), chosen.transforms(_MOVING)
+    wanted = (*map(chosen.get, ("imu", "accel", "twist", "truth")), *fixed)
     held: dict[str, list[Message]] = {}
     for message in bag.messages({topic.name for topic in wanted if topic is not None}):
         held.setdefault(message.topic, []).append(message)
-    for topic in (chosen.left_info, chosen.right_info, chosen.left, chosen.right):
+    for topic in map(chosen.get, ("left_info", "right_info", "left", "right")):
         if topic is not None:
             held[topic.name] = list(islice(bag.messages({topic.name}), 1))
-    static = [one for topic in chosen.transforms for message in held.get(topic.name, ()) for one in _joints(message)]
+    static = [one for topic in fixed for message in held.get(topic.name, ()) for one in _joints(message)]
     found = Recorded(bag.path, chosen, held, Tree(static))
-    if not chosen.moving or found.T_imu_left is not None:
+    if not changing or found.T_imu_left is not None:
         return found
-    moving = (one for message in bag.messages({topic.name for topic in chosen.moving}) for one in _joints(message))
+    moving = (one for message in bag.messages({topic.name for topic in changing}) for one in _joints(message))
     by_tf = replace(found, tree=Tree([*ros.fixed(moving), *static]), in_tf=True)
     return found if by_tf.T_imu_left is None else by_tf
 
@@ -598,9 +584,9 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
         noise = () if twist else (calibration.noise_source,)
         notes = (f"{calibration.source}, beside the bag", *noise, *calibration.shifted, *calibration.unused)
         return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes, shift_s=calibration.shift_s)
-    T_imu_left, left = source.T_imu_left, source.frame_of(source.chosen.left)
+    T_imu_left, left = source.T_imu_left, source.frame_of(source.chosen["left"])
     # An IMU does not have the axes of a camera: if both name the same frame, the name is wrong for one of them.
-    if T_imu_left is None or (source.chosen.imu is not None and source.body == left):
+    if T_imu_left is None or (source.chosen.get("imu") is not None and source.body == left):
         raise DataError(_not_joined(source))
     pair, as_they_are, how = _pair(source)
     stated = kalibr_noise(*_folders_beside(source.path))
@@ -611,12 +597,13 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
 
 
 def _not_joined(source: Recorded) -> str:
-    others = ", ".join(source.chosen.other_imus)
+    used = source.chosen.by_role.values()
+    others = ", ".join(one.name for one in _usable(source.chosen.topics, (ros.IMU,)) if one not in used)
     other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
-    tf = "/tf_static and no fixed transform of /tf" if source.chosen.moving else "/tf_static"
+    tf = "/tf_static and no fixed transform of /tf" if source.chosen.transforms(_MOVING) else "/tf_static"
     return (
         f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
-        f"{source.body!r} and {source.frame_of(source.chosen.left)!r}; {_PUT_BESIDE}{other}"
+        f"{source.body!r} and {source.frame_of(source.chosen['left'])!r}; {_PUT_BESIDE}{other}"
     )
 
 
@@ -647,7 +634,9 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     # How far right each camera is of the origin of the rectified axes; 0 where nothing is stated.
     left_m, right_m = (-float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0 for P in projections)
     pinhole_px, baseline_m = pinhole_of(projections[0]), right_m - left_m
-    T_right_left = source.tree.between(*(source.frame_of(one) for one in (source.chosen.right, source.chosen.left)))
+    T_right_left = source.tree.between(
+        *(source.frame_of(one) for one in (source.chosen["right"], source.chosen["left"]))
+    )
     if source.chosen.rectified:
         if not baseline_m > 0.0 and T_right_left is not None:
             baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
@@ -674,7 +663,7 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
 def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
     """Return the topics of both calibrations and their first messages; raises DataError where one is missing."""
     chosen, topics, infos = source.chosen, [], []
-    for image, topic in ((chosen.left, chosen.left_info), (chosen.right, chosen.right_info)):
+    for image, topic in ((chosen["left"], chosen.get("left_info")), (chosen["right"], chosen.get("right_info"))):
         messages = source.of(topic)
         if topic is None or not messages:
             raise DataError(

@@ -212,7 +212,11 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
         if len(images) != count:
             raise DataError(f"{path}: {key} has {len(images)} images and {parts.path.name} {count} timestamps")
         for place, image in enumerate(images):
-            _check_image(path, f"{key}[{place}]", image)
+            is_image = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
+            if not is_image or 0 in image.shape:
+                raise DataError(
+                    f"{path}: {key}[{place}] is no array (height, width) of uint8; save the images as grey ones"
+                )
         sides.append(images)
     pairs = []
     for place, (left, right) in enumerate(zip(*sides, strict=True)):
@@ -222,12 +226,6 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
         progress.advance(place + 1, count, "unpacking images")
     height, width = sides[0][0].shape
     return tuple(sorted(pairs, key=lambda pair: pair.t_ns)), (width, height)
-
-
-def _check_image(path: Path, key: str, image: Any) -> None:
-    is_image = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
-    if not is_image or 0 in image.shape:
-        raise DataError(f"{path}: {key} is no array (height, width) of uint8; save the images as grey ones")
 
 
 def _pair(parts: _Parts, size_px: tuple[int, int]) -> RectifiedPair:

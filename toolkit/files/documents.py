@@ -113,10 +113,12 @@ def read(
 def parse(content: bytes | str, record: type[Record], older: Older | None = None) -> Record:
     """Return the record in the text of a document; raises DataError, which names the place of what is wrong."""
     try:
-        document = _decoded(content)
+        # A place with NaN or infinity is left for the record to refuse and name.
+        document = json.loads(content, parse_constant=_NotFinite, parse_float=_finite_or_not)
     except _NOT_JSON as why:
         raise DataError(f"cannot be read as JSON ({why})") from why
-    known, given = schema_names(record), _schema_of(document)
+    known = schema_names(record)
+    given = document.get("schema") if isinstance(document, dict) else None
     wanted = known[-1]
     if older and isinstance(document, dict) and isinstance(given, str) and given in older:
         document, given = {**older[given](document), "schema": wanted}, wanted
@@ -149,18 +151,9 @@ class _NotFinite:
         return self._written
 
 
-def _decoded(content: bytes | str) -> object:
-    """Return what a text in JSON holds; a place with NaN or infinity is left for the record to refuse and name."""
-    return json.loads(content, parse_constant=_NotFinite, parse_float=_finite_or_not)
-
-
 def _finite_or_not(written: str) -> float | _NotFinite:
     value = float(written)
     return value if math.isfinite(value) else _NotFinite(written)
-
-
-def _schema_of(document: object) -> object:
-    return document.get("schema") if isinstance(document, dict) else None
 
 
 def readable(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:

@@ -378,20 +378,18 @@ def flattened(value: Any, key: str = "") -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from flattened(inner, f"{key}.{name}" if key else str(name))
-        matrix = _as_matrix(value)
-        if matrix is not None:
-            yield key, matrix
+        data, rows, cols = _as_array(value.get("data")), value.get("rows"), value.get("cols")
+        if (
+            isinstance(data, np.ndarray)
+            and isinstance(rows, int)
+            and isinstance(cols, int)
+            and data.size == rows * cols
+        ):
+            yield key, data.reshape(rows, cols)
         return
     array = _as_array(value)
     if array is not None:
         yield key, array
-
-
-def _as_matrix(mapping: dict[Any, Any]) -> np.ndarray | None:
-    data, rows, cols = _as_array(mapping.get("data")), mapping.get("rows"), mapping.get("cols")
-    if data is None or not isinstance(rows, int) or not isinstance(cols, int) or data.size != rows * cols:
-        return None
-    return data.reshape(rows, cols)
 
 
 def _as_array(value: Any) -> np.ndarray | None:

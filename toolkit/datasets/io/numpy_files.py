@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple, NoReturn, cast
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -306,7 +306,7 @@ class _PlainUnpickler(_InPython):  # type: ignore[misc]
         self.dispatch = {**_InPython.dispatch, pickle.BUILD[0]: _PlainUnpickler.load_build}
         self._path = path
 
-    def find_class(self, module: str, name: str) -> Callable[..., Any]:
+    def find_class(self, module: str, name: str) -> Any:
         """Return what makes the description of an object; raise DataError for any that plain data do not need."""
         full = f"{module}.{name}".replace("numpy.core.", "numpy._core.")
         if full not in _MAKERS:
@@ -349,13 +349,9 @@ def _array_of(state: Any) -> Plain:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
-def _class(*_: Any) -> NoReturn:
-    raise ValueError("a value is called")
-
-
-_MAKERS: dict[str, Callable[..., Any]] = {
+_MAKERS: dict[str, Any] = {
     "numpy._core.multiarray._reconstruct": lambda *_: _Begun(_array_of),
     "numpy._core.multiarray.scalar": lambda dtype, data: np.frombuffer(data, dtype)[0].item(),
-    "numpy.ndarray": _class,
+    "numpy.ndarray": "an argument of _reconstruct, and nothing to call",
     "numpy.dtype": _dtype,
 }

@@ -249,16 +249,12 @@ def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     before = [line for number, line in lines if not rows or number < rows[0][0]]
-    if rows and not _begins_with_number(rows[0][1]):
+    if rows and not any(is_number(_cells(rows[0][1], separator)[0]) for separator in _SEPARATORS):
         return rows[0][1], rows[1:]
     if not before:
         what = "holds numbers and no names" if rows else "holds no rows"
         raise DataError(f"{path}: {what}; its first line names the columns, the others hold them")
     return before[-1], rows
-
-
-def _begins_with_number(line: str) -> bool:
-    return any(is_number(_cells(line, separator)[0]) for separator in _SEPARATORS)
 
 
 def _cells(line: str, separator: str) -> list[str]:
