@@ -1,8 +1,6 @@
 """The command line run in this process, in an empty directory."""
 
-import shutil
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -33,23 +31,6 @@ def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_process: None) -
             return left.code
 
     return run
-
-
-@pytest.fixture(scope="session")
-def _short_run(
-    tmp_path_factory: pytest.TempPathFactory, without_pixels: Callable[[], AbstractContextManager[None]]
-) -> Path:
-    directory = tmp_path_factory.mktemp("short") / "run"
-    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
-    with without_pixels():
-        assert main([*words, "--out", str(directory)]) == 0
-    return directory
-
-
-@pytest.fixture
-def short_run(_short_run: Path, vislam: Vislam) -> Path:
-    """Return ``run`` in this test's directory: what a comparison of a few frames left, made once for all tests."""
-    return Path(shutil.copytree(_short_run, "run"))
 
 
 @pytest.fixture

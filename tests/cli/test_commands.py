@@ -15,7 +15,6 @@ from toolkit.cli import progress_display
 from toolkit.experiment import recording
 from toolkit.report.records import read_metrics, read_seeds
 
-Captured = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
 # Nobody looks at the figures here: drawing them takes as long as all else.
