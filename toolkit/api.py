@@ -187,7 +187,7 @@ def _planned(source: Source, estimators: Names | None, options: Mapping[str, Any
         raise SettingsError(f"source is {type_of(source)}; give one recording: a path, a built-in name, a Sequence")
     given = {key: value for key, value in options.items() if key not in ("own", "settings")}
     given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
-    asked = record_of(_Asked, _plain({key: value for key, value in given.items() if value is not None}), "")
+    asked = record_of(_Asked, _plain({key: value for key, value in given.items() if value is not None}))
     plan = plan_of(
         Configuration(asked, _with_seeds(options.get("settings", DEFAULTS), asked)),
         (source if isinstance(source, Sequence) else str(source),),

@@ -71,27 +71,24 @@ def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]
 def read_sweep_request(path: Path) -> SweepRequest:
     """Return the sweep in a file, nothing where it has none; raises SettingsError where it is not TOML, or no sweep."""
     values = {} if path.suffix == ".json" else read_toml(path).get(SWEEP, {})
-    if strange := values.keys() - set(SweepRequest.__struct_fields__):
-        meant = did_you_mean(min(strange), SweepRequest.__struct_fields__)
-        raise SettingsError(f"{path}: there is no {SWEEP}.{min(strange)}{meant}")
-    return record_of(SweepRequest, values, f"{path}: {SWEEP}.")
+    return record_of(SweepRequest, values, str(path), SWEEP)
 
 
 def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place: str) -> Configuration:
     """Return nested values as records, the defaults where nothing is given; raises SettingsError as settings_of."""
-    for key in request:
-        if key not in Request.__struct_fields__:
-            meant = did_you_mean(key, Request.__struct_fields__)
-            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{meant}")
-    return Configuration(record_of(Request, request, f"{place}: {COMPARE}."), settings_of(settings, place))
+    return Configuration(record_of(Request, request, place, COMPARE), settings_of(settings, place))
 
 
-def record_of(record: type[Record], values: Mapping[str, Any], place: str) -> Record:
-    """Return values as a record; raises SettingsError, which begins with ``place``, for one that it cannot have."""
+def record_of(record: type[Record], values: Mapping[str, Any], place: str = "", table: str = "") -> Record:
+    """Return values as a record; raises SettingsError, with place and table, for one that it cannot have."""
+    before, of = f"{place}: " if place else "", f"{table}." if table else ""
+    for key in values:
+        if key not in record.__struct_fields__:
+            raise SettingsError(f"{before}there is no {of}{key}{did_you_mean(key, record.__struct_fields__)}")
     try:
         return msgspec.convert(dict(values), record)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}{readable(error, dict(values), record)}") from error
+        raise SettingsError(f"{before}{of}{readable(error, dict(values), record)}") from error
 
 
 def plan_of(
