@@ -172,7 +172,7 @@ def test_remarks_are_reported_once_and_those_on_the_vertical_beside_the_table(co
     assert "ate_yaw_m: tilted" in comparison_text(messages)
     assert "half of them" not in comparison_text(messages)
     report = report_text(messages, {})
-    assert "- reproj_median_px, reproj_rmse_px: half of them" in report
+    assert "- reproj_median_px and reproj_rmse_px: half of them" in report
     assert report.count("tilted") == 1
 
 

@@ -278,18 +278,24 @@ def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[s
     could not be imported.
     """
     rows = [row for row in comparison.lines if row.answered]
-    empty: dict[tuple[str, str], list[str]] = {}
-    for metric in explained_metrics(comparison, columns):
-        by_reason: dict[str, list[Row]] = {}
-        for row in rows:
-            if row.value(metric.key) is None and not is_on_request(row.reason(metric.key)):
-                by_reason.setdefault(row.reason(metric.key), []).append(row)
-        for reason, affected in by_reason.items():
-            empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
-    for (whose, reason), names in empty.items():
-        yield f"no {listed(names)}{whose}: {reason}"
+    metrics = [(metric, row) for metric in explained_metrics(comparison, columns) for row in rows]
+    lacking = ((row, metric.name, row.reason(metric.key)) for metric, row in metrics if row.value(metric.key) is None)
+    for about, reason in _each_once(rows, (one for one in lacking if not is_on_request(one[2]))):
+        yield f"no {about}: {reason}"
     for name, why in unavailable().items():
         yield f"the metrics of {name} are unavailable: {why}"
+
+
+def _each_once(rows: list[Row], found: Iterable[tuple[Row, str, str]]) -> Iterator[tuple[str, str]]:
+    """Yield each text once, behind the names that it is about, with whose they are where they are not everybody's."""
+    by_text: dict[str, dict[str, list[Row]]] = {}
+    for row, name, text in found:
+        by_text.setdefault(text, {}).setdefault(name, []).append(row)
+    for text, rows_of in by_text.items():
+        names_of: dict[str, list[str]] = {}
+        for name, affected in rows_of.items():
+            names_of.setdefault(_whose(affected, rows), []).append(name)
+        yield "; ".join(f"{listed(names)}{whose}" for whose, names in names_of.items()), text
 
 
 def _whose(affected: list[Row], rows: list[Row]) -> str:
@@ -309,19 +315,10 @@ def remark_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def _remarks(comparison: Comparison, wanted: Callable[[str], bool]) -> Iterator[str]:
-    """Yield each remark once, behind the metrics and the rows it is about; over seeds there are too many."""
-    rows = [] if comparison.over_seeds else [row for row in comparison.lines if row.answered]
-    noted: dict[str, dict[str, list[Row]]] = {}
-    for row in rows:
-        for key, note in row.scores.notes.items():
-            if wanted(key) and row.scores.values.get(key) is not None:
-                noted.setdefault(note, {}).setdefault(key, []).append(row)
-    for note, rows_of in noted.items():
-        keys_of: dict[str, list[str]] = {}
-        for key, affected in rows_of.items():
-            keys_of.setdefault(_whose(affected, rows), []).append(key)
-        about = "; ".join(f"{', '.join(keys)}{whose}" for whose, keys in keys_of.items())
-        yield f"{about}: {note}"
+    rows = [] if comparison.over_seeds else [row for row in comparison.lines if row.answered]  # over seeds too many
+    notes = ((row, key, note) for row in rows for key, note in row.scores.notes.items())
+    told = (one for one in notes if wanted(one[1]) and one[0].scores.values.get(one[1]) is not None)
+    yield from (f"{about}: {note}" for about, note in _each_once(rows, told))
 
 
 # An estimator is named as nearly as good where its error is within this factor, and it saves this share of the time.
