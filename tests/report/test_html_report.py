@@ -174,43 +174,42 @@ def test_a_card_names_whom_the_contest_does_and_a_marked_row_wins_nothing(
     assert "ATE yaw 3.00" in card["detail"]
 
 
+def edited(change: Callable[[Json], object]) -> Callable[[str], str]:
+    """Return what changes a JSON document."""
+
+    def apply(text: str) -> str:
+        document = json.loads(text)
+        change(document)
+        return json.dumps(document)
+
+    return apply
+
+
 @pytest.mark.parametrize(
-    ("name", "text", "expected"),
+    ("name", "spoil", "expected"),
     [
         ("report.json", None, "has no report.json: an earlier version wrote it, or that was removed; repeat it"),
         ("manifest.json", None, "missing"),
-        ("metrics.json", "{", "cannot be read"),
-        ("metrics.json", "{}", "has not the schema vislam.metrics/1"),
+        ("metrics.json", lambda _: "{", "cannot be read"),
+        ("metrics.json", lambda _: "{}", "has not the schema vislam.metrics/1"),
         ("trajectories/late_final.tum", None, "late_final.tum is missing; repeat the comparison"),
-        ("trajectories/late_final.tum", "1 2 3\n", "columns"),
-        ("landmarks/late.csv", "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
+        ("trajectories/late_final.tum", lambda _: "1 2 3\n", "columns"),
+        ("landmarks/late.csv", lambda _: "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
+        ("report.json", edited(lambda d: d["runs"].pop()), "does not have the runs of metrics.json"),
+        (
+            "report.json",
+            edited(lambda d: d["maps"][0].update(estimator="nobody")),
+            "has the map of a run it does not have",
+        ),
     ],
 )
 def test_a_damaged_run_directory_is_reported_in_one_line(
-    run_directory: Path, tmp_path: Path, name: str, text: str | None, expected: str
+    run_directory: Path, tmp_path: Path, name: str, spoil: Callable[[str], str] | None, expected: str
 ) -> None:
-    shutil.copytree(run_directory, tmp_path / "run")
-    (tmp_path / "run" / name).unlink()
-    if text is not None:
-        (tmp_path / "run" / name).write_text(text)
+    file = Path(shutil.copytree(run_directory, tmp_path / "run")) / name
+    text = file.read_text()
+    file.unlink()
+    if spoil is not None:
+        file.write_text(spoil(text))
     with pytest.raises(DataError, match=re.escape(expected)):
-        read_run(tmp_path / "run")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "expected"),
-    [
-        (lambda d: d["runs"].pop(), "does not have the runs of metrics.json"),
-        (lambda d: d["maps"][0].update(estimator="nobody"), "has the map of a run it does not have"),
-    ],
-)
-def test_a_report_of_other_runs_is_reported(
-    run_directory: Path, tmp_path: Path, spoil: Callable[[Json], object], expected: str
-) -> None:
-    shutil.copytree(run_directory, tmp_path / "run")
-    report = tmp_path / "run" / "report.json"
-    document = json.loads(report.read_text())
-    spoil(document)
-    report.write_text(json.dumps(document))
-    with pytest.raises(DataError, match=expected):
         read_run(tmp_path / "run")
