@@ -3,7 +3,7 @@
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,39 +54,24 @@ class Normalised(NamedTuple):
         return 100.0 * float(np.mean(((self.value >= self.low) & (self.value <= self.high))[known]))
 
 
-class Drawn(NamedTuple):
-    """What a panel of an estimator shows, in its colour and with the line of a kind of output."""
-
-    estimator: str
-    colour: str
-    output: Output
-    series: Normalised
-
-
-def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: str, title: str) -> Figure:
-    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it."""
-    figure, panels = style.panels_of(panels_for)
-    shares: dict[str, list[float]] = {}
+def _figure(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], what: str) -> Figure:
+    """Draw each row's normalised errors over their band, in a panel an estimator that says how many are in it."""
+    figure, panels = style.panels_of(list(dict.fromkeys(row.estimator for row, _ in found)))
+    shares: dict[str, list[str]] = {}
     least = most = 1.0
-    for estimator, colour, output, series in drawn:
-        axes, shown = panels[estimator], np.clip(series.value, *RANGE)
+    for row, series in found:
+        axes, colour = panels[row.estimator], style.colour_of(comparison, row.estimator)
+        shown = np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
-        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(output), linewidth=1.0)
-        shares.setdefault(estimator, []).append(series.in_band_percent)
+        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(style.shown_as(row)), linewidth=1.0)
+        shares.setdefault(row.estimator, []).append(f"{series.in_band_percent:.0f} %")
+        style.annotate(axes, ", ".join(shares[row.estimator]))
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
-    for estimator, percents in shares.items():
-        style.annotate(panels[estimator], ", ".join(f"{percent:.0f} %" for percent in percents))
     style.scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
-    style.finish(
-        figure,
-        panels,
-        what,
-        title,
-        [
-            *style.output_entries({one.output for one in drawn}),
-            Entry("95 % band", Patch(color=style.BAND_COLOUR, linewidth=0.0)),
-        ],
-    )
+    entries = style.output_entries({style.shown_as(row) for row, _ in found})
+    seeds = f", {len(comparison.seeds)} seeds: mean" if comparison.over_seeds else ":"
+    band = Entry("95 % band", Patch(color=style.BAND_COLOUR, linewidth=0.0))
+    style.finish(figure, panels, what, f"{comparison.name}{seeds} {what}", [*entries, band])
     return figure
 
 
@@ -98,8 +83,8 @@ def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
         low, high = (np.full(nees.pose.size, side) for side in nees_band(POSE_DOF))
         return Normalised(comparison.sequence.elapsed_s(nees.t_ns), nees.pose, low, high)
 
-    found = [(row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines]
-    yield from _of_one_run(comparison, found, "nees_over_time", "pose NEES / 6", _OF_NEES)
+    if found := _series(comparison, of):
+        yield NamedFigure("nees_over_time", _OF_NEES, _figure(comparison, found, "pose NEES / 6"))
 
 
 def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -110,29 +95,29 @@ def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
         t_s = comparison.sequence.elapsed_s(evaluation.estimate.t_ns[nis.rows])
         return Normalised(t_s, nis.nis / nis.expected, *nis.bands())
 
-    found = [(row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines]
-    yield from _of_one_run(comparison, found, "nis_over_time", "NIS / expected", _OF_NIS)
+    if found := _series(comparison, of):
+        yield NamedFigure("nis_over_time", _OF_NIS, _figure(comparison, found, "NIS / expected"))
 
 
-def _of_one_run(
-    comparison: Comparison, found: Sequence[tuple[Row, Normalised | None]], name: str, what: str, caption: str
-) -> Iterator[NamedFigure]:
-    drawn = [
-        Drawn(row.estimator, style.colour_of(comparison, row.estimator), style.shown_as(row), series)
-        for row, series in found
-        if series is not None
-    ]
-    if drawn:
-        estimators = list(dict.fromkeys(one.estimator for one in drawn))
-        yield NamedFigure(name, caption, figure_with_bands(estimators, drawn, what, f"{comparison.name}: {what}"))
+def _series(comparison: Comparison, of: Callable[[Evaluation], Normalised]) -> list[tuple[Row, Normalised]]:
+    found = ((row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines)
+    return [(row, series) for row, series in found if series is not None]
 
 
 def draw_over_seeds(over: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of position errors and that of NEES, each where there is anything to draw."""
     if any(group.position_m is not None for group in over.rows):
         yield _errors(over)
-    if any(group.mean_nees is not None for group in over.rows):
-        yield _nees(over)
+    means = [(group, nees) for group in over.lines if (nees := group.mean_nees) is not None]
+    if means:
+        t_s = over.sequence.frames_s
+        found = [(group, Normalised(t_s, nees.mean, nees.low, nees.high)) for group, nees in means]
+        caption = (
+            f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
+            f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band "
+            f"an estimator is overconfident. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
+        )
+        yield NamedFigure("nees_over_seeds", caption, _figure(over, found, "pose NEES / 6"))
 
 
 def _errors(over: Comparison) -> NamedFigure:
@@ -162,24 +147,3 @@ def _errors(over: Comparison) -> NamedFigure:
         "shaded, the quartiles over the runs that are ok. Dashed: causal, what was known at the time. Solid: final."
     )
     return NamedFigure("errors_over_seeds", caption, figure)
-
-
-def _nees(over: Comparison) -> NamedFigure:
-    drawn = [
-        Drawn(
-            group.estimator,
-            style.colour_of(over, group.estimator),
-            style.shown_as(group),
-            Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high),
-        )
-        for group in over.lines
-        if (nees := group.mean_nees) is not None
-    ]
-    caption = (
-        f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
-        f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band an "
-        f"estimator is overconfident. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
-    )
-    title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
-    figure = figure_with_bands(over.estimators, drawn, "pose NEES / 6", title)
-    return NamedFigure("nees_over_seeds", caption, figure)
