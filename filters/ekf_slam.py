@@ -115,7 +115,7 @@ class JointEkf:
         joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)
-        self._joint.forget_clones(np.ones(1, dtype=bool))
+        self._joint.forget_clones(1)
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:

@@ -8,6 +8,8 @@ state does in the smoothers.
 `msckf-fej` and `msckf-slam` are this filter with other options: Jacobians at first estimates, and landmarks that stay.
 """
 
+from bisect import bisect_left
+
 import numpy as np
 
 from filters.kalman import joint_landmarks
@@ -26,7 +28,6 @@ from filters.kalman.tracks import (
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import BoolArray, IntArray
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.gating import FrameGate
 
@@ -62,7 +63,7 @@ class Msckf:
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
-        self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
+        self._clone_t_ns: list[int] = []
         self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks, self._memory = WindowTracks(), LandmarkMemory()
 
@@ -71,14 +72,14 @@ class Msckf:
         frame, outliers = packet.frame, self._outliers
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone()
-        self._clone_t_ns = np.append(self._clone_t_ns, frame.t_ns)
+        self._clone_t_ns.append(frame.t_ns)
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
         joint_landmarks.forget_lost(self._joint, frame, self._memory)
         correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
         self._tracks.add_frame(self._without_landmarks(frame))
-        leaving = self._clone_t_ns < frame.t_ns - self._lag_ns
+        leaving = bisect_left(self._clone_t_ns, frame.t_ns - self._lag_ns)
         self._correct_by_tracks(leaving, gate)
-        self._forget_clones(leaving)
+        self._forget_oldest(leaving)
         gate_in_view = FrameGate(outliers.gate_probability, outliers.joint_huber)
         now = given_tracks_in_view(self._joint, self._window(), self._tracks, self._rig, gate_in_view)
         return now.estimate(frame.t_ns, **gate.info())
@@ -98,18 +99,18 @@ class Msckf:
             return frame
         return frame.select(~is_among(frame.track_ids, self._joint.landmark_ids))
 
-    def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
-        """Correct by the tracks that have ended, and by those seen from poses (C,) that leave the window now.
+    def _correct_by_tracks(self, leaving: int, gate: FrameGate) -> None:
+        """Correct by the tracks that have ended, and by those seen from the oldest poses, which leave the window now.
 
         Both together, unless there is room for landmarks. A new landmark's linearisation point stays, so it is
         triangulated after the ended tracks have corrected the window.
         """
         used = self._tracks.ended()
         if not self._room:
-            used = used | self._tracks.seen_by(leaving)
+            used = used | self._tracks.seen_by_oldest(leaving)
         self._correct_by(self._tracks.take(used), gate)
-        if self._room and leaving.any():
-            self._correct_by(self._tracks.take(self._tracks.seen_by(leaving)), gate)
+        if self._room and leaving:
+            self._correct_by(self._tracks.take(self._tracks.seen_by_oldest(leaving)), gate)
 
     @property
     def _room(self) -> int:
@@ -127,9 +128,9 @@ class Msckf:
         first = 6 * int(np.argmax(found.seen.any(axis=0)))
         self._joint.inform(found.information[first:, first:], found.vector[first:])
 
-    def _forget_clones(self, which: BoolArray) -> None:
-        """Marginalise poses (C,), which are the oldest."""
-        if which.any():
-            self._joint.forget_clones(which)
-            self._tracks.drop_oldest(int(which.sum()))
-            self._clone_t_ns = self._clone_t_ns[~which]
+    def _forget_oldest(self, count: int) -> None:
+        """Marginalise the oldest poses."""
+        if count:
+            self._joint.forget_clones(count)
+            self._tracks.drop_oldest(count)
+            del self._clone_t_ns[:count]

@@ -87,12 +87,11 @@ class JointBelief:
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
 
-    def forget_clones(self, which: BoolArray) -> None:
-        """Marginalise clones (C,): their rows and columns are dropped."""
-        kept = np.ones(self._cov.shape[0], dtype=bool)
-        kept[self.clone_columns] = np.repeat(~which, 6)
-        self._cov = _of_slices(self._cov, _true_ranges(kept))
-        self.clones, self.first_clones = self.clones[~which], self.first_clones[~which]
+    def forget_clones(self, count: int) -> None:
+        """Marginalise the oldest clones: their rows and columns are dropped."""
+        first = self.clone_columns.start
+        self._cov = _of_slices(self._cov, [slice(0, first), slice(first + 6 * count, self._cov.shape[0])])
+        self.clones, self.first_clones = self.clones[count:], self.first_clones[count:]
 
     def forget_landmarks(self, which: BoolArray) -> None:
         """Marginalise landmarks (L,)."""

@@ -94,44 +94,40 @@ class WindowTracks:
         self.weights = np.empty((0, 0))
 
     def add_frame(self, frame: StereoFrame) -> None:
-        """Append the frame's sightings as a new column; ids unknown so far start new tracks."""
-        order = np.argsort(self.track_ids)
-        at, known = rows_of(frame.track_ids, self.track_ids[order])
-        before, window = self.seen.shape
+        """Append the frame's sightings as a new column; ids unknown so far start new tracks, tracks unseen leave."""
+        kept = np.flatnonzero(self.seen.any(axis=1))
+        track_ids, before, window = self.track_ids[kept], len(kept), self.seen.shape[1]
+        order = np.argsort(track_ids)
+        at, known = rows_of(frame.track_ids, track_ids[order])
         count = before + np.count_nonzero(~known)
         rows = np.empty(len(known), dtype=np.int64)
         rows[known], rows[~known] = order[at[known]], np.arange(before, count)
         uvs_px, seen, weights = (np.zeros((count, window + 1, *more), kind) for more, kind in _COLUMNS)
-        uvs_px[:before, :-1], seen[:before, :-1], weights[:before, :-1] = self.uvs_px, self.seen, self.weights
+        uvs_px[:before, :-1], seen[:before, :-1] = self.uvs_px[kept], self.seen[kept]
+        weights[:before, :-1] = self.weights[kept]
         uvs_px[rows, -1], seen[rows, -1], weights[rows, -1] = frame.uvs_px, True, 1.0
-        self.track_ids = np.concatenate([self.track_ids, frame.track_ids[~known]])
-        self.points = np.concatenate([self.points, np.full((count - before, 3), np.nan)])
+        self.track_ids = np.concatenate([track_ids, frame.track_ids[~known]])
+        self.points = np.concatenate([self.points[kept], np.full((count - before, 3), np.nan)])
         self.uvs_px, self.seen, self.weights = uvs_px, seen, weights
 
     def drop_oldest(self, count: int) -> None:
         """Drop the sightings from the ``count`` oldest poses."""
         columns = self.uvs_px, self.seen, self.weights
         self.uvs_px, self.seen, self.weights = (np.ascontiguousarray(each[:, count:]) for each in columns)
-        self._keep(np.asarray(self.seen.any(axis=1)))
 
     def ended(self) -> BoolArray:
         """Say which tracks (A,) the newest pose does not see."""
         return np.asarray(~self.seen[:, -1])
 
-    def seen_by(self, which: BoolArray) -> BoolArray:
-        """Say which tracks (A,) any of some poses (W,) has seen."""
-        return np.asarray(self.seen[:, which].any(axis=1))
+    def seen_by_oldest(self, count: int) -> BoolArray:
+        """Say which tracks (A,) any of the ``count`` oldest poses has seen."""
+        return np.asarray(self.seen[:, :count].any(axis=1))
 
     def take(self, rows: BoolArray) -> TrackSightings:
-        """Return those tracks (A,) and drop their sightings; a track that is still seen starts again."""
+        """Return those tracks (A,) and forget their sightings; a track that is still seen starts again."""
         taken = TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
-        self._keep(~rows)
+        self.seen[rows] = False
         return taken
-
-    def _keep(self, rows: BoolArray) -> None:
-        if not rows.all():
-            self.track_ids, self.points, self.weights = self.track_ids[rows], self.points[rows], self.weights[rows]
-            self.uvs_px, self.seen = self.uvs_px[rows], self.seen[rows]
 
 
 # What a track has for each pose: further axes and type of the sightings, of whether it was seen, and of the weights.

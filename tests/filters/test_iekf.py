@@ -78,7 +78,7 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
 def test_the_covariance_keeps_relative_inverse_depths_and_the_pose_while_the_estimate_moves(scenario) -> None:
     """The anchored error by its definition, differentiated before and after a move: what the move must carry over."""
     joint, *_ = scene(scenario)
-    joint.forget_clones(np.ones(1, dtype=bool))
+    joint.forget_clones(1)
     before, P = numerical_jacobian(partial(anchored_error, joint), joint.cov.shape[0]), joint.cov
     drawn = np.random.default_rng(4).standard_normal(joint.cov.shape[0])
     joint.move(np.linalg.cholesky(joint.cov) @ drawn)

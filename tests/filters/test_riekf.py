@@ -82,7 +82,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
     xi = gain @ residuals
     joint_landmarks.correct(joint, frame, AT, rig, FrameGate(probability=1.0))
-    joint.forget_clones(np.ones(1, dtype=bool))
+    joint.forget_clones(1)
 
     assert np.linalg.norm(xi[:3]) > 1e-5
     assert np.linalg.norm(group_exponential(xi, before.shape[0] - 3) - np.eye(len(before))) > 0.01
@@ -137,7 +137,7 @@ def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(sc
         part = joint_landmarks.columns(moved)
         # Jacobians of hundreds of pixels a radian or metre, directions of tens of metres.
         assert np.abs(H @ here[part]).max() < 1e-9
-        moved.forget_clones(np.ones(1, dtype=bool))
+        moved.forget_clones(1)
         xi = to_invariant(moved) @ gauge(moved, turns=np.eye(3))
         expected = np.zeros_like(xi)
         expected[:3, 3:] = np.eye(3)
