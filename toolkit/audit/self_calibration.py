@@ -452,51 +452,39 @@ def self_calibration(
         return None
     kind = sequence.motion_kind
     try:
-        given = Calibration(sequence.rig, 0.0, np.zeros(6))
-        found, cov = _fitted(_At(windows, given, np.zeros(COMMON)), kind)
+        found, cov = _fitted(_Adjustment(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), np.zeros(COMMON)), kind)
     except (np.linalg.LinAlgError, DataError):  # diverging steps: singular, or an impossible rig
         return None
-    value = found.value
+    value = found.moved_by + found.step
     if not found.settled or (np.abs(value) > NEAR[kind]).any():
         return None
     value[GYRO_BIAS] += w_bias
     return SelfCalibration(value, cov, len(windows))
 
 
-class _At(NamedTuple):
-    """Where an adjustment is linearised: the windows, the calibration, and its corrections so far (21,)."""
+class _Adjustment(NamedTuple):
+    """Windows, calibration and its corrections so far (21,), linearised there with the next step, and if converged."""
 
     windows: list[KeyFrameWindow]
     calibration: Calibration
     moved_by: Array
+    all_reduced: list[Reduced] = []
+    step: Array = np.zeros(COMMON)
+    settled: bool = False
 
 
-class _Adjusted(NamedTuple):
-    """The end of an adjustment: whether it converged, the last linearisation, its step (21,) and its windows."""
-
-    settled: bool
-    at: _At
-    step: Array
-    all_reduced: list[Reduced]
-
-    @property
-    def value(self) -> Array:
-        """The corrections of the calibration (21,)."""
-        return self.at.moved_by + self.step
-
-
-def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
+def _fitted(at: _Adjustment, kind: MotionKind) -> tuple[_Adjustment, Array]:
     """Return the adjustment and its covariance (21, 21).
 
     A rectified pair is assumed unless, after convergence, one step of all unknowns has a significant correction of the
     right image.
     """
     rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
-    right = _step(rectified.all_reduced, rectified.at.moved_by, prior)[RIGHT]
+    right = _step(rectified.all_reduced, rectified.moved_by, prior)[RIGHT]
     # Windows of a pair that is not rectified fit different calibrations, so their scatter is not included.
     by_parts, _ = _cov_of_parts(rectified.all_reduced, prior, COMMON)
     if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(by_parts)[RIGHT])).any():
-        found = _adjusted(rectified.at, kind, COMMON)
+        found = _adjusted(rectified, kind, COMMON)
         return found, _cov(found.all_reduced, prior)
     cov = _cov(rectified.all_reduced, prior)
     cov[:_RECTIFIED], cov[:, :_RECTIFIED] = 0.0, 0.0
@@ -504,19 +492,21 @@ def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
     return rectified, cov
 
 
-def _adjusted(at: _At, kind: MotionKind, free: int) -> _Adjusted:
-    prior = PRIOR[kind]
+def _adjusted(at: _Adjustment, kind: MotionKind, free: int) -> _Adjustment:
+    """Adjust the first ``free`` unknowns by Gauss-Newton."""
+    prior, after = PRIOR[kind], at
     for _ in range(MOST[kind].iterations):
-        all_reduced = [reduce(window, at.calibration) for window in at.windows]
-        found = _Adjusted(False, at, _step(all_reduced, at.moved_by, prior, free), all_reduced)
-        if not (np.abs(found.step) < STRAYED * prior).all():
-            return found
-        error = np.sqrt(np.diag(np.linalg.inv(_information(all_reduced, prior)[:free, :free])))
-        if (np.abs(found.step[:free]) < SETTLED * error).all():
-            return found._replace(settled=True)
-        windows = [one.moved(window, found.step) for window, one in zip(at.windows, all_reduced, strict=True)]
-        at = _At(windows, at.calibration.moved(found.step), found.value)
-    return found
+        reduced = [reduce(window, after.calibration) for window in after.windows]
+        step = _step(reduced, after.moved_by, prior, free)
+        at = _Adjustment(after.windows, after.calibration, after.moved_by, reduced, step)
+        if not (np.abs(step) < STRAYED * prior).all():
+            return at
+        error = np.sqrt(np.diag(np.linalg.inv(_information(reduced, prior)[:free, :free])))
+        if (np.abs(step[:free]) < SETTLED * error).all():
+            return at._replace(settled=True)
+        windows = [one.moved(window, step) for window, one in zip(at.windows, reduced, strict=True)]
+        after = _Adjustment(windows, at.calibration.moved(step), at.moved_by + step)
+    return at
 
 
 def _step(all_reduced: list[Reduced], value: Array, prior: Array, free: int = COMMON) -> Array:
