@@ -468,7 +468,7 @@ class _Adjustment(NamedTuple):
     windows: list[KeyFrameWindow]
     calibration: Calibration
     moved_by: Array
-    all_reduced: list[Reduced] = []
+    all_reduced: list[Reduced] = []  # noqa: RUF012 - never changed
     step: Array = np.zeros(COMMON)
     settled: bool = False
 
