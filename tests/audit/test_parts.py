@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit.conventions import axes_named, right_handed_axes, signed_axes
 from toolkit.audit.intervals import interval_means
 from toolkit.audit.one_step import errors_are_independent
 from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, slope
@@ -81,18 +80,6 @@ def test_few_stretches_have_a_bound_and_many_are_not_loosened_by_it() -> None:
     assert ten == pytest.approx(
         4.781 * 0.002, rel=1e-3
     )  # Student's t of nine degrees of freedom, 0.0005 on either side
-
-
-def test_axes_are_exchanged_and_negated_in_all_48_ways_of_which_24_are_rotations() -> None:
-    signed, rotations = signed_axes(), right_handed_axes()
-    assert len(np.unique(signed, axis=0)) == 48
-    assert len(np.unique(rotations, axis=0)) == 24
-    assert np.array_equal(signed @ signed.swapaxes(1, 2), np.tile(np.eye(3), (48, 1, 1)))
-    assert np.array_equal(np.round(np.linalg.det(rotations)), np.ones(24))
-    assert np.array_equal(signed[0], np.eye(3))
-    assert np.array_equal(rotations[0], np.eye(3))
-    assert len({axes_named(one) for one in signed}) == 48
-    assert axes_named(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])) == "y, x, -z"
 
 
 def test_errors_are_independent_only_where_five_standard_errors_leave_no_other_correlation() -> None:

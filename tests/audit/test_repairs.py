@@ -323,14 +323,6 @@ def test_missing_right_images_written_as_one_value_become_sightings_by_the_left_
     assert (len(kept), is_left_only(kept).sum()) == (len(uv_px) - both.sum(), right.sum())
 
 
-def test_images_exchanged_for_a_time_block() -> None:
-    clean = clean_recording("drive")
-    seen = clean.observations
-    then = (seen.frame >= clean.frame_count // 3) & (seen.frame < 2 * clean.frame_count // 3)
-    first, *_ = audit(with_pixels(clean, np.where(then[:, None], seen.uv_px[:, [1, 0, 2]], seen.uv_px))).findings
-    assert first.fault == "swapped-coordinates" and first.blocking
-
-
 @pytest.mark.parametrize("begin, end", [(0.0, 0.3), (0.2, 0.8), (0.6, 1.0)], ids=["beginning", "middle", "end"])
 def test_a_camera_that_freezes_for_longer_than_tracks_last_is_named(begin: float, end: float) -> None:
     sequence = clean_recording("drive")
