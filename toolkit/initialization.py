@@ -39,7 +39,7 @@ from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, MOS
 from toolkit.models.imu import Preintegration, preintegrate, preintegration_params
 from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import Ending, RobustCamera, StereoWindow, Vision, solve_window
-from toolkit.sequence import Observations, Sequence
+from toolkit.sequence import Sequence
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
 # Without enough vision: sigma of the unknown speed (m/s), and of the tilt (rad), by an acceleration of 1 m/s^2.
@@ -122,7 +122,8 @@ def _found(packets: list[Packet], sequence: Sequence) -> tuple[Estimate, Array]:
         raise NoSoundStartError("there are too few tracks in the first frames")
     motions = [packet.motion for packet in packets if packet.motion is not None]
     measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
-    seen = replace(sequence.truncated(len(packets)), observations=_visible(sequence, len(packets)))
+    visible = sequence.visible.select(sequence.visible.frame < len(packets))
+    seen = replace(sequence.truncated(len(packets)), observations=visible)
     guess = guess_with_imu(seen, measured) if measured else guess_from_vision(seen)
     if guess.contradiction is not None:
         raise NoSoundStartError(guess.contradiction)
@@ -196,10 +197,6 @@ def _held(sequence: Sequence, guess: FirstGuess) -> gtsam.NonlinearFactorGraph:
         graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)))
         graph.add(gtsam.PriorFactorVector(B(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, TURN_SIGMA)))
     return graph
-
-
-def _visible(sequence: Sequence, frames: int) -> Observations:
-    return sequence.visible.select(sequence.visible.frame < frames)
 
 
 def start_from_truth(sequence: Sequence) -> Prior:

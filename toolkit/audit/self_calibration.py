@@ -30,7 +30,6 @@ from toolkit.measurements import (
     StereoRig,
     TwistMotion,
     TwistNoise,
-    is_left_only,
 )
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import CHI2_3_MEDIAN
@@ -610,7 +609,8 @@ def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray
     begin, end = np.searchsorted(seen.frame, [keys[0], keys[-1] + 1])
     key_of = np.full(keys[-1] - keys[0] + 1, -1)
     key_of[keys - keys[0]] = np.arange(keys.size)
-    row = begin + np.flatnonzero((key_of[seen.frame[begin:end] - keys[0]] >= 0) & _usable(seen.uv_px[begin:end]))
+    usable = (disparity_px(seen.uv_px) > LEAST_DISPARITY_PX) & np.isfinite(seen.uv_px).all(axis=1)
+    row = begin + np.flatnonzero((key_of[seen.frame[begin:end] - keys[0]] >= 0) & usable[begin:end])
     _, track, sightings = np.unique(seen.track_id[row], return_inverse=True, return_counts=True)
     longest = np.argsort(-sightings, kind="stable")[: MOST[sequence.motion_kind].tracks]
     chosen = longest[sightings[longest] >= FEWEST_SIGHTINGS]
@@ -618,12 +618,6 @@ def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray
     row = row[np.argsort(seen.track_id[row], kind="stable")]
     _, track = np.unique(seen.track_id[row], return_inverse=True)
     return row, key_of[seen.frame[row] - keys[0]], track
-
-
-def _usable(uv_px: Array) -> BoolArray:
-    both = ~is_left_only(uv_px)
-    both[both] = disparity_px(uv_px[both]) > LEAST_DISPARITY_PX
-    return np.asarray(both & np.isfinite(uv_px).all(axis=1))
 
 
 def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:

@@ -1,6 +1,7 @@
 """Faults of the tracks: sightings that repeat, lack an image, have exchanged coordinates or fit no motion."""
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -287,14 +288,15 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
     return None
 
 
-def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
+def _reordered(sequence: Sequence) -> Iterator[tuple[str, Sequence]]:
+    """Yield the recording in every other order of coordinates, and what is wrong then."""
     # A sighting without the right image has nothing to be exchanged with.
     both = sequence.observations.select(~is_left_only(sequence.observations.uv_px))
-    orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
-    return [
-        (_order_name(order), replace(sequence, observations=replace(both, uv_px=both.uv_px[:, list(order)])))
-        for order in orders
-    ]
+    for order in itertools.permutations(range(3)):
+        named = f"they are in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
+        if order != (0, 1, 2):
+            other = replace(sequence, observations=replace(both, uv_px=both.uv_px[:, list(order)]))
+            yield "left and right are exchanged" if order == (1, 0, 2) else named, other
 
 
 def _is_sound(sequence: Sequence) -> bool:
@@ -305,12 +307,6 @@ def _is_sound(sequence: Sequence) -> bool:
         return False
     found = evidence.agreement
     return found.residual_px <= found.limit_px
-
-
-def _order_name(order: tuple[int, ...]) -> str:
-    if order == (1, 0, 2):
-        return "left and right are exchanged"
-    return f"they are in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
 
 
 # A disparity is doubled if its ratio is nearer to two than to one or four, to allow for noise and for the motion.
@@ -377,13 +373,10 @@ def _beginnings(observations: Observations) -> _Beginnings:
     return begun.select(np.isfinite(begun.first_ratio))
 
 
-def _doubles(ratio: Array) -> BoolArray:
-    return np.asarray((ratio > LEAST_RATIO) & (ratio < LARGEST_RATIO))
-
-
 def _is_doubled(begun: _Beginnings) -> bool:
     """Say whether nearly all of the tracks double once and keep the doubled disparity."""
-    doubled, again = _doubles(begun.first_ratio), np.isfinite(begun.second_ratio)
+    doubled = (begun.first_ratio > LEAST_RATIO) & (begun.first_ratio < LARGEST_RATIO)
+    again = np.isfinite(begun.second_ratio)
     if doubled.size < LEAST_DOUBLED_TRACKS or doubled.mean() < LEAST_DOUBLED_SHARE or again.mean() < LEAST_SEEN_AGAIN:
         return False
     stays = float(np.median(begun.second_ratio[again])) < LEAST_RATIO

@@ -1,6 +1,5 @@
 """Faults of the truth, with which runs are compared, and of the direction of gravity in its world."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -294,18 +293,13 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     scale, only_longer = longer(seen, true)
     if "turns" in elsewhere or (elsewhere and not only_longer):
         return Symptom.warning(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
+    steps = f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's"
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
-        return _doubtful(scale) if only_longer else None
+        within = "which is more than chance and no more than in recordings without faults"
+        doubt = f"{steps}, {within}: the truth's unit, the baseline or the focal length may be off by it"
+        return Undecided(doubt) if only_longer and abs(scale.value - 1.0) > scale.by_chance else None
     unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
-    return Symptom.warning(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
-
-
-def _doubtful(scale: WindowMedian) -> Undecided | None:
-    if abs(scale.value - 1.0) <= scale.by_chance:
-        return None
-    within = "which is more than chance and no more than in recordings without faults"
-    off = "the truth's unit, the baseline or the focal length may be off by it"
-    return Undecided(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's, {within}: {off}")
+    return Symptom.warning(f"{steps}{unit}", _WHERE)
 
 
 def _standing(both: Windows, moved: BoolArray) -> Symptom | None:
@@ -345,18 +339,15 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: Windows) -> Symptom 
     given = _apart(both)
     if not given > LEAST_APART:
         return None
-    for reading, remedy, T_world_imu in _readings(truth.T_world_imu):
+    poses = truth.T_world_imu
+    backwards = ("whose poses run backwards", "write them in the order of their stamps", poses[::-1])
+    exchanged = ((f"with {one.description}", _AXES, one.reread(poses)) for one in exchanges())
+    for reading, remedy, T_world_imu in (backwards, *exchanged):
         apart = _apart(windows(evidence.sequence, evidence.camera_motion, replace(truth, T_world_imu=T_world_imu)))
         if apart < given / TIMES_NEARER:
             only = f"only for a truth {reading}, with a difference of {apart:.1%} in place of {given:.0%}"
             return Symptom.warning(f"the truth's motion agrees with the camera's {only}", remedy)
     return None
-
-
-def _readings(T_world_imu: Array) -> Iterator[tuple[str, str, Array]]:
-    yield "whose poses run backwards", "write them in the order of their stamps", T_world_imu[::-1]
-    for exchange in exchanges():
-        yield f"with {exchange.description}", _AXES, exchange.reread(T_world_imu)
 
 
 def _apart(both: Windows) -> float:

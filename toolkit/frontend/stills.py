@@ -10,7 +10,7 @@ from toolkit.files.writing import replaced_directory
 from toolkit.frontend.cameras import Image
 from toolkit.frontend.images import Unusable
 from toolkit.frontend.tracking import ImageRecording, ImageTracks, read_pairs
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import IntArray
 from toolkit.progress import SILENT, Progress
 
 # How many past positions a track drags behind it, and the age (frames) at which it has its last colour.
@@ -97,12 +97,8 @@ def _still(images: tuple[Image, Image], tracks: ImageTracks, k: int) -> Image:
         cv2.polylines(canvas, [way[:, None]], False, colour, 1, cv2.LINE_AA)
         left, right = tracks.corners_px[row, :2], tracks.corners_px[row, 2:] + [images[0].shape[1], 0.0]
         for place in (left, right):
-            cv2.circle(canvas, _pixel(place), 3, colour, 1, cv2.LINE_AA)
+            cv2.circle(canvas, np.rint(place).astype(int).tolist(), 3, colour, 1, cv2.LINE_AA)
     return np.asarray(canvas, dtype=np.uint8)
-
-
-def _pixel(place: Array) -> tuple[int, int]:
-    return round(float(place[0])), round(float(place[1]))
 
 
 def _colour(age: int) -> tuple[int, int, int]:

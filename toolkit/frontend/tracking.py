@@ -127,7 +127,8 @@ def _tracked(
             skipped.append(images if isinstance(images, Unusable) else Unusable(pairs[i].right, *_MISPAIRED))
         progress.advance(i + 1, len(pairs), "tracking")
     if 2 * (len(skipped) - stalled) >= len(pairs) or len(seen) < 2 <= len(pairs):
-        often = _commonest(skipped)
+        reasons = [one.reason for one in skipped]
+        often = max(skipped, key=lambda one: reasons.count(one.reason))
         raise DataError(
             f"{often.path.parent}: {len(skipped)} of {len(pairs)} image pairs cannot be used, as {often}; "
             f"{often.remedy}"
@@ -139,11 +140,6 @@ def _tracked(
         np.concatenate([s.corners_px for _, s in seen]),
         tuple(map(str, skipped)),
     )
-
-
-def _commonest(skipped: Sequence[Unusable]) -> Unusable:
-    reasons = [one.reason for one in skipped]
-    return max(skipped, key=lambda one: reasons.count(one.reason))
 
 
 def _without_repeats(

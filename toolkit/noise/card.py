@@ -84,7 +84,8 @@ def card_of(sequence: Sequence) -> Card:
             f"{sequence.name}: the tracks seen {FEWEST_SIGHTINGS} times and more are too few to say what they are like"
         )
     spread_px = np.maximum(MAD_TO_SIGMA * np.median(np.abs(here.px), axis=0), 1e-9)
-    size = np.sqrt(_mean_of_each(here.track, np.square(here.px / spread_px).mean(axis=1)))
+    squares = np.square(here.px / spread_px).mean(axis=1)
+    size = np.sqrt(np.bincount(here.track, squares) / np.bincount(here.track))
     sound = size < _ODDS * np.median(size)
     common = np.bincount(neighbours(seen).interval, minlength=max(sequence.frame_count - 1, 0))
     disparity = disparity_px(seen.uv_px)
@@ -124,10 +125,6 @@ class _Residuals(NamedTuple):
         )
         _, track = np.unique(seen.point[often], return_inverse=True)
         return cls(begin + track, seen.pose[often], vision.residual_px[often] @ CHANNELS.T)
-
-
-def _mean_of_each(track: IntArray, values: Array) -> Array:
-    return np.asarray(np.bincount(track, values) / np.bincount(track))
 
 
 def _correlation(here: _Residuals, lag: int) -> Array:
