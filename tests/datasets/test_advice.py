@@ -451,11 +451,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (write(save_twice), "save it with one array of that name", write(save_npz)),
         (check("--tracks", "images"), "its format has tracks and no images; leave --tracks images out"),
         (check("--topics", "imu=/imu0"), "a bag has; leave --topics out, or compare it by itself"),
-        (
-            say("tracks", "@", "--out", "x"),
-            "name a bag, or a folder as EuRoC's or KITTI's",
-            say("tracks", "@/../none", "--out", "x"),
-        ),
+        (say("tracks", "@", "--out", "x"), "a folder as EuRoC's or KITTI's", say("tracks", "@/../none", "--out", "x")),
     ],
     "npy": [
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
@@ -492,29 +488,18 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     ],
     "own": [
         (edit("tracks.csv", "track_id", "trackid"), "(rename trackid?)", edit("tracks.csv", "trackid", "track_id")),
-        (
-            edit("tracks.csv", "t_ns,", "t,"),
-            "nanoseconds: divide by 1e9",
-            lines("tracks.csv", of_rows(in_seconds)),
-        ),
+        (edit("tracks.csv", "t_ns,", "t,"), "nanoseconds: divide by 1e9", lines("tracks.csv", of_rows(in_seconds))),
         (
             lines("tracks.csv", lambda table: [*table, table[3]]),
             "is there twice in its frame; remove one",
             lines("tracks.csv", lambda table: table[:-1]),
         ),
-        (
-            edit("rig.toml", "baseline_m", "baseline"),
-            "did you mean baseline_m?; remove or rename it",
-            edit("rig.toml", "baseline", "baseline_m"),
-        ),
+        (edit("rig.toml", "baseline_m", "baseline"), "remove or rename it", edit("rig.toml", "baseline", "baseline_m")),
         (
             lines("rig.toml", lambda rows: [*(row for row in rows if "_d" not in row and "_w" not in row), "x = 1\n"]),
             "there is no noise.x; remove or rename it",
         ),
-        (
-            lines("rig.toml", lambda rows: ["noise = 1\n", *rows[: rows.index("[noise]\n")]]),
-            "write [noise] above its densities",
-        ),
+        (lines("rig.toml", lambda rows: ["noise = 1\n", *rows[: rows.index("[noise]\n")]]), "above its densities"),
         (
             lines("tracks.csv", lambda table: [f"t,{table[0]}", *(f"1.5,{row}" for row in table[1:])]),
             "has the columns t and t_ns; leave one out",
@@ -632,25 +617,15 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (text("times.txt", "0.5\n" * FRAMES), "write the time of each"),
         (gone("image_1"), "and stereo needs both cameras; add those of image_1"),
         (lambda case: [path.unlink() for path in case.at.glob("*/*.png")], "with images; unpack them there (.png"),
-        (
-            swap("image_0", "image_1"),
-            "images are exchanged; exchange the two, or turn the images back",
-            swap("image_0", "image_1"),
-        ),
+        (swap("image_0", "image_1"), "exchange the two, or turn the images back", swap("image_0", "image_1")),
         (
             pixels("image_?/*.png", lambda image: image[:, ::-1]),
             "or turn the images back if all are upside down or mirrored",
             pixels("image_?/*.png", lambda image: image[:, ::-1]),
         ),
         (rolled, "one camera began earlier or dropped an image; pair them by when they were taken", later(1)),
-        (
-            pixels("image_1/*.png", lambda image: image[::2, ::2]),
-            "where images were scaled, cut or turned, do the same to the calibration",
-        ),
-        (
-            pixels("image_?/*.png", lambda image: image.astype(np.float32), ".tif"),
-            "convert the images to 8 or 16 bits",
-        ),
+        (pixels("image_1/*.png", lambda image: image[::2, ::2]), "cut or turned, do the same to the calibration"),
+        (pixels("image_?/*.png", lambda image: image.astype(np.float32), ".tif"), "convert the images to 8 or 16 bits"),
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
         (say("check-data", "@/image_0"), "is a part of a recording: name the whole recording"),
         (say("check-data", "@/poses.txt"), "name a recording and --trajectory NAME=FILE, or vislam evaluate"),
@@ -670,10 +645,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     ],
     "day": [
         (gone("calib_cam_to_cam.txt"), "into the folder of the day or of the drive"),
-        (
-            pixels("*/image_*/data/*.png", lambda image: image[::2, ::2]),
-            "take the calibration of the images' day, or images that were not scaled or cut",
-        ),
+        (pixels("*/image_*/data/*.png", lambda image: image[::2, ::2]), "day, or images that were not scaled or cut"),
         (text(f"{DAY}/oxts/data/0000000003.txt", packet(0.3, yaw=30.0)), "and no radians; convert degrees"),
         (
             edit(f"{DAY}/image_00/timestamps.txt", "2011-09-26 13", "yesterday 13"),
@@ -704,10 +676,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             lines("truth.tum", lambda all_: [f"{float(line[:20]) - 500.0:.9f}{line[20:]}" for line in all_]),
             "check that both are of one recording and clock",
         ),
-        (
-            both(*(lines(name, restamped(lambda t: t // 1000)) for name in TABLES)),
-            "microseconds: multiply by 1e3",
-        ),
+        (both(*(lines(name, restamped(lambda t: t // 1000)) for name in TABLES)), "microseconds: multiply by 1e3"),
         (lines(TABLES[0], of_rows(in_seconds)), "write seconds times 1e9"),
         (
             lines(TABLES[1], restamped(lambda t: t + 20_000_000)),
@@ -724,7 +693,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (edit(YAMLS[1], "[320, 200]", "[640, 400]"), "a pair needs one size; record both alike"),
         (
             yaml_of(PLACES[0], PLACES[1] @ se3_exp(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))),
-            "correct the extrinsics, or name two cameras that are a pair",
+            "correct the extrinsics, or name two cameras",
         ),
         (text("camchain.yaml", "a: [" * 2000), "is nested too deeply for a calibration; name another file"),
         (text("camchain.yaml", "a: 1\n" * 1_000_000), "characters are no calibration; name another file"),
@@ -785,26 +754,15 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
     ],
     "bare": [
-        (
-            without("camera_info"),
-            "or put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag",
-            beside,
-        ),
+        (without("camera_info"), "an ASL folder's cam0/sensor.yaml beside the bag", beside),
         (
             topic("camera_info", "lens"),
             "name it with --topics left_info=TOPIC,right_info=TOPIC",
             TOPICS("left_info=/cam0/lens,right_info=/cam1/lens"),
         ),
         (without("tf_static"), "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag", beside),
-        (
-            both(without("camera_info", "tf_static"), more(*calibration(PLACES, "P"))),
-            "cam0/sensor.yaml beside the bag and name the raw images",
-        ),
-        (
-            both(RAW, more(*calibration(PLACES, "K"))),
-            "is not calibrated (K is zero or the size is missing); put Kalibr's camchain.yaml",
-            beside,
-        ),
+        (both(without("camera_info", "tf_static"), more(*calibration(PLACES, "P"))), "the bag and name the raw images"),
+        (both(RAW, more(*calibration(PLACES, "K"))), "put Kalibr's camchain.yaml", beside),
         (both(RAW, more(*calibration([PLACES[1], PLACES[0]], "P"))), "exchange them, or correct the extrinsics"),
     ],
 }
