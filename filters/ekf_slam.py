@@ -21,7 +21,6 @@ estimates.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -73,13 +72,8 @@ def joint_ekf(setup: Setup) -> "JointEkf":
     return JointEkf(setup, at, setup.choice("landmarks", beliefs))
 
 
-class Correct(Protocol):
-    """Corrects a joint belief by the landmarks of its state; the frame must show every one of them."""
-
-    def __call__(
-        self, joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate, /
-    ) -> None:
-        """Correct the belief; the gate counts the tests."""
+# Corrects a joint belief by the landmarks of its state; the frame must show all of them, and the gate counts tests.
+Correct = Callable[[JointBelief, StereoFrame, Linearisation, StereoRig, FrameGate], None]
 
 
 class JointEkf:

@@ -8,9 +8,9 @@ Cathey 1993). Two options say what that Gaussian is: the coordinates in which it
 between the state and the landmarks are kept. Answers are read as in `fixed-lag`.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -24,7 +24,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, se3_inverse, se3_right_jacobian, skew, transform
 from toolkit.measurements import NS_PER_S
-from toolkit.models.factors import L, kind_of, linear_factor
+from toolkit.models.factors import L, kind_of, linear_factor, ordering_of
 from toolkit.settings.records import Scalar
 
 CITES = ("sibley2010sliding", "bell1993iterated", "gtsam")
@@ -58,39 +58,32 @@ _UNIT = gtsam.noiseModel.Unit.Create(1)
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     lag_s = setup.settings.window.seconds(setup.motion_kind)
-    coordinates: dict[Scalar, Coordinates] = {"invariant": InBody(setup.rig.T_imu_cam), "latest": InWorld()}
+    coordinates: dict[Scalar, Coordinates] = {"invariant": InBody(setup.rig.T_imu_cam), "latest": Coordinates()}
     kept: dict[Scalar, Kept] = {True: whole, False: without_cross_covariances}
     chosen = setup.choice("marginals", coordinates), setup.choice("cross_covariances", kept)
     return Thinned(setup, FixedLag(setup, lag_s, SlidingWindow(round(lag_s * NS_PER_S), *chosen)))
 
 
-class Coordinates(Protocol):
-    """What the errors of a Gaussian on one state and some landmarks are measured in.
+class Coordinates:
+    """What the errors of a Gaussian on one state and some landmarks are measured in: here GTSAM's own tangent spaces.
 
-    Keys are in the order pose, (velocity,) bias, landmarks.
+    Velocities and landmarks are in the axes of the world. Keys are in the order pose, (velocity,) bias, landmarks.
     """
 
     def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
-        """Return the errors (n,) of values against others, and their Jacobian (n, n) in GTSAM's tangent spaces."""
+        """Return the errors (n,) of values against others, and their Jacobian (n, n) in GTSAM's tangent spaces.
+
+        Here the identity, which it is to first order.
+        """
+        error = np.asarray(at.localCoordinates(values).vector(keys))
+        return error, np.eye(error.size)
 
     def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
         """Take note that the Gaussian is on another state from now on; ``landmarks`` are all that are in it then."""
 
 
-class InWorld:
-    """GTSAM's own tangent spaces: velocities and landmarks in the axes of the world."""
-
-    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
-        """Return the errors (n,), and as their Jacobian the identity, which it is to first order."""
-        error = np.asarray(at.localCoordinates(values).vector(keys))
-        return error, np.eye(error.size)
-
-    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
-        """Change nothing."""
-
-
 @dataclass
-class InBody:
+class InBody(Coordinates):
     """Velocity and landmarks in the axes of the state, which a turned or displaced world leaves as they are.
 
     Heading and position of the whole therefore stay unobservable at changing estimates, as in the right-invariant error
@@ -236,13 +229,13 @@ class SlidingWindow:
         known = set(linear.keyVector())
         if gone & known:
             self._factors = [factor for factor in self._factors if gone.isdisjoint(factor.keys())]
-            _, rest = linear.eliminatePartialSequential(_ordering(key for key in leaving if key in known))
+            _, rest = linear.eliminatePartialSequential(ordering_of(key for key in leaving if key in known))
             landmarks = sorted(key for key in known - gone if kind_of(key) == "l")
             before = leaving[0] if kind_of(leaving[0]) == "x" else state[0]
             self._coordinates.pass_on(values.atPose3(before), values.atPose3(state[0]), landmarks)
             keys = [*state, *landmarks]
             at = values.extract(keys)
-            root, told = self._kept(*rest.jacobian(_ordering(keys)), at.extract(state).dim())
+            root, told = self._kept(*rest.jacobian(ordering_of(keys)), at.extract(state).dim())
             _, H = self._coordinates.errors(at, at, keys)
             self._left = Gaussian(keys, at, np.asarray(np.linalg.solve(H.T, root.T).T), told, self._coordinates)
         for key in leaving:
@@ -309,15 +302,8 @@ class SlidingWindow:
         connected = set() if self._left is None else set(self._left.keys)
         landmarks = sorted(self._landmarks, key=lambda key: (key in connected, key))
         states = [*self._states[1:-1], *self._states[:1], *self._states[1:][-1:]]
-        return _ordering([*landmarks, *(key for _, keys in states for key in keys), LAST])
+        return ordering_of([*landmarks, *(key for _, keys in states for key in keys), LAST])
 
 
 def _place(key: int) -> int:
     return "xvb".index(kind_of(key))
-
-
-def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering

@@ -17,7 +17,7 @@ import numpy as np
 
 from toolkit.geometry import IntArray
 from toolkit.measurements import StereoFrame
-from toolkit.models.factors import L, X, kind_of
+from toolkit.models.factors import L, X, kind_of, ordering_of
 
 Order = Callable[[gtsam.NonlinearFactorGraph, list[StereoFrame]], gtsam.Ordering]
 
@@ -59,10 +59,7 @@ def _in_time(keys: Iterable[int], frames: list[StereoFrame]) -> gtsam.Ordering:
             of_states[wait.get(key, gtsam.Symbol(key).index())].append(key)
         else:
             rest.append(key)
-    ordering = gtsam.Ordering()
-    for key in (*first, *(key for k in sorted(of_states) for key in of_states[k]), *rest):
-        ordering.push_back(key)
-    return ordering
+    return ordering_of([*first, *(key for k in sorted(of_states) for key in of_states[k]), *rest])
 
 
 def _operations(graph: gtsam.SymbolicFactorGraph, ordering: gtsam.Ordering) -> int:
