@@ -23,7 +23,7 @@ from toolkit.report.curves import (
     look_numbers,
 )
 from toolkit.report.figures import FigureChoice, FigureFormat, bands, from_above, over_time, save
-from toolkit.report.figures.from_above import NOWHERE, PathFromAbove, view_of
+from toolkit.report.figures.from_above import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 from toolkit.sequence import Sequence
 from toolkit.settings import Metrics, Settings
@@ -153,11 +153,10 @@ def test_the_share_in_the_band_is_the_metrics(offset: Comparison) -> None:
 
 
 def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
-    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
-    straight = PathFromAbove(np.arange(2), np.array([[0.0, 0.0], [100.0, 0.0]]))
-    (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight, nowhere], [straight]))
+    straight = np.array([[0.0, 0.0], [100.0, 0.0]])
+    (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight, NOWHERE], [straight]))
     np.testing.assert_array_equal(both, one)
-    assert np.isfinite(view_of([nowhere], NOWHERE)).all()
+    assert np.isfinite(view_of([NOWHERE], NOWHERE)).all()
 
 
 @pytest.mark.parametrize("draw", [over_time.draw_errors, from_above.draw_all])

@@ -13,13 +13,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 from toolkit.answers import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.files.writing import plain_name
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.report.curves import alignment_text, errors_to, onto_truth, shown_output, truth_during
 from toolkit.report.figures import style
@@ -56,13 +55,6 @@ class View(NamedTuple):
         axes.set_aspect("equal", adjustable="box")
 
 
-class PathFromAbove(NamedTuple):
-    """Positions from above (N, 2) m at stamps (N,)."""
-
-    t_ns: IntArray
-    xy: Array
-
-
 def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     """Return x and y (M, 2) of the finite ones among points (N, 3), moved with the run onto the truth."""
     alignment = onto_truth(run, shown_output(run), comparison.sequence)
@@ -71,35 +63,25 @@ def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     return above
 
 
-def track_of(comparison: Comparison, run: Run) -> PathFromAbove:
-    """Return a run's final answer from above, without poses that are not finite; the run must have a trajectory."""
+def _track(comparison: Comparison, run: Run) -> Array:
+    """Return a run's final answer from above (M, 2), without poses that are not finite; nothing of no trajectory."""
     trajectory = run.trajectory(shown_output(run))
-    assert trajectory is not None, "only runs with a trajectory are drawn"
-    finite = np.isfinite(trajectory.positions).all(axis=1)
-    return PathFromAbove(trajectory.t_ns[finite], from_above(comparison, run, trajectory.positions))
+    return NOWHERE if trajectory is None else from_above(comparison, run, trajectory.positions)
 
 
-def true_track(comparison: Comparison) -> PathFromAbove | None:
-    """Return the truth from above while the camera ran, or None."""
+def _true_track(comparison: Comparison) -> Array:
     truth = truth_during(comparison.sequence)
-    return None if truth is None else PathFromAbove(truth.t_ns, truth.T_world_imu[:, :2, 3])
+    return NOWHERE if truth is None else truth.T_world_imu[:, :2, 3]
 
 
-def landmarks_shown(points: Array) -> Array:
-    """Return the corners (2, 2) of the range that holds all but the farthest of points (M, 2), or nothing."""
-    if not points.shape[0]:
-        return NOWHERE
-    corners: Array = np.quantile(points, _LANDMARK_QUANTILES, axis=0)
-    return corners
-
-
-def view_of(tracks: Sequence[PathFromAbove], landmarks: Array) -> View:
-    """Return the view of all of the tracks and of landmarks (M, 2) near them."""
-    track = np.vstack([NOWHERE, *(one.xy for one in tracks)])
+def view_of(tracks: Sequence[Array], landmarks: Array) -> View:
+    """Return the view of all of the tracks (N, 2) and of all but the farthest of the landmarks (M, 2) near them."""
+    track = np.vstack([NOWHERE, *tracks])
     if not track.size:
         track = np.zeros((1, 2))
+    corners = np.quantile(landmarks, _LANDMARK_QUANTILES, axis=0) if len(landmarks) else NOWHERE
     reach = max(_LANDMARK_REACH * float(np.ptp(track, axis=0).max()), _LEAST_REACH_M)
-    shown = np.vstack([track, np.clip(landmarks, track.min(axis=0) - reach, track.max(axis=0) + reach)])
+    shown = np.vstack([track, np.clip(corners, track.min(axis=0) - reach, track.max(axis=0) + reach)])
     low, high = shown.min(axis=0), shown.max(axis=0)
     margin = max(_MARGIN * float((high - low).max()), 0.5)
     return View(low - margin, high + margin)
@@ -131,43 +113,30 @@ def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, title: str) -> Figure:
-    truth, tracks = true_track(comparison), [track_of(comparison, run) for run in runs]
+    truth, tracks = _true_track(comparison), [_track(comparison, run) for run in runs]
     # A run that diverged would squash all the others; its own figure shows where it went.
     shown = [track for track, run in zip(tracks, runs, strict=True) if run.status == "ok" or len(runs) == 1]
-    shown += [] if truth is None else [truth]
     landmarks = NOWHERE if mapper is None else from_above(comparison, mapper, mapper.landmarks.points_world)
-    view = view_of(shown, landmarks_shown(landmarks))
+    view = view_of([*shown, truth], landmarks)
     figure = style.new_figure(min(max(style.WIDTH_IN * view.ratio, _LOWEST_IN), _HIGHEST_IN) + _LABELS_IN)
-    axes = figure.subplots()
-    axes.scatter(
-        landmarks[:, 0], landmarks[:, 1], s=3.0, color=style.LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1
-    )
-    if truth is not None:
-        axes.plot(*truth.xy.T, color=style.TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
+    axes, entries = figure.subplots(), []
+    if len(truth):
+        axes.plot(*truth.T, color=style.TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
+        entries.append(Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH))
     for run, track in zip(runs, tracks, strict=True):
         width = _LINE_WIDTH if len(runs) == 1 else style.width_of(comparison, run.estimator)
-        axes.plot(
-            *track.xy.T, linewidth=width, zorder=3, **style.stroke_of(comparison, run.estimator, shown_output(run))
-        )
-        colour = style.colour_of(comparison, run.estimator)
-        axes.plot(*track.xy[:1].T, "o", color=colour, ms=5.0, markeredgecolor="white", zorder=4)
+        stroke = style.stroke_of(comparison, run.estimator, shown_output(run))
+        axes.plot(*track.T, linewidth=width, zorder=3, **stroke)
+        axes.plot(*track[:1].T, "o", color=stroke["color"], ms=5.0, markeredgecolor="white", zorder=4)
+        entries.append(Entry.of_line(_name(run), stroke["color"], stroke["linestyle"], 1.8))
+    if mapper is not None and len(mapper.landmarks):
+        x, y = landmarks.T
+        dots = axes.scatter(x, y, s=3.0, color=style.LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1)
+        entries.append(Entry(f"landmarks of {mapper.estimator}", dots))
     view.show(axes)
     style.label_axes(axes, title, "x [m]", "y [m]")
-    style.legend_below(figure, _entries(comparison, runs, truth, mapper))
+    style.legend_below(figure, entries)
     return figure
-
-
-def _entries(
-    comparison: Comparison, runs: Sequence[Run], truth: PathFromAbove | None, mapper: Run | None
-) -> list[Entry]:
-    entries = [] if truth is None else [Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH)]
-    for run in runs:
-        line = Line2D([], [], linewidth=1.8, **style.stroke_of(comparison, run.estimator, shown_output(run)))
-        entries.append(Entry(_name(run), line))
-    if mapper is not None and len(mapper.landmarks):
-        dot = Line2D([], [], color=style.LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
-        entries.append(Entry(f"landmarks of {mapper.estimator}", dot))
-    return entries
 
 
 def _name(run: Run) -> str:
@@ -183,10 +152,9 @@ _BAR_IN, _TITLE_IN = 1.1, 0.3
 
 
 class _Coloured(NamedTuple):
-    """What a panel shows: where a run went, and its distance (n,) m to the truth at points (n, 2) m."""
+    """What a panel shows: a run's distance (n,) m to the truth at points (n, 2) m of its way."""
 
     run: Run
-    track: PathFromAbove
     points: Array
     value: Array
 
@@ -206,25 +174,24 @@ def _by_position(comparison: Comparison, run: Run) -> _Coloured | None:
     errors = errors_to(truth, trajectory, alignment, comparison.sequence)
     if errors is None:
         return None
-    track = track_of(comparison, run)
-    points = np.stack([np.interp(errors.t_ns, track.t_ns, xy) for xy in track.xy.T], axis=1)
-    return _Coloured(run, track, points, errors.position_m)
+    t_ns = trajectory.t_ns[np.isfinite(trajectory.positions).all(axis=1)]
+    points = [np.interp(errors.t_ns, t_ns, along) for along in _track(comparison, run).T]
+    return _Coloured(run, np.stack(points, axis=1), errors.position_m)
 
 
 def _coloured_figure(comparison: Comparison, shown: Sequence[_Coloured]) -> NamedFigure:
-    truth = true_track(comparison)
+    truth = _true_track(comparison)
     good = [one for one in shown if one.run.status == "ok"] or list(shown)
-    view = view_of([one.track for one in good] + ([] if truth is None else [truth]), NOWHERE)
+    view = view_of([truth, *(one.points for one in good)], NOWHERE)
     scale = ScalarMappable(_norm(np.concatenate([one.value for one in good])), _COLOURS)
     names = [_name(one.run) for one in shown]
     panel_in = (style.WIDTH_IN - _BAR_IN) / style.columns_for(len(names)) * view.ratio + _TITLE_IN
     figure, panels = style.panels_of(names, "", panel_in)
     for axes, one in zip(panels.values(), shown, strict=True):
         view.show(axes)
-        if truth is not None:
-            axes.plot(*truth.xy.T, color=style.TRUTH_COLOUR, linewidth=0.6, zorder=3)
+        axes.plot(*truth.T, color=style.TRUTH_COLOUR, linewidth=0.6, zorder=3)
         axes.add_collection(_line(one, scale))
-        axes.set_title(f"{number(rmse(one.value))} m", fontsize=style.SMALL_PT, loc="right", color=style.MUTED_COLOUR)
+        style.annotate(axes, f"{number(rmse(one.value))} m")
     bar = figure.colorbar(scale, ax=list(panels.values()), shrink=0.9, aspect=35, pad=0.02, extend="both")
     bar.set_label("position error [m]", fontsize=style.LABEL_PT)
     bar.ax.tick_params(labelsize=style.TICK_PT)
