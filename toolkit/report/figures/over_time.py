@@ -34,7 +34,6 @@ from toolkit.report.text import number
 _FAR_FROM_MIDDLE = 10.0
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
 _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
-_ORDER_OF_MAGNITUDE, _BELOW_LEAST, _LEAST_LOGARITHMIC_M = 12.0, 0.2, 1e-5
 _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
 # An axis shows all of the error, and of the band at most this many times the largest error.
@@ -73,18 +72,11 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
 
 
 def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
-    """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them.
-
-    Where these differ by more than an order of magnitude it is logarithmic: else the best would be a line at zero.
-    """
+    """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them."""
     largest = {row: float(np.nanmax(errors.position_m)) for row, errors in curves}
     good = [size for row, size in largest.items() if row.status == "ok"] or largest.values()
     reach = 1.05 * max(*good, _LEAST_POSITION_M)
-    sizes = [size for row, errors in curves if row.status == "ok" and (size := rmse(errors.position_m)) > 0.0]
-    if sizes and max(sizes) > _ORDER_OF_MAGNITUDE * min(sizes) and reach > 2.0 * _LEAST_POSITION_M:
-        style.scale_by_decades(axes, max(_BELOW_LEAST * min(sizes), _LEAST_LOGARITHMIC_M), reach)
-    else:
-        axes.set_ylim(0.0, reach)
+    style.scale_errors(axes, [rmse(errors.position_m) for row, errors in curves if row.status == "ok"], reach)
     _say_who_leaves(axes, largest, reach, "m")
 
 
@@ -102,7 +94,7 @@ def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: s
     beyond = {row.estimator: size for row, size in largest.items() if size > 1.01 * reach}
     if beyond:
         listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
-        axes.set_title(f"beyond it: {listed}", fontsize=style.SMALL_PT, loc="right", color=style.MUTED_COLOUR)
+        style.annotate(axes, f"beyond it: {listed}")
 
 
 def _without_wraps(heading_deg: Array) -> Array:

@@ -41,6 +41,8 @@ _WIDEST, _THINNEST = 2.8, 1.2
 _MANY = 10
 _PANEL_IN = 1.35
 _FEW_DECADES = 1.7
+# Errors that differ by this factor have a logarithmic axis, which begins here at least: the best were a line at zero.
+_ORDER_OF_MAGNITUDE, _LEAST_ERROR = 12.0, 1e-5
 
 
 class NamedFigure(NamedTuple):
@@ -218,6 +220,15 @@ def scale_by_decades(axes: Axes, low: float, high: float, which: Literal["x", "y
         axis.set_major_formatter("{x:g}")
     # Ticks between decades are many, and take longer to draw than all else.
     axis.set_minor_locator(NullLocator())
+
+
+def scale_errors(axes: Axes, sizes: Sequence[float], most: float) -> None:
+    """Have an axis of errors reach from zero up to a value, by decades where their sizes differ by more than one."""
+    known = [size for size in sizes if size > 0.0]
+    if known and max(known) > _ORDER_OF_MAGNITUDE * min(known):
+        scale_by_decades(axes, max(0.2 * min(known), _LEAST_ERROR), most)
+    else:
+        axes.set_ylim(0.0, most)
 
 
 def annotate(axes: Axes, text: str) -> None:

@@ -3,12 +3,11 @@
 Of each system it is the run of the middle error that is drawn, after the fit of SE(3) to its positions, as evo's -a.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from toolkit.errors import DataError
 from toolkit.evaluation.scoring import TruthFile, aligned_file
@@ -25,7 +24,6 @@ from toolkit.report.text import number
 # Systems in a figure of trajectories, from the first of the leaderboard; sequences that are drawn unless all are asked
 # for; and sequences that have a panel of boxes each.
 _MOST_SYSTEMS, _FEW_SEQUENCES, _MOST_PANELS = 7, 3, 12
-_ORDER_OF_MAGNITUDE = 12.0
 _FITTED = "after the fit of SE(3)"
 _TRUTH = Entry.of_line("truth", style.TRUTH_COLOUR)
 
@@ -50,13 +48,9 @@ def draw(evaluation: EvaluatedSystems, *, all_sequences: bool = False) -> Iterat
         name = f"{name}-{i + 1}" if name in map(plain_name, sequences[:i]) else name
         yield _map(name, truth, drawn)
         yield _errors(name, truth, drawn)
-        at_s = [_since_start(truth, one.matched.t_ns) for one in drawn]
-        positions = [one.matched.estimate[:, :3, 3] for one in drawn]
-        yield _components(f"positions_{name}", truth, drawn, at_s, (truth.poses[:, :3, 3], positions), "xyz")
+        yield _components(f"positions_{name}", truth, drawn, "position", lambda poses: poses[:, :3, 3])
         if changes(truth.poses[:, :3, :3]):
-            angles = [_roll_pitch_yaw_deg(one.matched.estimate) for one in drawn]
-            both = _roll_pitch_yaw_deg(truth.poses), angles
-            yield _components(f"angles_{name}", truth, drawn, at_s, both, ("roll", "pitch", "yaw"))
+            yield _components(f"angles_{name}", truth, drawn, "angles", _roll_pitch_yaw_deg)
 
 
 def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
@@ -131,7 +125,7 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
         style.label_axes(grid[1], "rotation error", "", "rotation [deg]")
         grid[1].set_ylim(bottom=0.0)
     grid[-1].set_xlabel(_x_label(truth))
-    _fit_scale(grid[0], sizes, largest)
+    style.scale_errors(grid[0], sizes, 1.05 * largest)
     figure.align_ylabels()
     style.legend_below(figure, entries)
     return NamedFigure(
@@ -139,37 +133,27 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     )
 
 
-def _fit_scale(axes: Axes, sizes: list[float], largest: float) -> None:
-    least = min((size for size in sizes if size > 0.0), default=0.0)
-    if least and max(sizes) > _ORDER_OF_MAGNITUDE * least:
-        style.scale_by_decades(axes, 0.2 * least, 1.2 * largest)
-    else:
-        axes.set_ylim(bottom=0.0)
+_ROWS = {"position": ("x [m]", "y [m]", "z [m]"), "angles": ("roll [deg]", "pitch [deg]", "yaw [deg]")}
 
 
 def _components(
-    name: str,
-    truth: TruthFile,
-    drawn: list[_Drawn],
-    at_s: list[Array],
-    values: tuple[Array, list[Array]],
-    rows: str | tuple[str, ...],
+    name: str, truth: TruthFile, drawn: list[_Drawn], what: str, values_of: Callable[[Array], Array]
 ) -> NamedFigure:
-    """Return three panels, one a component of the truth's values (N, 3) and of each estimate's (n, 3)."""
-    true, estimates = values
-    unit = "m" if rows == "xyz" else "deg"
+    """Return three panels, one a component (n, 3) of poses (n, 4, 4), the truth's and each estimate's."""
     figure = style.new_figure(4.6)
     grid = figure.subplots(3, 1, sharex=True)
-    for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
-        axes.plot(_since_start(truth, truth.t_ns), true[:, i], color=style.TRUTH_COLOUR, linewidth=2.0)
-        for one, t_s, estimate in zip(drawn, at_s, estimates, strict=True):
-            axes.plot(t_s, estimate[:, i], color=one.colour, linewidth=1.2)
-        title = f"{truth.name}: {'position' if unit == 'm' else 'angles'}, {_FITTED}" if i == 0 else ""
-        style.label_axes(axes, title, _x_label(truth) if i == 2 else "", f"{row} [{unit}]")
+    for i, (axes, row) in enumerate(zip(grid, _ROWS[what], strict=True)):
+        at_s = _since_start(truth, truth.t_ns)
+        axes.plot(at_s, values_of(truth.poses)[:, i], color=style.TRUTH_COLOUR, linewidth=2.0)
+        for one in drawn:
+            at_s = _since_start(truth, one.matched.t_ns)
+            axes.plot(at_s, values_of(one.matched.estimate)[:, i], color=one.colour, linewidth=1.2)
+        title = f"{truth.name}: {what}, {_FITTED}" if i == 0 else ""
+        style.label_axes(axes, title, _x_label(truth) if i == 2 else "", row)
     figure.align_ylabels()
     style.legend_below(figure, [_TRUTH, *_entries(drawn)])
-    what = "Position" if unit == "m" else "Roll, pitch and yaw (about z, then y, then x)"
-    return NamedFigure(name, f"{what} on {truth.name} over time, {_FITTED}, with the truth.", figure)
+    told = "Position" if what == "position" else "Roll, pitch and yaw (about z, then y, then x)"
+    return NamedFigure(name, f"{told} on {truth.name} over time, {_FITTED}, with the truth.", figure)
 
 
 def _roll_pitch_yaw_deg(poses: Array) -> Array:
@@ -213,8 +197,7 @@ def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
             every += values
     if not every:
         return
-    if min(every) > 0.0 and max(every) > _ORDER_OF_MAGNITUDE * min(every):
-        style.scale_by_decades(next(iter(panels.values())), 0.8 * min(every), 1.2 * max(every))
+    style.scale_errors(next(iter(panels.values())), every, 1.2 * max(every))
     unit = f" [{metric.unit}]" if metric.unit not in ("", "1") else ""
     entries = [Entry.of_line(name, style.colour_at(place)) for place, name in enumerate(systems)]
     style.finish(figure, panels, f"{metric.name}{unit}", f"{metric.name} over {over}", entries)
