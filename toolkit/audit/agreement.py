@@ -116,11 +116,9 @@ class Span(NamedTuple):
 
 @beside_camera
 def conflict(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report the times at which vision and samples differ for seconds, and by how much; nothing is repaired.
+    """Report the times at which vision and samples differ for seconds: traffic in the view, slip, a shaken IMU.
 
-    Most of the points in view may belong to traffic, wheels may slip, or an IMU may be shaken. The deviation of the
-    samples from the camera's own motion is averaged over stretches of time and compared with the scatter of such
-    means in the rest of the recording.
+    Means of the deviation over stretches of time are compared with the scatter of such means in the rest.
     """
     sequence, found = evidence.sequence, list[tuple[Deviation, Span]]()
     speed_mps = float(np.median(np.linalg.norm(intervals.v_cam_mps, axis=1)))
@@ -163,11 +161,10 @@ def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ..
 
 
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
-    """Return the spans in which the means over stretches exceed ``sigmas`` of their standard deviations.
+    """Return the spans in which means over stretches exceed ``sigmas`` of their standard deviations, and ``least``.
 
-    The standard deviation of a mean is that of white noise. In a long recording it is no less than the scatter of the
-    means, taken from the less scattered half of them in each half of the recording, the smaller of both. ``least`` is
-    the smallest deviation that is reported, in its unit.
+    The standard deviation is that of white noise; in a long recording it is no less than the scatter of the less
+    scattered half of the means in either half of the recording, the smaller of both.
     """
     if deviation.t_s.size < LEAST_IN_STRETCH:
         return []
@@ -266,11 +263,7 @@ LEAST_STRETCHES_ASIDE = 2
 
 @beside_camera
 def scale_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report a step of odometry's scale: a tyre loses air, a gear or a focus is changed.
-
-    The ratio of the measured velocity to the camera's is computed in ten stretches. A step between two of them is
-    reported where the scatter within the parts before and after does not explain it.
-    """
+    """Report a step of odometry's scale, as of a tyre or gear, that its scatter over ten stretches does not explain."""
     if intervals.v_mps is None:
         return None  # an IMU has no speed to compare
     measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
@@ -325,8 +318,7 @@ LARGEST_HIDDEN_GRAVITY = 0.05
 def accelerometer_change(evidence: Evidence) -> Symptom | Undecided | None:
     """Report an accelerometer that reads another gravity from some time on: another range, or a knock.
 
-    The camera's velocity less the integrated specific force changes by gravity. The size of its slope over a few
-    seconds is the gravity that is read there; the gyro's drift changes only its direction, which is not used.
+    It is the size of the slope of the camera's velocity less the integrated force; the gyro's drift only turns that.
     """
     sequence = evidence.sequence
     if sequence.motion_kind != "imu":
@@ -408,9 +400,8 @@ LEAST_AROUND = 10
 def image_jump(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the times at which the image is displaced for good: a knock of the camera, another crop.
 
-    For one interval the camera seems to rotate by an angle that the gyro did not measure. A slip of the tracks
-    causes the same, but does not last: with odometry the camera's velocity must be rotated by that angle from then
-    on.
+    The camera seems to rotate in one interval, unlike the gyro. A slip of the tracks does not last: with odometry the
+    camera's velocity must be rotated by that angle from then on.
     """
     sequence = evidence.sequence
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S

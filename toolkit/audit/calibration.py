@@ -182,11 +182,7 @@ MOST_STRETCHED = 1.5
 
 
 def intrinsics(evidence: Evidence) -> Symptom | None:
-    """Report intrinsics that contradict the sightings: the principal point, a focal length that no lens has.
-
-    Suspects are reported only where ordinary values let the tracks follow one rigid motion of the camera better.
-    The true values are not in the data, so there is no repair.
-    """
+    """Report a principal point or focal length that no lens has, where others fit one motion of the camera better."""
     sequence = evidence.sequence
     uv_px = sequence.observations.uv_px
     if len(uv_px) < LEAST_INTERVALS or not is_measured(uv_px).all():
@@ -270,12 +266,10 @@ UNKNOWN_SIGMA_RADPS = 0.02
 
 
 def gyro_bias(evidence: Evidence) -> Symptom | Undecided | None:
-    """Report a constant bias of the gyro; it is left to the estimators, unless the recording's prior excludes it.
+    """Report a constant bias of the gyro, which is left to the estimators.
 
-    It is the median rate at a standstill of odometry, or an unknown of the self-calibration with an IMU (0.002
-    rad/s), or else the difference from the camera's rotation (0.5 degrees a second). An estimator whose prior
-    excludes the bias diverges, so the covariance of such a prior is widened. With odometry and without a prior,
-    estimators start from zero; a bias that is too large for that is subtracted.
+    A prior that excludes it makes them diverge, so its covariance is widened; with odometry and without a prior they
+    start from zero, and a bias that is too large for that is subtracted.
     """
     if (reading := _bias_read(evidence)) is None:
         return evidence.blind
@@ -340,9 +334,8 @@ LEAST_IN_COMMON = 0.8
 def gyro_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report the axes of the gyro whose rates are a multiple of the camera's: a channel with a wrong scale.
 
-    Noise of the camera's rates makes the slope of the gyro's rates on them too small, noise of the gyro makes the
-    inverse of the opposite slope too large (Frisch, "Statistical confluence analysis", 1934). Where both are above
-    1, or both below, noise does not explain it.
+    Noise lowers the slope of the gyro's rates on the camera's, and raises the inverse of the opposite one (Frisch,
+    "Statistical confluence analysis", 1934): the scale is wrong where both are on one side of 1.
     """
     off, doubtful = list[str](), list[str]()
     both = (rates - np.median(rates, axis=0) for rates in (intervals.w_radps, intervals.w_seen_radps))
@@ -395,11 +388,9 @@ LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 @beside_camera
 def lever_arm(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report the axes along which the camera is not at the position of the extrinsic.
+    """Report the axes along which the camera is not where the extrinsic has it, or the velocities are of another point.
 
-    In a turn of rate w, a camera whose position is wrong by p moves by w x p more than expected, so that residuals
-    appear in turns only. The data do not show whether the camera is elsewhere or the velocities are of another point.
-    With an IMU the self-calibration decides, which follows points over seconds.
+    In a turn of rate w, a camera whose position is wrong by p moves by w x p more than expected.
     """
     found, kind, T_imu_cam = evidence.position, evidence.sequence.motion_kind, evidence.sequence.rig.T_imu_cam
     if found is None:
@@ -455,9 +446,8 @@ LARGEST_RAD = 0.05
 def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Report small errors of the calibration that bend a trajectory: rotation, K, a sensor's scale.
 
-    From frame to frame, a rotated camera cannot be distinguished from a principal point that is off. Points
-    followed over a second distinguish most errors (`self_calibration`). With odometry, whose slip lasts as long,
-    the rotation from frame to frame is judged as well.
+    Points followed over a second show most of them (`self_calibration`). With odometry, whose slip lasts as long, the
+    rotation from frame to frame is judged as well.
     """
     wrongs, unseen = _calibration(evidence, intervals)
     rotation, force = rotation_ratio(intervals), force_ratio(evidence.sequence)
@@ -526,10 +516,9 @@ LARGEST_CHANCE = 0.02
 
 @beside_camera
 def vision_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report steps of vision longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
+    """Report steps of vision longer or shorter than those by odometry's velocities, or a baseline that fits the IMU.
 
-    A relative error of all depths scales every step of the camera by the same factor. Odometry's velocities show it;
-    with an IMU it is the baseline of the self-calibration. A ratio beyond MOST_RATIO is a `disagreement`.
+    A relative error of all depths does that. A ratio beyond MOST_RATIO is a `disagreement`.
     """
     if evidence.velocity_fit is not None:
         return _scale_beside_odometry(evidence.velocity_fit)
@@ -580,11 +569,7 @@ SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD = 0.005, 0.003
 
 
 def steady_difference(evidence: Evidence) -> Symptom | None:
-    """Report a constant difference of vision and odometry beyond chance, within what slip causes.
-
-    The data do not show whether the calibration or the wheels are wrong. The difference is significant all the
-    same, and no estimator's covariance accounts for it.
-    """
+    """Report a constant difference of vision and odometry beyond chance, within what slip causes."""
     found = evidence.velocity_fit
     if found is None:
         return None

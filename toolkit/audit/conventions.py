@@ -57,10 +57,8 @@ _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0
 def extrinsic_convention(evidence: Evidence) -> Symptom | Undecided | None:
     """Take the one of four readings of an extrinsic, which its format leaves open, that the tracks follow.
 
-    The matrix can be that of the IMU to the camera or its inverse, with camera axes x right, y down, z forward
-    (optical) or x forward, y left, z up (regular). Points moved by the motion samples through the right one have
-    the smallest residuals in the next frame. Two readings under which the camera looks the same way differ in its
-    position; its own velocity in turns then decides.
+    It may be inverted, with camera axes right, down, forward (optical) or forward, left, up (regular). Points moved by
+    the samples have the smallest residuals under the right one; of two that look the same way, turns decide.
     """
     sequence = evidence.sequence
     if EXTRINSIC_UNCERTAIN not in sequence.provenance.facts:
@@ -149,11 +147,9 @@ class ExtrinsicConvention(NamedTuple):
 def mixed_axes(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Find the extrinsic under which samples and camera agree, and take it where it is not the given one.
 
-    Three axes have 24 right-handed conventions. If the body's axes follow another one, the whole extrinsic is
-    rotated; if the camera's do, the camera is rotated at its position. All of these and the inverse are compared;
-    turns decide between two possible positions. A convention is taken only if the rotations alone do not contradict
-    it, among all 48 ways to exchange and negate three channels: otherwise channels of the samples are wrong, and
-    nothing is repaired. Velocities alone decide nothing, because slip changes the signs of small components.
+    With other axes of the body the whole extrinsic is rotated, with other axes of the camera that alone. All 24
+    conventions of each and the inverse are compared; turns decide between two possible positions. One is taken only if
+    the rotations alone, among 48 orders and signs of channels, do not contradict it: else channels are wrong.
     """
     given = evidence.sequence.rig.T_imu_cam
     readings = _readings(given)  # the first is the given
@@ -259,9 +255,8 @@ def _ranked(intervals: Intervals, readings: list[ExtrinsicConvention]) -> Rankin
 def extrinsic_translation(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Compare the extrinsic's translation with that of its inverse; take the latter where it is far more likely.
 
-    A file can hold the rotation IMU -> camera together with the camera's position t in the IMU frame. Inverted like
-    a rigid transform, it puts the camera at p = -R_imu_cam t. Turns distinguish p and t, because the camera's
-    velocity differs from the IMU's by w x p.
+    A file can hold the rotation IMU -> camera beside the camera's position t in the IMU frame: inverted, the camera is
+    at -R_imu_cam t. Turns distinguish both, because the camera's velocity differs from the IMU's by w x p.
     """
     if evidence.velocity_fit is None:
         return None  # without velocities lever-arm estimates the position
@@ -311,9 +306,7 @@ class _Changes(NamedTuple):
 def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     """Report the order and signs of the accelerometer's channels that fit the camera's motion, if not the given.
 
-    In the axes of one frame, by the gyro, the change of the camera's velocity less the specific force is gravity,
-    which is constant. Of all 48 ways to exchange and negate three channels the right one leaves the smallest
-    variation.
+    In the axes of one frame, by the gyro, the camera's change of velocity less the specific force is gravity, constant.
     """
     if evidence.intervals is None or evidence.sequence.motion_kind != "imu":
         return None

@@ -20,11 +20,10 @@ Spans = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault found in a recording, as it is reported.
+    """One fault found in a recording, as it is reported; ``count`` is in the fault's own unit, named in ``detail``.
 
-    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means that the
-    fault is harmful and was not repaired, so that a check of the recording has to fail. A ``warning`` has no repair and
-    does not block, but may affect every result of the recording. ``spans_ns`` are the times (ns) at which the fault is
+    A ``blocking`` one is harmful and not repaired, so that a check of the recording has to fail. A ``warning`` has no
+    repair and does not block, but may affect every result. ``spans_ns`` are the times (ns) at which the fault is
     present; it is empty where the fault is present throughout.
     """
 
@@ -39,12 +38,11 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Symptom:
-    """The result of a check: a count, a description, and the sequence without the fault.
+    """The result of a check: a count, a description, and the sequence without the fault, None without a sure repair.
 
-    ``remedy`` is None where there is nothing to repair, or no repair is known to be right; ``treatment`` describes what
-    the remedy does, or why there is none. A symptom that is not ``harmful`` is information and never blocks. One that
-    ``warns`` does not block either, but may spoil results: all of them, or those within its ``spans_ns``. After one
-    that ``spoils_vision`` and is not repaired, no later check uses the tracks.
+    ``treatment`` describes the repair, or why there is none. A symptom that is not ``harmful`` is information. One that
+    ``warns`` does not block, but may spoil results: all, or those within its ``spans_ns``. After one that
+    ``spoils_vision`` and is not repaired, no later check uses the tracks.
     """
 
     count: int

@@ -82,10 +82,8 @@ def _moved(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> _
 def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
     """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
 
-    Points triangulated in one frame are moved by the motion samples through the extrinsic ``T_imu_cam`` and projected
-    into the next. The gyro's bias, the median difference of its rates from the camera's, is subtracted, with odometry
-    only if it is no more than ``MOST_BIAS_RADPS``. An IMU measures no velocity, so the camera's own is used. Only
-    intervals whose camera motion is known are used.
+    Points are moved by the motion samples through the extrinsic ``T_imu_cam``, over intervals whose camera motion is
+    known. The gyro's bias is subtracted, with odometry up to ``MOST_BIAS_RADPS``; an IMU has the camera's velocity.
     """
     return _median(_one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))[1])
 

@@ -111,9 +111,8 @@ BEYOND_MEDIAN = 1e3
 def implausible(evidence: Evidence) -> Symptom | None:
     """Drop single values that no sensor gives, by a flipped bit or a failed parse.
 
-    A twist that differs from both neighbours by more than a vehicle's velocity can change is not a motion. With an
-    IMU, a single sample that differs from its neighbours, while those do not differ from theirs, is not a motion
-    either: a knock shows in several samples, or happens again.
+    Dropped are also a twist that differs from both neighbours by more than a vehicle can, and a sample of an IMU that
+    differs from neighbours that do not differ from theirs: a knock shows in several samples, or happens again.
     """
     sequence = evidence.sequence
     sightings: BoolArray = np.asarray((np.abs(sequence.observations.uv_px) > MOST_PX).any(axis=1))
@@ -184,10 +183,8 @@ CAMERA_STANDING_MPS, STRAIGHT_RADPS = 0.1, 0.01
 def stuck_samples(evidence: Evidence) -> Symptom | None:
     """Count the samples that repeat the one before in a long run, and drop them: the driver hangs.
 
-    Real samples have noise: three axes are not equal many times in a row, nor is one axis for a second. Odometry
-    repeats values without a fault (at standstill, whole counts on a straight line); its repetitions are a fault
-    where it moves and turns at once, beyond chance, or where its velocities or rates are zero throughout while the
-    camera moves.
+    Real samples have noise. Odometry repeats values without a fault (at standstill, whole counts); it hangs where it
+    moves and turns at once, beyond chance, or where it is zero throughout while the camera moves.
     """
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or not sequence.motion.t_ns.size:
@@ -328,9 +325,8 @@ MOST_ROUNDING = 0.5
 def coarse_samples(evidence: Evidence) -> Symptom | None:
     """Report samples that come in steps, because a converter has few bits or a log few digits.
 
-    Rounding to steps of s adds errors of s / sqrt(12) to each sample (Bennett, "Spectra of quantized signals",
-    1948), which stay the same for seconds in uniform motion. Rounded values repeat, and different ones are at least
-    a step apart.
+    Rounding to steps of s adds errors of s / sqrt(12) (Bennett, "Spectra of quantized signals", 1948), which last in
+    uniform motion.
     """
     sequence = evidence.sequence
     if sequence.motion_kind == "none" or sequence.motion.t_ns.size < LEAST_COARSE_SAMPLES:
@@ -517,10 +513,8 @@ class _WrongUnit(NamedTuple):
 def units(evidence: Evidence) -> Symptom | Undecided | None:
     """Convert times, lengths, speeds, rates and accelerations that are not in SI, where the unit is certain.
 
-    Two sources of one motion have a ratio that does not depend on axes: of the speeds of samples and camera, of
-    their rates of rotation, of the speeds of truth and samples, of specific force and gravity. A ratio that is a
-    unit's factor names the unit. One that speeds and rates have in common is that of the stamps, because the
-    camera's motion is divided by time. Baseline and extrinsic are judged by lengths that no rig has.
+    A ratio of two sources of one motion does not depend on axes: that of a unit's factor names the unit, and one that
+    speeds and rates have in common that of the stamps. Baseline and extrinsic are judged by lengths that no rig has.
     """
     now, stamps = evidence, _stamps(evidence) or _frame_rate(evidence)
     found = [] if stamps is None else [stamps]

@@ -473,11 +473,7 @@ class _Adjustment(NamedTuple):
 
 
 def _fitted(at: _Adjustment, kind: MotionKind) -> tuple[_Adjustment, Array]:
-    """Return the adjustment and its covariance (21, 21).
-
-    A rectified pair is assumed unless, after convergence, one step of all unknowns has a significant correction of the
-    right image.
-    """
+    """Return the adjustment and its covariance (21, 21), of a rectified pair unless one step of all is significant."""
     rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
     right = _step(rectified.all_reduced, rectified.moved_by, prior)[RIGHT]
     # Windows of a pair that is not rectified fit different calibrations, so their scatter is not included.

@@ -64,9 +64,8 @@ class _Step(NamedTuple):
 def clock_jump(evidence: Evidence) -> Symptom | Undecided | None:
     """Report the times at which the clock was set, and keep the longest stretch between them.
 
-    If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, by
-    one usual step. The distance that the camera moves in that interval, in units of the intervals around it,
-    decides. A clock that goes back by more than a step shows in its stamps (`time_order`).
+    If nothing was recorded for a while, the vehicle has moved as far as the stamps say; if the clock was set, by one
+    usual step. A clock that goes back by more than a step shows in its stamps (`time_order`).
     """
     sequence = evidence.sequence
     steps, at_s = list(_steps_alike(sequence)), (sequence.frames_t_ns - sequence.frames_t_ns[:1]) / NS_PER_S
@@ -273,10 +272,9 @@ MOTION_GAP_S = 1.5
 
 
 def time_gap(evidence: Evidence) -> Symptom | None:
-    """Find gaps in the motion samples and keep the longest stretch between them; else in the frames.
+    """Find gaps in the motion samples, which no noise covers, and keep the longest stretch between them.
 
-    No measurement says how the vehicle moved in a long gap, and no noise model covers interpolation over it. A gap
-    in the frames alone is information, because the motion samples cover it.
+    A gap in the frames alone is information, because the motion samples cover it.
     """
     sequence = evidence.sequence
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
@@ -340,11 +338,9 @@ LEAST_STRETCHES = 5
 
 
 def motion_gap(evidence: Evidence) -> Symptom | None:
-    """Fill short gaps in the motion samples, with the noise that interpolation has elsewhere.
+    """Fill gaps in the motion samples that are too short for `time_gap` on straight lines, and raise the noise there.
 
-    A gap shorter than `time_gap` reports is filled on straight lines. Stretches of the same length that were
-    measured are interpolated in the same way, and the noise in the gap is raised until it covers the integral of
-    their error.
+    It covers the error that the same interpolation has over measured stretches of the same length.
     """
     sequence = evidence.sequence
     if not is_comparable(sequence):
@@ -437,8 +433,7 @@ BESIDE = (-2, -1, 1, 2)
 def uneven_stamps(evidence: Evidence) -> Symptom | None:
     """Report frames with uneven stamps of evenly taken images: transfer times, a busy computer.
 
-    The motion of a camera from one image to the next is proportional to the time between them. An interval that is
-    longer by its stamps must show more motion than the intervals around it, by the tracks alone.
+    An interval that is longer by its stamps must show more motion than those around it, by the tracks alone.
     """
     sequence, camera = evidence.sequence, evidence.camera_motion
     if evidence.spoilt_by or not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
@@ -494,9 +489,8 @@ LAG_SIGMAS = 5.0
 def twist_lag(evidence: Evidence) -> Symptom | Undecided | None:
     """Estimate which interval a twist describes, and pair the samples by the nearest of start, mean and end.
 
-    With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
-    0 where the sample at the start describes the interval, 1 where that at the end does: half an interval is the mean
-    of both, which has no offset of the clocks (`clocks`).
+    With w_k the sample and c_k the camera's rotation over k -> k + 1, c_k = (1 - s) w_k + s w_(k+1) has a lag s of 0
+    where the sample at the start describes the interval, 1 at the end, 1/2 without an offset of the clocks (`clocks`).
     """
     sequence, intervals = evidence.sequence, evidence.intervals
     if not isinstance(sequence.motion, TwistSamples):
@@ -548,9 +542,8 @@ ONE_CLOCK = "a clock drifts or was set: stamp both by one clock, or cut the reco
 def time_offset(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
     """Find the offset of the frames' stamps by rotations (`clocks`), and shift the frames by it.
 
-    For twists stamped at the frames, `twist_lag` sets the pairing, and only an offset that no pairing explains is
-    reported. Frames are not shifted by an offset that only half of the recording has, or that grows (a change of
-    the clock), nor where the velocities of the twists then fit worse: the rates of rotation alone are late.
+    Twists stamped at the frames have a pairing (`twist_lag`); what that explains is no offset. Frames are not shifted
+    where the halves differ, nor where velocities then fit worse: the rates of rotation alone are late.
     """
     sequence = evidence.sequence
     at_frames, is_twist = is_stamped_at_frames(sequence), isinstance(sequence.motion, TwistSamples)
@@ -673,11 +666,9 @@ LARGEST_CHANGE_S = 0.1
 
 @beside_camera
 def clock_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Compare the offsets of camera and samples in both halves of the recording.
+    """Compare the offsets of camera and samples in both halves of the recording, equal with clocks of one rate.
 
-    With clocks of one rate they are equal, whatever interval a sample describes; if they change, no constant shift
-    is right. With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by
-    rotations.
+    With an IMU the change is an unknown of the self-calibration, else the difference of the offsets by rotations.
     """
     found = _fitted_change(evidence, intervals) or change_of_offset(evidence.sequence, intervals)
     if found is None:

@@ -47,8 +47,7 @@ def unknown_rows(evidence: Evidence) -> Undecided | None:
 def returning_tracks(evidence: Evidence) -> Symptom | None:
     """Count the track ids that are absent for some frames and return; each return starts a new track.
 
-    If the tracker recognised the point, an estimator that uses the id closes a loop without knowing it; if it used
-    the id again for another point, an estimator takes two points for one.
+    An estimator would close a loop without knowing it or, of an id used again, take two points for one.
     """
     observations = evidence.sequence.observations
     order = observations.by_track
@@ -77,9 +76,8 @@ TURNING_PX, DRIVING_MPS = 2.0, 1.0
 def stale_frames(evidence: Evidence) -> Symptom | None:
     """Count the frames that repeat the pixels before them while the vehicle moves; repeated tracks end there.
 
-    From such a frame on, each track follows a different scene point. A standing camera also repeats pixels, which
-    is no fault: the image must move just before and just after or, at the ends of a recording, the samples must
-    show motion.
+    From then on, each track follows a different scene point. A standing camera repeats pixels too: the image must move
+    just before and just after or, at the ends of a recording, the samples must show motion.
     """
     sequence = evidence.sequence
     pairs = neighbours(sequence.observations)
@@ -217,10 +215,8 @@ NAMES = ("uL", "uR", "v")
 def swapped_coordinates(evidence: Evidence) -> Symptom | None:
     """Find coordinates in the wrong columns: left and right images exchanged, or rows and columns.
 
-    A point in front of a rectified pair is farther left in the right image, so nearly every disparity uL - uR is
-    positive. Where many are not, the five other orders of the coordinates are tried; the right one is that under
-    which the tracks follow the measured motion. Where rows and columns are exchanged, uL and uR hold rows, which
-    differ by noise alone: the depth is lost, and there is no repair.
+    Nearly every disparity uL - uR is positive. Where many are not, the right one of the other orders is that under
+    which the tracks follow the measured motion. Of exchanged rows and columns the depth is lost.
     """
     sequence = evidence.sequence
     if (filled := _filled_right(sequence)) is not None:
@@ -323,8 +319,7 @@ LEAST_SEEN_AGAIN = 0.5
 def doubled_disparity(evidence: Evidence) -> Symptom | None:
     """Find tracks whose disparity doubles from the first sighting to the second, and halve it from there on.
 
-    A tracker that adds the disparity to an initial guess which already contains it does this to every new track. No
-    motion does: it would have to halve the depths of near and far points alike in one interval, and then stop.
+    A tracker does so that adds the disparity to a guess which contains it; no motion halves all depths just once.
     """
     observations = evidence.sequence.observations
     begun = _beginnings(observations)
@@ -484,11 +479,9 @@ SAME_RATIO = (0.9, 1.1)
 def track_scatter(evidence: Evidence) -> Symptom | Undecided | None:
     """Compare the scatter of the tracks about the camera's own motion with the stated noise.
 
-    A point triangulated in one frame, moved by the camera's best motion and projected into the next, has a residual
-    of covariance J R J^T + R, where R is that of a sighting. If R is right, the squared Mahalanobis distances have
-    the upper quartile of the chi-square distribution with three degrees of freedom, which a few gross errors do not
-    change. Where R is assumed and too large, mismatches are found by their number. A scatter far below the stated
-    noise contradicts it too, with certainty only if errors are independent from frame to frame.
+    One-step residuals have the covariance J R J^T + R if the noise R of a sighting is right, and squared Mahalanobis
+    distances the upper quartile of the chi-square distribution, which few gross errors change. Where R is assumed and
+    too large, mismatches are found by their number; a scatter far below R contradicts it if errors are independent.
     """
     if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return evidence.blind

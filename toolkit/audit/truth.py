@@ -131,11 +131,7 @@ STANDARD_MPS2 = 9.81
 
 
 def gravity_direction(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare the direction of gravity in the truth's world with that of the samples.
-
-    The mean of the specific force, rotated into the world by the truth, is the mean acceleration less gravity. The
-    truth is used where its rates of rotation agree with the gyro's.
-    """
+    """Compare gravity in the truth's world with the mean specific force, rotated by a truth that turns as the gyro."""
     sequence, truth = evidence.sequence, evidence.sequence.truth
     if not isinstance(sequence.motion, ImuSamples) or truth is None or evidence.spoilt_by:
         return None
@@ -188,11 +184,7 @@ LARGEST_S = 0.05
 
 
 def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
-    """Report a truth stamped by a clock that runs faster or slower than the frames'.
-
-    The rate is estimated from the rotations of camera and truth. Positions are not used: at constant speed a fast
-    clock looks like a wrong scale of the truth.
-    """
+    """Report a truth by a clock that runs faster or slower than the frames', by the rotations of camera and truth."""
     if evidence.spoilt_by or evidence.sequence.truth is None:
         return None
     clock = evidence.truth_clock
@@ -233,12 +225,10 @@ _AXES = "write the truth in the axes it is read in: the world's, z upwards, and 
 
 
 def truth_mismatch(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare the camera's own motion with the truth's, in direction and in size.
+    """Compare the camera's own motion with the truth's over windows, in direction and in size.
 
-    Displacements and rotations over windows are compared. Vision's steps have another length where the baseline or
-    the focal length is wrong, or the truth is in another unit, and another direction where the truth is of another
-    recording, runs backwards or is in other axes. If the rotations agree at shifted times, the truth's clock has an
-    offset.
+    Vision's steps have another length with a wrong baseline or focal length, or a truth in another unit, and another
+    direction with a truth of another recording, order or axes. Rotations that agree at shifted times show its clock.
     """
     truth = evidence.sequence.truth
     if truth is None or truth.t_ns.size < 2 or evidence.spoilt_by or not is_comparable(evidence.sequence):
