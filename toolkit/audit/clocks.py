@@ -234,8 +234,8 @@ def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar
 def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray) -> tuple[Array, Array] | None:
     """Return the camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate.
 
-    None where the truth covers too few of the rows. A fast clock lowers all rates, as a wrong focal length does: that is
-    not used.
+    None where the truth covers too few of the rows. A fast clock lowers all rates, as a wrong focal length: that is not
+    used.
     """
     t_ns, truth = as_gyro.frames_t_ns, Integral.of(as_gyro.motion.t_ns, as_gyro.motion.values[:, 3:])
     since_s = (t_ns - t_ns[0]) / NS_PER_S
