@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 
 
@@ -79,12 +78,6 @@ def openvins(tmp_path: Path) -> Path:
     truth = [f"{0.1 * k + 0.1:.1f},{k},1,0,0,0,1,2,3,4,5,6,.1,.2,.3,.4,.5,.6" for k in range(4)]
     (folder / "truth_cam.csv").write_text("\n".join([columns, *truth]) + "\n")
     return folder
-
-
-def assert_folder_refused(folder: Path, pattern: str) -> None:
-    with pytest.raises(DataError, match=pattern) as raised:
-        load_sequence(str(folder))
-    assert "\n" not in str(raised.value)
 
 
 def assert_refused(read: Callable[[], object], path: Path, pattern: str) -> None:

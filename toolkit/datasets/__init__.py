@@ -2,8 +2,8 @@
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
-:class:`DrawnFromASeed`, one that has tracks made of images is :class:`HasImages`, one of named topics is
-:class:`HasTopics`.
+:class:`DrawnFromASeed`, one that has tracks made of images is :class:`HasImages`. One of named topics, of which
+``frontend.topics`` says which is what, has the constant ``HAS_TOPICS``.
 It imports nothing heavy at its top, because all modules are imported to recognise a path.
 Read ``course_npz`` first, then the others; parts they share are in ``io``, formats of trajectories in ``trajectories``.
 
@@ -88,13 +88,6 @@ class HasImages(Protocol):
 
     def images_of(self, path: Path, frontend: Frontend) -> ImageRecording:
         """Return the image pairs that tracks are made of and their cameras; raise DataError where there are none."""
-
-
-@runtime_checkable
-class HasTopics(Protocol):
-    """A format whose recordings are of named topics; ``frontend.topics`` says which of them is what."""
-
-    HAS_TOPICS: bool
 
 
 @runtime_checkable
@@ -237,7 +230,7 @@ def check_built_in(source: str, frontend: Frontend) -> None:
 
 
 def _check_topics(source: str, reader: RecordingFormat | None, frontend: Frontend) -> None:
-    if frontend.topics is not None and not isinstance(reader, HasTopics):
+    if frontend.topics is not None and not getattr(reader, "HAS_TOPICS", False):
         raise DataError(f"{source}: it has no topics, a bag has; leave --topics out, or compare it by itself")
 
 

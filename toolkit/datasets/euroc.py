@@ -171,7 +171,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         rig=calibration.rig,
         noise=calibration.noise,
         frames_t_ns=frames_t_ns,
-        observations=_tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
+        observations=_tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed),
         motion=imu,
         provenance=Provenance(
             "euroc",
@@ -294,23 +294,14 @@ def _how_simulated(layout: _Layout) -> str:
     return f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU"
 
 
-@dataclass(frozen=True, eq=False)
-class _RoomTracks:
-    """The tracks, and the landmarks (M, 3) in the world that they are of."""
-
-    observations: Observations
-    points: Array
-
-
-def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> _RoomTracks:
+def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> Observations:
     """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance."""
     tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
     points = _room_around(T_world_imu[:, :3, 3])
     tracks = sensors.follow(sensors.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
     exact = sensors.sightings(tracks, points, T_world_imu, rig)
-    noisy = sensors.with_pixel_noise(exact, 1.0, rig.cov_uv_px2, camera.step_px, pixels_rng)
     # Track ids grow with time and a frame's places keep their order, so the rows are sorted already.
-    return _RoomTracks(noisy, points)
+    return sensors.with_pixel_noise(exact, 1.0, rig.cov_uv_px2, camera.step_px, pixels_rng)
 
 
 def _check_room(root: Path, positions: Array) -> None:

@@ -86,15 +86,8 @@ class _Mounted(NamedTuple):
     facts: tuple[str, ...]
 
 
-class _Moved(NamedTuple):
-    """The motion samples, their noise, the truth, and what to know of them."""
-
-    samples: MotionSamples
-    noise: MotionNoise
-    truth: Truth | None
-    facts: tuple[str, ...]
-
-
+# The motion samples, their noise, the truth, and what to know of them.
+_Moved = tuple[MotionSamples, MotionNoise, Truth | None, tuple[str, ...]]
 uses_images = images_only
 
 
@@ -122,17 +115,18 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     layout = _whole(path)
     mounted, listed = _mounted(layout), _listed(layout)
     seen = seen_in(layout.root, ImageRecording(listed.pairs, mounted.pair), mounted.T_imu_left, frontend, progress)
-    moved = (_packets_motion if layout.is_raw else _assumed_motion)(layout, seen.frames_t_ns)
-    facts = (*moved.facts, *seen.facts, *listed.remarks, *mounted.facts)
+    motion_of = _packets_motion if layout.is_raw else _assumed_motion
+    samples, noise, truth, how = motion_of(layout, seen.frames_t_ns)
+    facts = (*how, *seen.facts, *listed.remarks, *mounted.facts)
     return Sequence(
         name=layout.root.name,
         rig=seen.rig,
-        noise=moved.noise,
+        noise=noise,
         frames_t_ns=seen.frames_t_ns,
         observations=seen.observations,
-        motion=moved.samples,
+        motion=samples,
         provenance=Provenance("kitti", f"{path}: stereo tracks from the images", facts),
-        truth=moved.truth,
+        truth=truth,
     )
 
 
@@ -268,7 +262,7 @@ def _count(layout: _Layout) -> int:
 def _assumed_motion(layout: _Layout, t_ns: IntArray) -> _Moved:
     stamps, how = _times(layout)
     facts = ("no motion input: all estimators assume smooth motion", *how)
-    return _Moved(NoSamples(t_ns), unmeasured_motion(), _poses(layout, stamps, t_ns), facts)
+    return NoSamples(t_ns), unmeasured_motion(), _poses(layout, stamps, t_ns), facts
 
 
 def _poses(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
@@ -334,7 +328,7 @@ def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
     packets = _read_packets(layout.root / "oxts")
     if packets is None:
         how = "no oxts: no motion input, all estimators assume smooth motion"
-        return _Moved(NoSamples(frames_t_ns), unmeasured_motion(), None, (how,))
+        return NoSamples(frames_t_ns), unmeasured_motion(), None, (how,)
     t_ns, values, alone = packets
     check_one_clock(layout.root, frames_t_ns, t_ns, "the oxts packets")
     facts = (f"{alone} oxts packets lack their file or their stamp and are left out",) if alone else ()
@@ -345,11 +339,11 @@ def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
     rate_hz = NS_PER_S / float(np.median(np.abs(np.diff(t_ns))))
     if rate_hz >= _IMU_FROM_HZ:
         how = f"the oxts packets, {rate_hz:.0f} a second, are read as an IMU"
-        return _Moved(ImuSamples(t_ns, values[:, _ACCEL], w_radps), _IMU_NOISE, truth, (how, *facts))
+        return ImuSamples(t_ns, values[:, _ACCEL], w_radps), _IMU_NOISE, truth, (how, *facts)
     how = f"the oxts packets, {rate_hz:.0f} a second, are too few for an IMU and read as body twists"
     v_mps = np.einsum("nji,nj->ni", R_world_imu, v_world)
     noise = twist_noise(t_ns, v_mps, w_radps)
-    return _Moved(TwistSamples(t_ns, v_mps, w_radps), noise, truth, (how, *facts))
+    return TwistSamples(t_ns, v_mps, w_radps), noise, truth, (how, *facts)
 
 
 class _Day(NamedTuple):
