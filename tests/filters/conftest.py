@@ -19,12 +19,12 @@ from filters.kalman.online_output import LandmarkMemory
 from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
-from toolkit.measurements import StereoFrame, StereoRig
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, skew
+from toolkit.measurements import Prior, StereoFrame, StereoRig
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.models.state import Belief
+from toolkit.models.state import IMU_LAYOUT, Belief
 from toolkit.models.stereo import project, triangulate_world
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Settings
@@ -184,6 +184,35 @@ BELIEFS: dict[str, Callable[[StereoRig, Belief], JointBelief]] = {
     "riekf": lambda rig, core: InvariantBelief(core),
     "iekf": lambda rig, core: AnchoredBelief(core, rig.T_imu_cam),
 }
+
+
+# Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.
+LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
+
+
+def gauge(joint: JointBelief, turns: Array) -> Array:
+    """Return the plain errors (n, 3 + t) when the world shifts along x, y, z and turns about axes (3, t)."""
+
+    def of_pose(T: Array) -> Array:
+        to_body = T[:3, :3].T
+        return np.block([[np.zeros((3, 3)), to_body @ turns], [to_body, -to_body @ skew(T[:3, 3]) @ turns]])
+
+    core, still = joint.core, np.zeros((3, 3))
+    rows = [of_pose(core.T_world_imu)]
+    if core.layout.velocity is not None:
+        rows.append(np.hstack([still, -core.T_world_imu[:3, :3].T @ skew(core.v_world) @ turns]))
+    rows.append(np.zeros((core.layout.size - sum(map(len, rows)), 3 + turns.shape[1])))
+    rows += [np.hstack([np.eye(3), -skew(point) @ turns]) for point in joint.points]
+    rows += [of_pose(T) for T in joint.clones]
+    return np.vstack(rows)
+
+
+def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
+    """Return the prior with independent errors along the gauge added: the prior alone knew of it."""
+    directions = np.zeros((15, 3 + turns.shape[1]))
+    rows = np.arange(15) if core.layout is IMU_LAYOUT else np.r_[0:6, 12:15]
+    directions[rows] = gauge(JointBelief(core), turns)
+    return replace(prior, cov=prior.cov + (directions * LOOSENESS[: 3 + turns.shape[1]] ** 2) @ directions.T)
 
 
 class Problem:

@@ -15,20 +15,17 @@ import numpy as np
 import pytest
 
 from filters.ekf_slam import JointEkf
-from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, Linearisation
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, Linearisation
 from filters.msckf import Msckf
-from tests.filters.conftest import recorded
+from tests.filters.conftest import LOOSENESS, loosened, recorded
+from tests.filters.conftest import gauge as directions
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, skew
-from toolkit.measurements import Prior
+from toolkit.geometry import Array
 from toolkit.models.motion import motion_model
-from toolkit.models.state import TWIST_LAYOUT, Belief
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT
 
-# Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.
-LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1])
-YAW = 3
+UP, YAW = np.eye(3)[:, 2:], 3
 
 SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=3.0)}
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
@@ -42,18 +39,6 @@ every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
-def gauge_directions(belief: Belief) -> Array:
-    """Return the errors (d, 4) of a state when the world is moved along x, y, z and turned about z."""
-    to_body, position = belief.T_world_imu[:3, :3].T, belief.T_world_imu[:3, 3]
-    up = np.array([0.0, 0.0, 1.0])
-    directions = np.zeros((belief.layout.size, 4))
-    directions[3:6, :3] = to_body
-    directions[:3, YAW], directions[3:6, YAW] = to_body @ up, to_body @ skew(up) @ position
-    if belief.layout.velocity is not None:
-        directions[belief.layout.velocity, YAW] = to_body @ skew(up) @ belief.v_world
-    return directions
-
-
 class Watched:
     """A linearisation that remembers the joint belief it serves."""
 
@@ -65,14 +50,8 @@ class Watched:
         self.joint = joint
         return self._at.transition(joint, increment, prediction)
 
-    def clones(self, joint):
-        return self._at.clones(joint)
-
-    def points(self, joint):
-        return self._at.points(joint)
-
-    def outdated(self, joint):
-        return self._at.outdated(joint)
+    def __getattr__(self, name):
+        return getattr(self._at, name)
 
 
 class Answers(NamedTuple):
@@ -97,7 +76,7 @@ def run(name: str, scenario: str, at: Callable[[], Linearisation], *, loose: boo
     setup = recording.setup
     first = motion_model(setup.noise, setup.gravity_world).initial_belief(setup.prior)
     if loose:
-        setup = replace(setup, prior=loosened(setup.prior, first))
+        setup = replace(setup, prior=loosened(setup.prior, first, UP))
     return answers(name, setup, recording.sequence, at())
 
 
@@ -109,16 +88,8 @@ def answers(name: str, setup: Setup, sequence: Sequence, at: Linearisation) -> A
         estimate = under_test.step(packet)
         poses.append(estimate.T_world_imu)
         covs.append(estimate.cov)
-        gauge.append(gauge_directions(watched.joint.first_core if watched.joint else first))
+        gauge.append(directions(JointBelief(watched.joint.first_core if watched.joint else first), UP))
     return Answers(np.array(poses), np.array(covs), np.array(gauge))
-
-
-def loosened(prior: Prior, first: Belief) -> Prior:
-    """Return the prior with independent errors along the gauge added."""
-    rows = np.r_[0:6, 12:15] if first.layout is TWIST_LAYOUT else np.arange(15)
-    directions = np.zeros((15, 4))
-    directions[rows] = gauge_directions(first)
-    return replace(prior, cov=prior.cov + (directions * LOOSENESS**2) @ directions.T)
 
 
 @every_scenario
@@ -137,7 +108,7 @@ def test_a_looser_start_stays_looser_by_exactly_as_much(name, scenario):
     """
     tight, loose = (run(name, scenario, AtFirstEstimates, loose=loose) for loose in (False, True))
     np.testing.assert_allclose(loose.poses, tight.poses, rtol=0.0, atol=1e-6)
-    added = (tight.gauge * LOOSENESS**2) @ np.swapaxes(tight.gauge, 1, 2)
+    added = (tight.gauge * LOOSENESS[:4] ** 2) @ np.swapaxes(tight.gauge, 1, 2)
     sigmas = np.sqrt(np.diagonal(loose.covs, axis1=1, axis2=2))
     assert np.abs((loose.covs - tight.covs - added) / (sigmas[:, :, None] * sigmas[:, None, :])).max() < 1e-6
 

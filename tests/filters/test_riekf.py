@@ -16,13 +16,12 @@ from filters.ekf_slam import JointEkf
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InvariantBelief
 from filters.kalman.joint import AtLatestEstimates, JointBelief
-from tests.filters.conftest import BELIEFS, carried, setup_of, short
+from tests.filters.conftest import BELIEFS, carried, gauge, loosened, setup_of, short
 from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
-from toolkit.measurements import Prior
 from toolkit.models.gating import FrameGate
 from toolkit.models.motion import motion_model
-from toolkit.models.state import IMU_LAYOUT, Belief
+from toolkit.models.state import IMU_LAYOUT
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
 AT = AtLatestEstimates()
@@ -146,32 +145,6 @@ def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(sc
         first = 9 if with_velocity else 6
         expected[first : first + 3 * len(moved.points), :3] = np.tile(np.eye(3), (len(moved.points), 1))
         np.testing.assert_allclose(xi, expected, rtol=0.0, atol=1e-8)
-
-
-def gauge(joint: JointBelief, turns: Array) -> Array:
-    """Return the plain errors (n, 3 + t) when the world shifts along x, y, z and turns about axes (3, t)."""
-
-    def of_pose(T: Array) -> Array:
-        to_body = T[:3, :3].T
-        return np.block([[np.zeros((3, 3)), to_body @ turns], [to_body, -to_body @ skew(T[:3, 3]) @ turns]])
-
-    core, still = joint.core, np.zeros((3, 3))
-    rows = [of_pose(core.T_world_imu)]
-    if core.layout.velocity is not None:
-        rows.append(np.hstack([still, -core.T_world_imu[:3, :3].T @ skew(core.v_world) @ turns]))
-    rows.append(np.zeros((core.layout.size - sum(map(len, rows)), 3 + turns.shape[1])))
-    rows += [np.hstack([np.eye(3), -skew(point) @ turns]) for point in joint.points]
-    rows += [of_pose(T) for T in joint.clones]
-    return np.vstack(rows)
-
-
-def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
-    """Return the prior, half a metre and six degrees looser along the gauge: the prior alone knew of it."""
-    directions = np.zeros((15, 3 + turns.shape[1]))
-    rows = np.arange(15) if core.layout is IMU_LAYOUT else np.r_[0:6, 12:15]
-    directions[rows] = gauge(JointBelief(core), turns)
-    looseness = np.r_[np.full(3, 0.5), np.full(turns.shape[1], 0.1)]
-    return replace(prior, cov=prior.cov + (directions * looseness**2) @ directions.T)
 
 
 def most_information_gained(scenario, belief, correct) -> float:
