@@ -29,6 +29,7 @@ from toolkit.models.stereo import project, triangulate_world
 from toolkit.sequence import Observations, Sequence
 from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import Scenario, simulate
+from toolkit.simulation.sensors import Imu
 
 SEED = 11
 
@@ -159,8 +160,23 @@ def short(scenario: Scenario, duration_s: float, tracks: int | None = None, seed
     return simulate(replace(scenario, duration_s=duration_s, camera=camera), seed)
 
 
+def linear(scenario: Scenario, duration_s: float, tracks: int = 30) -> Scenario:
+    """Return a scenario that is linear in effect where its errors are drawn small: short, of few tracks.
+
+    Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
+    """
+    motion = replace(scenario.motion, rate_hz=1000.0) if isinstance(scenario.motion, Imu) else scenario.motion
+    camera = replace(scenario.camera, max_tracks=tracks)
+    return replace(scenario, duration_s=duration_s, motion=motion, camera=camera)
+
+
 def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
     return runner.setup_of(sequence, sequence.prior, settings)
+
+
+def off_at_the_end_m(sequence: Sequence, estimate: Estimate) -> float:
+    """Return how far the estimate of the last frame is from the truth."""
+    return float(np.linalg.norm(estimate.T_world_imu[:3, 3] - sequence.truth.T_world_imu[-1, :3, 3]))
 
 
 def carried(

@@ -128,6 +128,21 @@ def frame_of(ids: list[int], u_left: float = 400.0, disparity_px: float = 40.0) 
     return StereoFrame(0, np.array(ids, dtype=np.int64), uvs_px)
 
 
+def take_in(tracked: TrackedMap, frame: StereoFrame, moved_m: Array = np.zeros(3)) -> Array:  # noqa: B008 - read only
+    """Take in a frame, all landmarks that are seen again corrected by so much, and return the ids of these."""
+    seen, _ = tracked.seen_again(frame)
+    corrected = seen.corrected(np.ones(len(seen), dtype=bool), seen.points + moved_m, seen.covs)
+    tracked.keep(corrected, frame, POSE)
+    return seen.track_ids
+
+
+def map_after(*frames: StereoFrame) -> TrackedMap:
+    tracked = TrackedMap(RIG)
+    for frame in frames:
+        take_in(tracked, frame)
+    return tracked
+
+
 def test_a_first_sighting_stands_where_stereo_sees_it():
     frame = frame_of([3, 8, 9])
     started = first_sighting(frame, np.array([0, 2]), POSE, RIG)
@@ -152,13 +167,9 @@ def test_the_covariance_of_a_first_sighting_is_the_measurements_carried_through_
 
 def test_too_little_disparity_waits_for_a_better_view():
     far = frame_of([1], disparity_px=0.9 * LEAST_DISPARITY_PX)
-    tracked = TrackedMap(RIG)
-    seen, _ = tracked.seen_again(far)
-    tracked.keep(seen, far, POSE)
+    tracked = map_after(far)
     assert len(tracked.landmarks()) == 0
-    near = frame_of([1], disparity_px=2.0 * LEAST_DISPARITY_PX)
-    seen, _ = tracked.seen_again(near)
-    tracked.keep(seen, near, POSE)
+    take_in(tracked, frame_of([1], disparity_px=2.0 * LEAST_DISPARITY_PX))
     np.testing.assert_array_equal(tracked.landmarks().track_ids, [1])
 
 
@@ -178,48 +189,27 @@ def test_lost_landmarks_leave_the_state():
 
 
 def test_an_id_that_comes_back_is_a_new_landmark():
-    tracked = TrackedMap(RIG)
-    for frame in (frame_of([1, 2]), frame_of([2])):
-        seen, _ = tracked.seen_again(frame)
-        tracked.keep(seen, frame, POSE)
-    returned = frame_of([1, 2], u_left=500.0)
-    seen, _ = tracked.seen_again(returned)
-    np.testing.assert_array_equal(seen.track_ids, [2])
-    tracked.keep(seen, returned, POSE)
+    tracked, returned = map_after(frame_of([1, 2]), frame_of([2])), frame_of([1, 2], u_left=500.0)
+    np.testing.assert_array_equal(take_in(tracked, returned), [2])
     expected = stereo.triangulate_world(returned.uvs_px[:1], POSE, RIG)
     np.testing.assert_allclose(tracked.landmarks().points_world[0], expected[0], atol=1e-12)
 
 
-def moved(landmarks: LandmarkMap, by_m: Array) -> LandmarkMap:
-    return landmarks.corrected(np.ones(len(landmarks), dtype=bool), landmarks.points + by_m, landmarks.covs)
-
-
 def test_the_archive_keeps_every_id_once_with_its_last_value():
-    tracked = TrackedMap(RIG)
-    first, second = frame_of([4, 7]), frame_of([7])
-    seen, _ = tracked.seen_again(first)
-    tracked.keep(seen, first, POSE)
-    seen, _ = tracked.seen_again(second)
-    tracked.keep(moved(seen, np.array([1.0, 0.0, 0.0])), second, POSE)
-    nothing = frame_of([])
-    seen, _ = tracked.seen_again(nothing)
-    tracked.keep(seen, nothing, POSE)
-    # Returns to be archived a second time.
-    seen, _ = tracked.seen_again(first)
-    tracked.keep(moved(seen, np.zeros(3)), first, POSE)
+    first = frame_of([4, 7])
+    tracked = map_after(first)
+    take_in(tracked, frame_of([7]), np.array([1.0, 0.0, 0.0]))
+    take_in(tracked, frame_of([]))
+    take_in(tracked, first)  # returns to be archived a second time
     landmarks = tracked.landmarks()
     np.testing.assert_array_equal(landmarks.track_ids, [4, 7])
     np.testing.assert_allclose(landmarks.points_world, stereo.triangulate_world(first.uvs_px, POSE, RIG), atol=1e-12)
 
 
 def test_the_last_value_of_a_lost_landmark_is_the_corrected_one():
-    tracked = TrackedMap(RIG)
-    frame = frame_of([4, 7])
-    seen, _ = tracked.seen_again(frame)
-    tracked.keep(seen, frame, POSE)
-    seen, _ = tracked.seen_again(frame)
-    shift_m = np.array([0.5, -0.25, 1.0])
-    tracked.keep(moved(seen, shift_m), frame, POSE)
+    frame, shift_m = frame_of([4, 7]), np.array([0.5, -0.25, 1.0])
+    tracked = map_after(frame)
+    take_in(tracked, frame, shift_m)
     tracked.seen_again(frame_of([]))
     expected = stereo.triangulate_world(frame.uvs_px, POSE, RIG) + shift_m
     np.testing.assert_allclose(tracked.landmarks().points_world, expected, atol=1e-12)

@@ -10,7 +10,7 @@ from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphExtension
-from tests.filters.conftest import recording_with_a_fleck, setup_of, short
+from tests.filters.conftest import off_at_the_end_m, recording_with_a_fleck, setup_of, short
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, X
@@ -119,23 +119,16 @@ def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_cont
     np.testing.assert_allclose(position_of(window, 4), exact.atPoint3(X(4)), atol=1e-9)
 
 
-def convoy() -> Sequence:
-    """Return a drive among vehicles: of what moves as fast as the camera, the depth grows without end."""
-    return moving_vehicles(simulate(replace(DRIVE, duration_s=4.5), seed=1), dose=0.6, seed=1)
-
-
 def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
-    """It names the first variable of a clique. Without vehicles no landmark is beyond the condition."""
-    sequence = convoy()
+    """It names the first variable of a clique. Of what moves as fast as the camera, the depth grows without end."""
+    sequence = moving_vehicles(simulate(replace(DRIVE, duration_s=4.5), seed=1), dose=0.6, seed=1)
     ungated = Settings(outliers=Outliers(gate_probability=None))  # the gate refuses the vehicles
     estimator = FixedLag(replace(setup_of(sequence), settings=ungated), 0.6)
     answers_there = [estimator.step(packet) for packet in sequence.packets()]
     log = estimator.finish().log
     assert any("in all" in line for line in log)
-    truth = sequence.truth
-    ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 45 m of odometry that is good to 0.1 m: what vehicles take vision to is not more than a metre off.
-    assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0
+    assert off_at_the_end_m(sequence, answers_there[-1]) < 1.0
 
 
 class BrokenOff:

@@ -18,7 +18,7 @@ from filters.smoothing.isam2_tree import (
     Isam2Tree,
 )
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from toolkit import runner
+from tests.filters.conftest import off_at_the_end_m, setup_of, short
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.geometry import se3_inverse, se3_log, transform
@@ -27,7 +27,7 @@ from toolkit.models import stereo
 from toolkit.models.factors import B, L, V, X, kind_of
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
+from toolkit.settings import POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.faults import cut_tracks, moving_vehicles
 
@@ -113,7 +113,7 @@ class Refusing:
 def test_after_a_refusal_for_rounding_it_solves_by_qr_and_returns_to_cholesky_with_vision():
     few_tracks = replace(FLIGHT, duration_s=1.5, camera=replace(FLIGHT.camera, max_tracks=50))
     sequence, by = simulate(few_tracks, 1), []
-    estimator = isam2_of(sequence)
+    estimator = Isam2(setup_of(sequence))
     for packet in sequence.packets():
         if packet.index == 3:
             estimator._tree.isam = Refusing(estimator._tree.isam, X(2))
@@ -137,7 +137,7 @@ def test_a_tree_built_anew_has_all_landmarks_before_its_states_however_long_they
 
     monkeypatch.setattr(Isam2Tree, "_order", watched)
     sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
-    estimator = isam2_of(sequence)
+    estimator = Isam2(setup_of(sequence))
     for packet in sequence.packets():
         estimator.step(packet)
     tree = estimator._tree
@@ -171,7 +171,7 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
         monkeypatch.setattr(isam2_tree, name, 1e-9)
     monkeypatch.setattr(isam2_tree, "LANDMARK_BEYOND_SIGMA", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
-    estimator, points = isam2_of(sequence), []
+    estimator, points = Isam2(setup_of(sequence)), []
     for packet in sequence.packets():
         estimator.step(packet)
         points.append(gtsam.Values(estimator._tree.isam.getLinearizationPoint()))
@@ -190,7 +190,7 @@ def places_and_renewals(sequence: Sequence) -> Iterator[tuple[set[int], set[tupl
 
     Those of the factors that are as they were, and of those that are linearised anew.
     """
-    estimator, before, at = isam2_of(sequence), dict[tuple[int, ...], CachedLinearisation](), gtsam.Values()
+    estimator, before, at = Isam2(setup_of(sequence)), dict[tuple[int, ...], CachedLinearisation](), gtsam.Values()
     for packet in sequence.packets():
         estimator.step(packet)
         now = {held.keys: held for held in estimator._tree._cached.values()}
@@ -229,7 +229,7 @@ def stepped(sequence: Sequence, monkeypatch, retired_after: int) -> tuple[Isam2,
     monkeypatch.setattr(isam2_tree, "FROZEN_AFTER_FRAMES", 5)
     monkeypatch.setattr(isam2_tree, "RETIRED_AFTER_FRAMES", retired_after)
     monkeypatch.setattr(isam2_tree, "RETIRING_EVERY_FRAMES", 4)
-    estimator = isam2_of(sequence)
+    estimator = Isam2(setup_of(sequence))
     return estimator, [estimator.step(packet) for packet in sequence.packets()]
 
 
@@ -256,8 +256,7 @@ def assert_same_answers(ours: list[Estimate], theirs: list[Estimate]) -> None:
 @pytest.mark.usefixtures("nothing_linearised_anew")
 @pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU], ids=lambda s: s.name)
 def test_what_leaves_the_tree_changes_no_later_answer_and_is_in_the_final_one(scenario, monkeypatch):
-    few_tracks = replace(scenario, duration_s=2.5, camera=replace(scenario.camera, max_tracks=30))
-    sequence = without_returns(simulate(few_tracks, 1))
+    sequence = without_returns(short(scenario, 2.5, 30, 1))
     whole, expected = stepped(sequence, monkeypatch, retired_after=1000)
     ours, estimates = stepped(sequence, monkeypatch, retired_after=8)
     assert_same_answers(estimates, expected)
@@ -275,9 +274,7 @@ def test_what_leaves_the_tree_changes_no_later_answer_and_is_in_the_final_one(sc
 def test_a_state_leaves_whole_where_a_bridge_over_a_gap_still_ties_its_pose(monkeypatch):
     """Its bias alone would take all factors of the pose along, and the tree would have a pose on nothing."""
     noisy = TwistNoise(np.full(3, 0.16), np.full(3, 0.016), np.full(3, 1e-5))
-    few_tracks = replace(DRIVE, duration_s=2.5, camera=replace(DRIVE.camera, max_tracks=30))
-    scenario = replace(few_tracks, motion=replace(few_tracks.motion, noise=noisy))
-    sequence = cut_tracks(simulate(scenario, 1), 0.4, 1)
+    sequence = cut_tracks(short(replace(DRIVE, motion=replace(DRIVE.motion, noise=noisy)), 2.5, 30, 1), 0.4, 1)
     _, expected = stepped(sequence, monkeypatch, retired_after=1000)
     ours, estimates = stepped(sequence, monkeypatch, retired_after=8)
     assert_same_answers(estimates, expected)
@@ -286,8 +283,7 @@ def test_a_state_leaves_whole_where_a_bridge_over_a_gap_still_ties_its_pose(monk
 
 @pytest.mark.usefixtures("nothing_linearised_anew")
 def test_a_track_that_returns_has_the_tree_whole_again(monkeypatch):
-    few_tracks = replace(DRIVE_IMU, duration_s=2.5, camera=replace(DRIVE_IMU.camera, max_tracks=50))
-    sequence = without_returns(simulate(few_tracks, 1))
+    sequence = without_returns(short(DRIVE_IMU, 2.5, 50, 1))
     rows = sequence.observations
     seen_first_and_late = np.intersect1d(rows.track_id[rows.frame < 4], rows.track_id[rows.frame >= 20])
     assert seen_first_and_late.size
@@ -315,11 +311,6 @@ def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share
     assert 20 < badly.sum() < 180
 
 
-def isam2_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Isam2:
-    s = sequence
-    return Isam2(runner.setup_of(s, s.prior, settings))
-
-
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
 def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     """Of every factor it took in, the Python ones themselves: many more steps lead nowhere else.
@@ -328,9 +319,8 @@ def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     may still move by is a hundredth of a sigma.
     """
     sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0), 1)
-    estimator, estimates = isam2_of(sequence), []
-    for packet in sequence.packets():
-        estimates.append(estimator.step(packet))
+    estimator = Isam2(setup_of(sequence))
+    estimates = [estimator.step(packet) for packet in sequence.packets()]
     graph, before = estimator._tree.graph(), estimator._tree.values()
     finished = estimator.finish()
     assert finished.converged
@@ -347,12 +337,10 @@ def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew
     """Their depths grow without end. One of which nothing was left but its value could not begin anew: it failed."""
     sequence = moving_vehicles(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)
     ungated = Settings(outliers=Outliers(gate_probability=None))  # the gate refuses the vehicles
-    estimator = isam2_of(sequence, ungated)
+    estimator = Isam2(setup_of(sequence, ungated))
     newest = [estimator.step(packet) for packet in sequence.packets()][-1]
     log, tree = estimator.finish().log, estimator._tree
     assert any("indeterminate and was dropped" in line for line in log)
     assert set(tree.isam.getLinearizationPoint().keys()) == {*tree.isam.getFactorsUnsafe().keyVector()}
-    truth = sequence.truth
-    ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
     # 20 m of odometry that is good to 0.1 m.
-    assert np.linalg.norm(newest.T_world_imu[:3, 3] - ends_at) < 0.5
+    assert off_at_the_end_m(sequence, newest) < 0.5

@@ -12,16 +12,10 @@ import pytest
 
 from filters.ekf_slam import JointEkf
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
 
-# Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
-SCENARIOS = [
-    replace(DRIVE, duration_s=2.0),
-    replace(DRIVE_IMU, duration_s=2.0, motion=replace(DRIVE_IMU.motion, rate_hz=1000.0)),
-    replace(FLIGHT, duration_s=1.0, motion=replace(FLIGHT.motion, rate_hz=1000.0)),
-]
-SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=30)) for s in SCENARIOS]
+SCENARIOS = [linear(DRIVE, 2.0), linear(DRIVE_IMU, 2.0), linear(FLIGHT, 1.0)]
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 both_linearisations_and_weights = pytest.mark.parametrize(

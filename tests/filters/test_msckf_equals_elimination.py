@@ -15,7 +15,7 @@ import pytest
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import EliminatedTracks, WindowPoses, WindowTracks, eliminated_tracks
 from filters.msckf import Msckf
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.models.gating import FrameGate
@@ -133,13 +133,6 @@ def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(row
     np.testing.assert_array_equal(other.cov, other.cov.T)
 
 
-def scenario_of(scenario, frames):
-    """Return a scenario of so many frames; exact IMU samples integrate to the truth only in the limit of their rate."""
-    camera = replace(scenario.camera, max_tracks=30)
-    motion = scenario.motion if scenario is DRIVE else replace(scenario.motion, rate_hz=1000.0)
-    return replace(scenario, duration_s=(frames - 1) / camera.rate_hz, camera=camera, motion=motion)
-
-
 def seen_twice(sequence):
     """Return the tracks that tie two poses together."""
     track_ids, counts = np.unique(sequence.visible.track_id, return_counts=True)
@@ -157,7 +150,7 @@ SIZES = {"in view": (9, 0, 7), "one window": (9, 0, 10), "every landmark kept": 
 def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, size, weight):
     """Errors of 1e-6 of the stated noise: the gates are open and second orders out of sight."""
     clones, landmarks, frames = SIZES[size]
-    recording = recorded(scenario_of(scenario, frames), 1e-6)
+    recording = recorded(linear(scenario, (frames - 1) / scenario.camera.rate_hz), 1e-6)
     rig = replace(recording.sequence.rig, track_weight=weight)
     recording = replace(recording, sequence=replace(recording.sequence, rig=rig))
     # A pose leaves in the frame in which it is older than the window.

@@ -10,18 +10,13 @@ import numpy as np
 import pytest
 
 from filters import fixed_lag, iekf, sliding_window
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded, short
 from toolkit import runner
 from toolkit.settings import Settings
 from toolkit.settings.records import POLICIES, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-# Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
-SCENARIOS = [
-    replace(DRIVE, duration_s=2.0),
-    replace(FLIGHT, duration_s=0.8, motion=replace(FLIGHT.motion, rate_hz=1000.0)),
-]
-SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=20)) for s in SCENARIOS]
+SCENARIOS = [linear(DRIVE, 2.0, tracks=20), linear(FLIGHT, 0.8, tracks=20)]
 ONE_STATE = Window(most_states=1)
 
 
@@ -56,7 +51,7 @@ def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario
 @pytest.fixture(scope="module")
 def flown():
     """Return a function that runs estimators over a flight of full noise, without gates and losses."""
-    sequence = simulate(replace(FLIGHT, duration_s=1.0, camera=replace(FLIGHT.camera, max_tracks=20)), 3)
+    sequence = short(FLIGHT, 1.0, 20, 3)
 
     @cache
     def run(build, **options):

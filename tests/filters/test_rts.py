@@ -1,19 +1,11 @@
 """The full smoother linearised once: the batch where the problem is linear, and the filter until then (2 s)."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from filters import ekf_slam, rts
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, recorded
+from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded
 from toolkit.simulation import DRIVE, FLIGHT
-
-SCENARIOS = [
-    replace(DRIVE, duration_s=2.0),
-    replace(FLIGHT, duration_s=1.0, motion=replace(FLIGHT.motion, rate_hz=1000.0)),
-]
-SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=30)) for s in SCENARIOS]
 
 
 def answers(recording, build):
@@ -21,7 +13,7 @@ def answers(recording, build):
     return [estimator.step(packet) for packet in recording.sequence.packets()], estimator.finish()
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", [linear(DRIVE, 2.0), linear(FLIGHT, 1.0)], ids=lambda s: s.name)
 def test_on_a_linear_problem_it_is_the_batch_and_until_the_end_the_filter(scenario):
     recording, exact = recorded(scenario, 1e-4), recorded(scenario, 1e-7)
     causal, finished = answers(recording, rts.build)

@@ -1,7 +1,8 @@
-"""What the package promises about its answers, and the figures that are read off a run: NIS and cost."""
+"""What the package promises about its answers, and the figures that are read off a run: NIS, gate and cost."""
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from tests.metrics.conftest import drive_poses, make_run, make_sequence
 from toolkit import metrics
 from toolkit.errors import ExtensionError, VislamError
 from toolkit.metrics import Scores, score_run
+from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.models.gating import chi2_bound, mean_below_bound
+from toolkit.simulation import SCENARIOS, simulate
 
 
 @pytest.fixture
@@ -47,18 +50,39 @@ def test_nis_behind_a_gate_is_held_against_what_passes_it(case):
     assert case(info=without).values["nis_mean"] == pytest.approx(0.877, abs=0.01)
 
 
+def test_what_the_gate_accepts_is_the_share_over_all_steps_that_tested_something(case):
+    info = {"gate_tested": np.array([np.nan, 30.0, 0.0, 10.0]), "gate_accepted": np.array([np.nan, 27.0, 0.0, 3.0])}
+    assert case(info=info).values[ACCEPTED] == pytest.approx(75.0)
+
+
+ONES, ZEROS, NANS = np.ones(3), np.zeros(3), np.full(3, np.nan)
+
+
 @pytest.mark.parametrize(
-    ("output", "info", "reason"),
+    ("key", "output", "info", "reason"),
     [
-        ("final", {"nis": np.ones(3), "nis_dof": np.ones(3)}, "causal"),
-        ("causal", {}, "reports no innovations"),
-        ("causal", {"nis": np.full(3, np.nan), "nis_dof": np.full(3, np.nan)}, "no step"),
+        ("nis_mean", "final", {"nis": ONES, "nis_dof": ONES}, "causal"),
+        ("nis_mean", "causal", {}, "reports no innovations"),
+        ("nis_mean", "causal", {"nis": NANS, "nis_dof": NANS}, "no step"),
+        (ACCEPTED, "final", {"gate_tested": ONES, "gate_accepted": ONES}, "causal"),
+        (ACCEPTED, "causal", {}, "reports no gate"),
+        (ACCEPTED, "causal", {"gate_tested": ZEROS, "gate_accepted": ZEROS}, "tested nothing"),
     ],
 )
-def test_nis_is_missing_with_its_reason(case, output, info, reason):
+def test_what_is_read_off_innovations_is_missing_with_its_reason(case, key, output, info, reason):
     scores = case(output, info=info)
-    assert scores.values["nis_mean"] is None
-    assert reason in scores.notes["nis_mean"]
+    assert scores.values[key] is None
+    assert reason in scores.notes[key]
+
+
+@pytest.mark.parametrize("name", ["ekf", "msckf-slam"])
+def test_a_sound_recording_passes_and_a_focal_length_a_tenth_too_long_does_not(run_estimator, name):
+    """The innovations that remain look consistent in both: behind its gate msckf-slam reads a NIS near 1."""
+    sound = simulate(replace(SCENARIOS["flight"], duration_s=4.0), seed=5)
+    wrong = replace(sound, rig=replace(sound.rig, fx_px=1.1 * sound.rig.fx_px))
+    shares = [score_run(run_estimator(name, one), "causal", one).values[ACCEPTED] for one in (sound, wrong)]
+    assert not refuses_much(shares[0])
+    assert refuses_much(shares[1])
 
 
 def test_cost_is_read_off_the_timings(case):
