@@ -1,18 +1,26 @@
-"""Whoever changes a command line as the refusal says is not refused for the same again (3 s)."""
+"""Whoever changes a command line, or a call, as the refusal says is not refused for the same again (4 s)."""
 
 import re
+import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import toolkit
 from tests.advice import TOOLKIT, advice_in, is_followed
+from toolkit.cli import main
+from toolkit.errors import DataError
+from toolkit.settings import SettingsError
 
 Vislam = Callable[..., int]
 # Seven poses on a bend, so that they can be fitted to others.
 POSES = "".join(f"{k}.0 {k} {k * k} 0 0 0 {k / 20} {(1 - k * k / 400) ** 0.5}\n" for k in range(7))
 NAME = "n" * 201
 BASELINE = "baseline --trajectories results/ours --truth truths --out"
+EVALUATED = "check --baseline b.json --trajectories e/evaluation.json"
 CHECK = "check --baseline b.json --trajectories"
 # What is typed, the advice, and what is typed then. Where the command would go on to run something the recording is one
 # that is not there, and that it says.
@@ -124,26 +132,77 @@ ROWS = [
         "are files of their own; give each its name",
         f"{CHECK} results/ours --json c.json --markdown c.md",
     ),
+    (
+        f"evaluate truths ours=results/ours --max-dt 0.1 --out e && {EVALUATED}",
+        "evaluate again without --max-dt",
+        f"evaluate truths ours=results/ours --out e && {EVALUATED}",
+    ),
+    (
+        f"evaluate truths ours=results/ours --gap 9 --out e && {EVALUATED}",
+        "evaluate again with --gap 5",
+        f"evaluate truths ours=results/ours --gap 5 --out e && {EVALUATED}",
+    ),
+    (
+        "baseline --plan --trajectories truths --truth truths",
+        "give the files of repeated runs, SEQUENCE/RUN.tum",
+        "baseline --plan --trajectories results/ours --truth truths",
+    ),
 ]
-# What is followed in another test, or nothing on a command line.
+
+
+def compared(*given: Any, **options: Any) -> Callable[[], object]:
+    return lambda: toolkit.compare(*given, **options)
+
+
+# The same from Python.
+CALLS = [
+    (compared("no", "ekf,rts"), "give several names as a list: ['ekf', 'rts']", compared("no", ["ekf", "rts"])),
+    (compared(3), "give one recording: a path, a built-in name, a Sequence", compared("no")),
+    (compared("no", {"my": print}), "functions build(setup) go by name into own", compared("no", own={"my": print})),
+    (compared("no", own=[print]), "give a dict, by name", compared("no", own={"my": print})),
+    (compared("no", own={"my": 3}), "give functions build(setup), each by a name", compared("no", own={"my": print})),
+    (compared("no", ["ekf"], own={"ekf": print}), "give it another name", compared("no", ["ekf"], own={"my": print})),
+    (compared("no", settings=3), "give nested values, as {'seeds': 3}", compared("no", settings={"seeds": 3})),
+    (compared("no", settings={3: 1}), "for a name, 3; give a text", compared("no", settings={"seeds": 1})),
+    (compared("no", resume="kept"), "and there is one seed: give seeds", compared("no", resume="kept", seeds=2)),
+    (compared("no", []), "name an estimator, or a trajectory of another system", compared("no", ["ekf"])),
+    (
+        lambda: toolkit.explain("no", own={"my": print}),
+        "give the path of a file with INGREDIENTS",
+        lambda: toolkit.explain("no", "ekf", "batch"),
+    ),
+]
+# What is followed in another test, or nothing that is typed.
 ELSEWHERE = re.compile(
-    r"^(install|pip|build|start|look|correct|rename|give the file another name|give it another name|keep to one"
+    r"^(install|pip|build|start|look|correct|rename|give the file another name|keep to one"
     r"|repeat|delete the line|make room|make one with|make a baseline with|name a (wheel|later one)|name another"
     r"|name one of them|allow more|change to another|film less|use the scenario's own|simulate a scene|give it more"
-    r"|give a (path|text|dict)|give (functions|seeds|several names|nested values|names, as|one recording|the path of)"
-    r"|give one like|check the address|name the two|name an estimator|run one seed|choose one with|choose a format"
-    r"|write a pose for each|give \{\} another name|evaluate again|give the files of repeated)"
+    r"|give a path|give (names, as)"
+    r"|give one like|check the address|name the two|run one seed|choose one with|choose a format"
+    r"|write a pose for each|give \{\} another name)"
 )
+
+
+@pytest.fixture(scope="module")
+def short_run(
+    tmp_path_factory: pytest.TempPathFactory, without_pixels: Callable[[], AbstractContextManager[None]]
+) -> Path:
+    """Return what a comparison of a few frames left."""
+    run = tmp_path_factory.mktemp("short") / "run"
+    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+    with without_pixels():
+        assert main([*words, "--out", str(run)]) == 0
+    return run
 
 
 @pytest.fixture
 def files(vislam: Vislam, short_run: Path) -> None:
-    del short_run  # in whose directory they stand
+    shutil.copytree(short_run, "run")
     for name in ("truths/A.tum", "two/A/1.tum", "two/A/2.tum", "both/A.tum", "both/A.csv", "other.tum"):
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(POSES.replace("3.0 3", "3.0 3.5") if name == "other.tum" else POSES)
     Path("results/ours/A").mkdir(parents=True)
-    for run in (1, 2):
+    for run in (1, 2, 3):
         Path(f"results/ours/A/{run}.tum").write_text(POSES.replace("5.0 5", f"5.0 5.{run}"))
     Path("a.toml").write_text("seeds = 1\n")
     Path("other.json").write_text("{}")
@@ -153,8 +212,9 @@ def files(vislam: Vislam, short_run: Path) -> None:
 def test_every_advice_about_a_command_line_is_followed_in_a_test() -> None:
     folders = ("cli", "evaluation", "experiment", "gate", "report", "simulation")
     modules = {path for folder in folders for path in (TOOLKIT / folder).glob("*.py")}
-    told = advice_in(modules - {TOOLKIT / "evaluation/scoring.py"}, raised=True)  # evaluation/test_public_cases
-    followed = [advice for _, advice, _ in ROWS]
+    modules = (modules | {TOOLKIT / "api.py"}) - {TOOLKIT / "evaluation/scoring.py"}  # evaluation/test_public_cases
+    told = advice_in(modules, raised=True)
+    followed = [advice for _, advice, _ in (*ROWS, *CALLS)]
     assert not [one for one in told if not (ELSEWHERE.match(one) or is_followed(one, followed))]
 
 
@@ -163,9 +223,19 @@ def test_every_advice_about_a_command_line_is_followed_in_a_test() -> None:
 def test_who_types_what_is_advised_is_not_refused_for_the_same_again(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], typed: str, advice: str, then: str
 ) -> None:
-    assert vislam(*typed.split()) != 0
+    assert [vislam(*words.split()) for words in typed.split(" && ")][-1] != 0
     assert advice in "".join(capsys.readouterr())
-    status = vislam(*then.split())
+    status = [vislam(*words.split()) for words in then.split(" && ")][-1]
     told = "".join(capsys.readouterr())
     assert advice not in told
     assert status in (0, 1) or "no: no such file" in told
+
+
+@pytest.mark.parametrize(("call", "advice", "then"), CALLS, ids=[advice for _, advice, _ in CALLS])
+def test_who_calls_as_is_advised_is_not_refused_for_the_same_again(
+    call: Callable[[], object], advice: str, then: Callable[[], object]
+) -> None:
+    with pytest.raises(SettingsError, match=re.escape(advice)):
+        call()
+    with pytest.raises(DataError, match="no: no such file"):
+        then()
