@@ -245,36 +245,32 @@ def test_noise_does_not_make_the_mean_of_two_samples_look_right() -> None:
     assert audit(replace(clean, motion=replace(clean.motion, w_radps=w_radps))).findings == ()
 
 
-def test_a_gyro_bias_is_reported_and_left_to_the_filters() -> None:
+@pytest.mark.parametrize(
+    ("bias_radps", "has_prior", "repaired"),
+    [
+        ((-0.01, -0.01, -0.01), False, False),
+        ((0.0, 0.0, -0.02), True, True),
+        ((0.0, 0.1, 0.0), False, True),
+        ((0.0, -0.15, 0.0), False, True),
+    ],
+)
+def test_a_gyro_bias_is_left_to_the_filters_unless_their_prior_or_start_without_one_denies_it(
+    bias_radps: tuple[float, ...], has_prior: bool, repaired: bool
+) -> None:
     clean = clean_recording("drive")
-    motion = replace(clean.motion, w_radps=clean.motion.w_radps - 0.01)
-    outcome = audit(replace(clean, motion=motion, prior=None))
+    motion = replace(clean.motion, w_radps=clean.motion.w_radps + np.array(bias_radps))
+    outcome = audit(replace(clean, motion=motion, prior=clean.prior if has_prior else None))
     (finding,) = outcome.findings
-    assert (finding.fault, finding.count, finding.repaired, finding.blocking) == ("gyro-bias", 3, False, False)
-    assert outcome.sequence.motion is motion
-
-
-def test_a_prior_that_denies_the_gyro_bias_is_widened_to_allow_it() -> None:
-    clean, bias_radps = clean_recording("drive"), np.array([0.0, 0.0, -0.02])
-    outcome = audit(replace(clean, motion=replace(clean.motion, w_radps=clean.motion.w_radps + bias_radps)))
-    (finding,) = outcome.findings
-    assert (finding.fault, finding.repaired, finding.blocking) == ("gyro-bias", True, False)
-    assert clean.prior is not None
-    assert outcome.sequence.prior is not None
-    added = np.diag(outcome.sequence.prior.cov - clean.prior.cov)
-    np.testing.assert_allclose(np.sqrt(added), np.abs(np.r_[np.zeros(12), bias_radps]), atol=0.004)  # 3 sigma
-
-
-@pytest.mark.parametrize("bias_radps", [0.1, -0.15])
-def test_a_bias_of_odometry_without_a_prior_that_estimators_do_not_expect_is_taken_off(bias_radps: float) -> None:
-    clean = clean_recording("drive")
-    motion = replace(clean.motion, w_radps=clean.motion.w_radps + np.array([0.0, bias_radps, 0.0]))
-    outcome = audit(replace(clean, motion=motion, prior=None))
-    assert [(finding.fault, finding.repaired, finding.blocking) for finding in outcome.findings] == [
-        ("gyro-bias", True, False)
-    ]
-    left_radps = outcome.sequence.motion.values[:, 3:] - clean.motion.values[:, 3:]
-    np.testing.assert_allclose(left_radps, np.zeros_like(left_radps), atol=0.0045)  # three standard errors
+    assert (finding.fault, finding.repaired, finding.blocking) == ("gyro-bias", repaired, False)
+    assert finding.count == np.count_nonzero(bias_radps)
+    if has_prior:  # it is widened
+        assert clean.prior is not None and outcome.sequence.prior is not None
+        added = np.diag(outcome.sequence.prior.cov - clean.prior.cov)
+        np.testing.assert_allclose(np.sqrt(added), np.abs(np.r_[np.zeros(12), bias_radps]), atol=0.004)  # 3 sigma
+    elif repaired:  # it is taken off
+        np.testing.assert_allclose(outcome.sequence.motion.values, clean.motion.values, atol=0.0045)  # 3 sigma
+    else:
+        assert outcome.sequence.motion is motion
 
 
 def test_a_standstill_shows_the_gyro_bias_without_a_camera() -> None:
