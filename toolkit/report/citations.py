@@ -7,7 +7,6 @@ file. Nothing is imported to read it.
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
@@ -28,37 +27,24 @@ _SOFTWARE = """@software{{vislam_toolkit,
 }}"""
 
 
-@dataclass(frozen=True)
-class Cited:
-    """The BibTeX entries of an estimator or a data set, by key; none where there is nothing to cite."""
-
-    name: str
-    entries: Mapping[str, str]
-
-
-def citations(names: Iterable[str]) -> tuple[Cited, ...]:
+def citations(names: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return what to cite for estimators, formats, files of estimators and run directories; for all without names.
 
-    Raises EstimatorError for a name nobody knows or a key that references.bib does not have, DataError for a directory
-    that is no run's.
+    It is BibTeX by key, by name, and empty where there is nothing to cite. Raises EstimatorError for a name nobody
+    knows or a key that references.bib does not have, DataError for a directory that is no run's.
     """
     known = {name: entry.found for name, entry in discover().items()} | datasets.modules()
     wanted = [found for name in names for found in _meant(name, known)] or list(known.items())
-    return tuple(Cited(name, _entries(module)) for name, module in dict(wanted).items())
+    return {name: _entries(module) for name, module in dict(wanted).items()}
 
 
-def bibtex(cited: Iterable[Cited]) -> str:
+def bibtex(cited: Mapping[str, Mapping[str, str]]) -> str:
     """Return BibTeX: the toolkit itself, then every entry once, under the names that it is cited for."""
-    entries: dict[str, str] = {}
-    whose: dict[str, list[str]] = {}
-    nothing = []
-    for one in cited:
-        entries |= one.entries
-        for key in one.entries:
-            whose.setdefault(key, []).append(one.name)
-        nothing += [] if one.entries else [one.name]
+    entries = {key: text for of_one in cited.values() for key, text in of_one.items()}
+    nothing = [name for name, of_one in cited.items() if not of_one]
     parts = [f"% the toolkit\n{_SOFTWARE.format(version=version('vislam-toolkit'))}"]
-    parts += [f"% {', '.join(whose[key])}\n{text}" for key, text in entries.items()]
+    for key, text in entries.items():
+        parts.append(f"% {', '.join(name for name, of_one in cited.items() if key in of_one)}\n{text}")
     parts += [f"% nothing to cite for {', '.join(nothing)}"] if nothing else []
     return "\n\n".join(parts) + "\n"
 

@@ -35,7 +35,6 @@ T = TypeVar("T")
 # How many colours there are; a look of a higher number has the colours over again, in other dashes.
 COLOURS = 7
 _MICROSECONDS = 6
-_HALF_WINDOW = 7
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
 _LINES = "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
 _FROM_START = "All start from the same pose and nothing is fitted, so that the error is what has drifted since."
@@ -132,19 +131,6 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
 def seconds(sequence: Sequence, t_ns: IntArray) -> tuple[float, ...]:
     """Return stamps (N,) as seconds from the first frame, to the microsecond."""
     return tuple(round(t, _MICROSECONDS) for t in sequence.elapsed_s(t_ns).tolist())
-
-
-def running_median(values: Array) -> Array:
-    """Return the median (N,) of the known ones of the fifteen values around each of (N,); NaN where none is known.
-
-    At the ends there are fewer.
-    """
-    padded = np.pad(values, _HALF_WINDOW, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _HALF_WINDOW + 1)
-    known = np.isfinite(windows).any(axis=1)
-    medians = np.full(values.size, np.nan)
-    medians[known] = np.nanmedian(windows[known], axis=1)
-    return medians
 
 
 def shown_output(run: Run) -> Output:

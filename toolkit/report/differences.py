@@ -18,6 +18,7 @@ from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats, Whe
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.run_directory import RunFiles, SeedsFiles
+from toolkit.report.scores import MetricOverSeeds
 from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, cell, filled
 
 Files = RunFiles | SeedsFiles
@@ -142,19 +143,20 @@ class _Line:
         return float(np.mean(good)) if good else None
 
 
-def _lines(files: Files) -> dict[tuple[str, str], _Line]:
+def _hashes(files: Files) -> dict[int, str | None]:
+    """Return the hash of what was read under each seed."""
     if isinstance(files, SeedsFiles):
-        seeds = files.scores.seeds
-        return {
-            (run.estimator, run.output): _Line(
-                dict(zip(seeds, run.status, strict=True)),
-                {key: dict(zip(seeds, metric.values, strict=True)) for key, metric in run.metrics.items()},
-            )
-            for run in files.scores.runs
-        }
-    seed = files.manifest.seeds.sequence
+        return dict(zip(files.scores.seeds, files.scores.hashes, strict=True))
+    return {files.manifest.seeds.sequence: files.scores.sequence.hash}
+
+
+def _lines(files: Files) -> dict[tuple[str, str], _Line]:
+    def by_seed(values: Any) -> dict[int, Any]:
+        given = values.values if isinstance(values, MetricOverSeeds) else values
+        return dict(zip(_hashes(files), given if isinstance(given, tuple) else (given,), strict=True))
+
     return {
-        (run.estimator, run.output): _Line({seed: run.status}, {key: {seed: v} for key, v in run.metrics.items()})
+        (run.estimator, run.output): _Line(by_seed(run.status), {k: by_seed(one) for k, one in run.metrics.items()})
         for run in files.scores.runs
     }
 
@@ -171,12 +173,7 @@ def _repeats_causal(lines: Mapping[tuple[str, str], _Line], key: tuple[str, str]
 
 def _reads_the_same(before: Files, after: Files) -> bool:
     """Say whether both sides read the same recording under each common seed; otherwise runs are not paired."""
-    one, two = (
-        dict(zip(files.scores.seeds, files.scores.hashes, strict=True))
-        if isinstance(files, SeedsFiles)
-        else {files.manifest.seeds.sequence: files.scores.sequence.hash}
-        for files in (before, after)
-    )
+    one, two = _hashes(before), _hashes(after)
     shared = one.keys() & two.keys()
     return bool(shared) and all(one[seed] == two[seed] for seed in shared)
 

@@ -9,7 +9,7 @@ import csv
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace
@@ -250,7 +250,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
     scored = [metric.key for metric in evaluation.scored_metrics]
-    remarks: dict[str, _RemarkScope] = {}
+    remarks: dict[str, tuple[set[str], dict[str, None]]] = {}  # the metrics, and the systems on sequences
     for run in evaluation.runs:
         # Whatever the file's orientations lack is told, though nothing that needs them has a value. Why a run failed is
         # listed already.
@@ -261,20 +261,14 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         told += ["nees_pose_mean"] if run.notes.get("nees_pose_mean", NO_COVARIANCE) != NO_COVARIANCE else []
         for key in (key for key in dict.fromkeys(told) if run.notes[key] not in run.log):
             text = run.notes[key] if run.metrics.get(key) is not None else f"no value: {run.notes[key]}"
-            about = remarks.setdefault(text, _RemarkScope({}, {}))
-            about.keys[key] = about.whose[f"{run.estimator} on {run.sequence}"] = None
-    for text, about in list(remarks.items())[:_MOST_REMARKS]:
-        first, *others = about.whose
+            keys, systems = remarks.setdefault(text, (set(), {}))
+            keys.add(key)
+            systems[f"{run.estimator} on {run.sequence}"] = None
+    for text, (keys, systems) in list(remarks.items())[:_MOST_REMARKS]:
+        first, *others = systems
         more = f" and {len(others)} more" if others else ""
-        whose = "" if len(about.whose) == len(evaluation.cells) else f" of {first}{more}"
-        yield f"{listed(metric.key for metric in METRICS if metric.key in about.keys)}{whose}: {text}"
-
-
-class _RemarkScope(NamedTuple):
-    """The metrics, and the systems on sequences, that a remark is about, in order."""
-
-    keys: dict[str, None]
-    whose: dict[str, None]
+        whose = "" if len(systems) == len(evaluation.cells) else f" of {first}{more}"
+        yield f"{listed(metric.key for metric in METRICS if metric.key in keys)}{whose}: {text}"
 
 
 def _parts(
