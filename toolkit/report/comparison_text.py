@@ -3,8 +3,6 @@
 Below the table stand the verdict and the most harmful notes; the report has everything needed to read the table.
 """
 
-import csv
-import io
 from collections.abc import Mapping
 
 from toolkit.audit import Audit
@@ -28,6 +26,7 @@ from toolkit.report.text import (
     WIDTH,
     Table,
     Width,
+    as_csv,
     as_latex,
     as_markdown,
     as_text,
@@ -95,15 +94,12 @@ def comparison_latex(comparison: Comparison, columns: Columns = None) -> str:
 
 def comparison_csv(comparison: Comparison) -> str:
     """Return a line a row of the table with every metric in full: over seeds means over the runs that are ok."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     keys = [metric.key for metric in known_metrics()]
-    writer.writerow(["sequence", "estimator", "output", "runs", "ok", *keys])
-    for row in comparison.lines:
-        values = [row.value(key) for key in keys]
-        texts = ["" if value is None else repr(value) for value in values]
-        writer.writerow([comparison.name, row.estimator, row.label, len(row.outcomes), row.counts["ok"], *texts])
-    return out.getvalue().rstrip("\n")
+    rows = (
+        [comparison.name, row.estimator, row.label, len(row.outcomes), row.counts["ok"], *map(row.value, keys)]
+        for row in comparison.lines
+    )
+    return as_csv(["sequence", "estimator", "output", "runs", "ok", *keys], rows).rstrip("\n")
 
 
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:

@@ -5,8 +5,6 @@ figures, and the leaderboard in Markdown and as a page, one HTML file that opens
 page.
 """
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +38,7 @@ from toolkit.report.text import (
     Table,
     TextPart,
     Width,
+    as_csv,
     as_latex,
     cell,
     filled,
@@ -306,15 +305,16 @@ def evaluation_latex(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] =
 
 def evaluation_csv(evaluation: EvaluatedSystems) -> str:
     """Return a line a run, failed ones too, with every metric; the last column says why a run failed."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["sequence", "system", "run", "status", *(metric.key for metric in METRICS), "why"])
-    for run in evaluation.runs:
-        values = [run.metrics.get(metric.key) for metric in METRICS]
-        texts = ["" if value is None else repr(value) for value in values]
-        why = run.log[0] if run.log else ""
-        writer.writerow([run.sequence, run.estimator, run.run, run.status, *texts, why])
-    return out.getvalue()
+    keys = [metric.key for metric in METRICS]
+    rows = (
+        [
+            *(run.sequence, run.estimator, run.run, run.status),
+            *map(run.metrics.get, keys),
+            run.log[0] if run.log else "",
+        ]
+        for run in evaluation.runs
+    )
+    return as_csv(["sequence", "system", "run", "status", *keys, "why"], rows)
 
 
 def check_evaluation_directory(target: Path) -> None:

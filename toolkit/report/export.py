@@ -24,7 +24,7 @@ from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
 from toolkit.files.reading import open_input
 from toolkit.files.writing import replaced_file, write_text
-from toolkit.report.report_json import Report, states_file
+from toolkit.report.report_json import Report, file_of
 from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
 BUNDLE, LOCK = "bundle.json", "requirements.txt"
@@ -106,7 +106,7 @@ def _chosen(
     if wanted not in outputs:
         raise DataError(f"{directory} has no {wanted} trajectory of {name}, only a {outputs[0]} one")
     repeats = any(run.repeats_causal for run in report.runs if (run.estimator, run.output) == (name, wanted))
-    return f"{name} {wanted}", files[name, wanted], states_file(name, "causal" if repeats else wanted)
+    return f"{name} {wanted}", files[name, wanted], file_of("states", name, "causal" if repeats else wanted)
 
 
 class BundleRecord(Struct, frozen=True, kw_only=True):

@@ -301,19 +301,12 @@ read_seeds_report = reader(SeedsReport, REPEAT)
 Series = TypeVar("Series", NeesSeries, NisSeries)
 
 
-def trajectory_file(estimator: str, output: Output) -> str:
-    """Return where in a run directory the trajectory of an estimator's output is."""
-    return f"trajectories/{plain_name(estimator)}_{output}.tum"
+_FILES = {"trajectory": "trajectories/{}_{}.tum", "states": "states/{}_{}.txt", "landmarks": "landmarks/{}.csv"}
 
 
-def states_file(estimator: str, output: Output) -> str:
-    """Return where in a run directory the states of an estimator's output are, with their covariances."""
-    return f"states/{plain_name(estimator)}_{output}.txt"
-
-
-def landmarks_file(estimator: str) -> str:
-    """Return where in a run directory the landmarks of an estimator are."""
-    return f"landmarks/{plain_name(estimator)}.csv"
+def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, output: Output = "final") -> str:
+    """Return where in a run directory an output's trajectory or its covariances are, or an estimator's landmarks."""
+    return _FILES[kind].format(plain_name(estimator), output)
 
 
 def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()) -> Report:
@@ -328,7 +321,7 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         runs=tuple(_row(row, comparison, _errors(row, curves, comparison.sequence)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
         maps=tuple(
-            DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=shown_output(run))
+            DrawnMap(estimator=run.estimator, landmarks=file_of("landmarks", run.estimator), output=shown_output(run))
             for run in comparison.runs
             if len(run.landmarks)
         ),
@@ -391,7 +384,7 @@ def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnR
         estimator=row.estimator,
         output=row.output,
         repeats_causal=row.output == "final" and row.run.final_is_causal,
-        trajectory=trajectory_file(row.estimator, row.output) if answered else None,
+        trajectory=file_of("trajectory", row.estimator, row.output) if answered else None,
         rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
         translation_m=_vector(alignment.translation),
         errors=errors,

@@ -194,12 +194,12 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            _write_text(directory / report_json.trajectory_file(row.estimator, row.output), tum.text(trajectory))
+            _write_text(directory / report_json.file_of("trajectory", row.estimator, row.output), tum.text(trajectory))
         if trajectory is not None and trajectory.cov is not None and not row.repeats_causal:
             states = openvins.text_with_covariances(trajectory)
-            _write_text(directory / report_json.states_file(row.estimator, row.output), states)
+            _write_text(directory / report_json.file_of("states", row.estimator, row.output), states)
     for run in comparison.runs:
-        _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+        _write_landmarks(run.landmarks, directory / report_json.file_of("landmarks", run.estimator))
 
 
 def _write_truth(comparison: Comparison, directory: Path) -> None:

@@ -4,7 +4,9 @@ Numbers have three significant digits; lengths of centimetres and less are in mi
 Lines are wrapped to the width of a terminal, and whole where they go into a file or a pipe. tabulate lays tables out.
 """
 
+import csv
 import html
+import io
 import math
 import re
 import sys
@@ -232,6 +234,16 @@ def as_html(table: Table) -> str:
     heads = [in_html(_in_one_line(lines)) for lines in table.headings]
     rows = _cells(table, in_html, '<b class="best">{}</b>')
     return str(tabulate(rows, heads, "unsafehtml", colalign=_sides(table), disable_numparse=True))
+
+
+def as_csv(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return lines of values in full, numbers as Python writes them; None is nothing."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(heads)
+    for row in rows:
+        writer.writerow(["" if value is None else value if isinstance(value, str) else repr(value) for value in row])
+    return out.getvalue()
 
 
 def as_latex(table: Table) -> str:

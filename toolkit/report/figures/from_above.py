@@ -125,7 +125,7 @@ def _figure(comparison: Comparison, runs: Sequence[Run], mapper: Run | None, tit
         entries.append(Entry.of_line("truth", style.TRUTH_COLOUR, width=_TRUTH_WIDTH))
     for run, track in zip(runs, tracks, strict=True):
         width = _LINE_WIDTH if len(runs) == 1 else style.width_of(comparison, run.estimator)
-        stroke = style.stroke_of(comparison, run.estimator, shown_output(run))
+        stroke = style.stroke_of(comparison.estimators, run.estimator, shown_output(run))
         axes.plot(*track.T, linewidth=width, zorder=3, **stroke)
         axes.plot(*track[:1].T, "o", color=stroke["color"], ms=5.0, markeredgecolor="white", zorder=4)
         entries.append(Entry.of_line(_name(run), stroke["color"], stroke["linestyle"], 1.8))

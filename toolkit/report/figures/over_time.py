@@ -54,7 +54,7 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     position, heading = figure.subplots(2, 1, sharex=True)
     for row, errors in curves.of_rows:
         t_s, width = comparison.sequence.elapsed_s(errors.t_ns), style.width_of(comparison, row.estimator)
-        stroke = style.stroke_of(comparison, row.estimator, row.output)
+        stroke = style.stroke_of(comparison.estimators, row.estimator, row.output)
         position.plot(t_s, errors.position_m, linewidth=width, **stroke)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **stroke)
     style.label_axes(position, f"{comparison.name}: position {curves.what}, {curves.placing}", "", "position [m]")
@@ -233,7 +233,7 @@ def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]])
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
             t_s = comparison.sequence.elapsed_s(one.t_ns)
-            stroke = style.stroke_of(comparison, row.estimator, style.shown_as(row))
+            stroke = style.stroke_of(comparison.estimators, row.estimator, style.shown_as(row))
             lost = np.linalg.norm(one.excess[:, block], axis=1)
             axes.plot(t_s, scale * lost, linewidth=1.6, label=f"{row.estimator} {row.label}", **stroke)
             axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)

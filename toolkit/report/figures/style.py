@@ -60,7 +60,7 @@ def colour_at(place: int) -> str:
 
 def colour_of(comparison: "Comparison", estimator: str) -> str:
     """Return the colour an estimator has in every figure of every run."""
-    return stroke_among(comparison.estimators, estimator)["color"]
+    return stroke_of(comparison.estimators, estimator)["color"]
 
 
 def line_of(output: Output) -> Dashes:
@@ -75,16 +75,11 @@ class Stroke(TypedDict):
     linestyle: Dashes
 
 
-def stroke_of(comparison: "Comparison", estimator: str, output: Output) -> Stroke:
-    """Return colour and dashes of one kind of output of an estimator: other dashes where its colour is another's too.
+def stroke_of(estimators: Iterable[str], estimator: str, output: Output = "final") -> Stroke:
+    """Return colour and dashes of one kind of output of an estimator, given all: others where its colour is another's.
 
     Both outputs keep the estimator's colour, so that thrice as many estimators as there are colours are told apart.
     """
-    return stroke_among(comparison.estimators, estimator, output)
-
-
-def stroke_among(estimators: Iterable[str], estimator: str, output: Output = "final") -> Stroke:
-    """Return colour and dashes of one kind of output of an estimator, given all that are shown."""
     from toolkit.report.curves import look_numbers
 
     number, styles = look_numbers(estimators)[estimator], _LINE_OF[output]
@@ -140,7 +135,7 @@ class Entry(NamedTuple):
 def entries_of(comparison: "Comparison", drawn: Sequence[tuple[str, Output]]) -> list[Entry]:
     """Return an entry for each estimator of which outputs are drawn, with the line of the final one where it is."""
     output_of = dict(sorted(drawn, key=lambda pair: pair[1]))  # causal before final
-    strokes = {name: stroke_of(comparison, name, output_of[name]) for name, _ in drawn}
+    strokes = {name: stroke_of(comparison.estimators, name, output_of[name]) for name, _ in drawn}
     return [Entry.of_line(name, stroke["color"], stroke["linestyle"], 1.8) for name, stroke in strokes.items()]
 
 

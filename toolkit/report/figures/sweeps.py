@@ -91,7 +91,7 @@ def _draw_lines(axes: Axes, lines: dict[str, list[tuple[float, Interval]]]) -> N
     values = [min(one.value, _MOST) for line in lines.values() for _, one in line if math.isfinite(one.value)]
     low, high = 0.7 * min([0.9, *values]), 1.5 * max([BREAKS_AT, *values])
     for name, line in lines.items():
-        stroke, place = style.stroke_among(lines, name), [place for place, _ in line]
+        stroke, place = style.stroke_of(lines, name), [place for place, _ in line]
         value, below, above = (np.clip([one[end] for _, one in line], low, high) for end in range(3))
         axes.fill_between(place, below, above, color=stroke["color"], alpha=0.13, linewidth=0.0)
         axes.plot(place, value, linewidth=1.3, marker="o", markersize=2.5, **stroke)
@@ -108,7 +108,7 @@ def _against_time(sweep: Sweep, axis: Axis) -> NamedFigure:
     reached = {name: _reached(sweep, axis, name) for name in sweep.estimators}
     everywhere = [at for points in reached.values() for at in points.values()]
     for name, points in reached.items():
-        stroke = style.stroke_among(reached, name)
+        stroke = style.stroke_of(reached, name)
         line = [at for point, at in points.items() if point]
         axes.plot(*np.reshape(line, (-1, 2)).T, linewidth=1.0, alpha=0.6, **stroke)
         for point, at in points.items():
@@ -145,5 +145,5 @@ def _reached(sweep: Sweep, axis: Axis, name: str) -> dict[Point, tuple[float, fl
 
 
 def _entries(sweep: Sweep) -> list[Entry]:
-    strokes = {name: style.stroke_among(sweep.estimators, name) for name in sweep.estimators}
+    strokes = {name: style.stroke_of(sweep.estimators, name) for name in sweep.estimators}
     return [Entry.of_line(name, stroke["color"], stroke["linestyle"]) for name, stroke in strokes.items()]
