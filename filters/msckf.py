@@ -9,6 +9,7 @@ state does in the smoothers.
 """
 
 from bisect import bisect_left
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import NS_PER_S, Packet, StereoFrame
 from toolkit.models.gating import FrameGate
+from toolkit.models.state import Belief
 
 CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ past poses; one update a track, at its end; usual errors, one step"
@@ -42,9 +44,11 @@ def build(setup: Setup) -> Estimator:
     return estimator(setup, AtLatestEstimates())
 
 
-def estimator(setup: Setup, at: Linearisation, landmarks: int = 0) -> Estimator:
+def estimator(
+    setup: Setup, at: Linearisation, landmarks: int = 0, belief: Callable[[Belief], JointBelief] = JointBelief
+) -> Estimator:
     """Return the filter of a linearisation and a number of landmarks, with states as sparse as the window demands."""
-    msckf = Msckf(setup, at, landmarks)
+    msckf = Msckf(setup, at, landmarks, belief=belief)
     return Thinned(setup, OnlineOutput(msckf, msckf.log))
 
 
@@ -53,10 +57,17 @@ class Msckf:
 
     Up to ``landmarks`` tracks that span the window are kept in the state for as long as they are seen (Li & Mourikis
     2013, "Optimization-based estimator design for vision-aided inertial navigation"); ``window_s`` is the length of the
-    window in seconds, by default that of the settings.
+    window in seconds, by default that of the settings; ``belief`` decides in which coordinates landmarks move.
     """
 
-    def __init__(self, setup: Setup, at: Linearisation, landmarks: int = 0, window_s: float | None = None) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        at: Linearisation,
+        landmarks: int = 0,
+        window_s: float | None = None,
+        belief: Callable[[Belief], JointBelief] = JointBelief,
+    ) -> None:
         self.log = load_kernels(setup.progress)
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
         self._motion = setup.motion
@@ -64,7 +75,7 @@ class Msckf:
             window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: list[int] = []
-        self._joint = JointBelief(self._motion.initial_belief(setup.prior))
+        self._joint = belief(self._motion.initial_belief(setup.prior))
         self._tracks, self._memory = WindowTracks(), LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:

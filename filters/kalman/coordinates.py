@@ -78,6 +78,81 @@ class InverseDepthBelief(LandmarkAnchors):
         self.points = transform(self.anchors, inverse_depth(inverse_depth(now) + change))
 
 
+class CloneAnchoredBelief(JointBelief):
+    """A belief whose landmarks are moved in inverse depth from the camera of a clone, their anchor.
+
+    The error of a landmark is that of (x / z, y / z, 1 / z) in its anchor, which is a state too: a correction moves
+    both and the landmark follows. To first order this error and that of the anchor are a linear function of the errors
+    in metres, evaluated where ``at`` has Jacobians evaluated. The covariance is kept in metres, and changes with that
+    function as the estimates move; at first estimates it is constant. The anchor is the newest clone, and the newest
+    again once it leaves the window, which changes no covariance.
+
+    Sources: Geneva et al. 2020, "OpenVINS" (ANCHORED_INVERSE_DEPTH); Cohen, Korotkine & Forbes 2026, "Observability and
+    consistency analysis for visual-inertial navigation with anchored feature parameterizations" (arXiv 2606.19307): the
+    unobservable directions do not depend on the estimates of landmarks, but still on those of poses.
+    """
+
+    def __init__(self, core: Belief, T_imu_cam: Array, at: Linearisation) -> None:
+        super().__init__(core)
+        self._T_imu_cam, self._at = T_imu_cam, at
+        self.anchors: IntArray = np.empty(0, dtype=np.int64)
+
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, covs: Array) -> None:
+        """Add N landmarks as :meth:`JointBelief.add_landmarks` does, anchored in the newest clone."""
+        super().add_landmarks(track_ids, points, jacobian, covs)
+        self.anchors = np.append(self.anchors, np.full(len(track_ids), len(self.clones) - 1))
+
+    def forget_landmarks(self, which: BoolArray) -> None:
+        """Marginalise landmarks (L,)."""
+        super().forget_landmarks(which)
+        self.anchors = self.anchors[~which]
+
+    def forget_clones(self, count: int) -> None:
+        """Marginalise the oldest clones; landmarks anchored there are anchored in the newest."""
+        super().forget_clones(count)
+        self.anchors = np.where(self.anchors < count, len(self.clones) - 1, self.anchors - count)
+
+    def move(self, delta: Array) -> None:
+        """Move every estimate by an error (n,); the covariance of anchored errors stays."""
+        before = self._d_triple_d_error()
+        self._displace(delta)
+        now = self._d_triple_d_error()
+        if not np.array_equal(now, before):
+            carried = self._carried(before, now, self._carried(before, now, self._cov).T)
+            self._cov = 0.5 * (carried + carried.T)
+
+    def triples(self) -> Array:
+        """Return (x / z, y / z, 1 / z) of each landmark in its anchor, (L, 3)."""
+        return inverse_depth(transform(se3_inverse(self.clones[self.anchors] @ self._T_imu_cam), self.points))
+
+    def _displace(self, delta: Array) -> None:
+        change = self._d_triple_d_error() @ self._own(delta[:, None])
+        triples = self.triples() + change[..., 0]
+        super()._displace(delta)
+        self.points = transform(self.clones[self.anchors] @ self._T_imu_cam, inverse_depth(triples))
+
+    def _carried(self, before: Array, now: Array, rows: Array) -> Array:
+        """Return errors (n, m) in metres before a move as those after it, for the same anchored errors."""
+        result, own = rows.copy(), self._own(rows)
+        relative = before @ own - now[:, :, 3:] @ own[:, 3:]
+        result[self.landmark_columns] = np.linalg.solve(now[:, :, :3], relative).reshape(-1, rows.shape[1])
+        return result
+
+    def _own(self, rows: Array) -> Array:
+        """Return the errors (L, 9, m) of each landmark and its anchor, of the errors (n, m) of the state."""
+        of_points = rows[self.landmark_columns].reshape(len(self.points), 3, rows.shape[1])
+        of_clones = rows[self.clone_columns].reshape(len(self.clones), 6, rows.shape[1])
+        return np.concatenate([of_points, of_clones[self.anchors]], axis=1)
+
+    def _d_triple_d_error(self) -> Array:
+        """Return the Jacobians (L, 3, 9) of the triples to the errors of each landmark and its anchor."""
+        anchors, points = self._at.clones(self)[self.anchors], self._at.points(self)
+        to_camera = se3_inverse(anchors @ self._T_imu_cam)
+        of_point = inverse_depth_jacobian(transform(to_camera, points)) @ to_camera[:, :3, :3]
+        turn, in_imu = anchors[:, :3, :3], transform(se3_inverse(anchors), points)
+        return np.concatenate([of_point, of_point @ turn @ skew(in_imu), -of_point @ turn], axis=2)
+
+
 class InvariantBelief(JointBelief):
     """A joint belief that is corrected on the group.
 

@@ -130,11 +130,13 @@ def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
     assert np.abs((one - other) / np.outer(sigma, sigma)).max() < relative
 
 
-def with_clones(scenario: Scenario, seed: int, count: int) -> tuple[Sequence, JointBelief]:
+def with_clones(
+    scenario: Scenario, seed: int, count: int, belief: Callable[..., JointBelief] = JointBelief
+) -> tuple[Sequence, JointBelief]:
     """Return a recording and the joint belief after its first frames, of which it has a clone each, without vision."""
     sequence = simulate(scenario, seed)
     model = motion_model(sequence.noise, sequence.gravity_world)
-    joint = JointBelief(model.initial_belief(sequence.prior))
+    joint = belief(model.initial_belief(sequence.prior))
     for packet in list(sequence.packets())[:count]:
         propagate(joint, model, AtLatestEstimates(), packet.motion)
         joint.clone()

@@ -1,10 +1,19 @@
-"""Landmarks that move along their inverse depth: to first order as in metres, and exactly as their camera sees them."""
+"""Landmarks that move along their inverse depth: to first order as in metres, and exactly as their camera sees them.
+
+Anchored in a clone, they are the same Gaussian to first order, whose anchored errors a move leaves as they are.
+"""
+
+from copy import copy
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from filters.kalman.coordinates import InverseDepthBelief
-from filters.kalman.joint import AtFirstEstimates, JointBelief
+from filters.kalman.coordinates import CloneAnchoredBelief, InverseDepthBelief
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, Linearisation
+from tests.filters.conftest import with_clones
+from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
@@ -71,3 +80,63 @@ def test_landmarks_that_are_forgotten_take_their_anchors_with_them(belief):
     assert belief.anchors.shape == (1, 4, 4)
     by = np.array([[0.0, 0.0, 1e-6]])
     np.testing.assert_allclose(landmarks_moved(belief, by).points, belief.points + by, atol=1e-11)
+
+
+def anchored(T_imu_cam: Array, at: Linearisation) -> CloneAnchoredBelief:
+    """Return a corrected belief of three clones, with a landmark anchored in the first and one in the last."""
+    belief = partial(CloneAnchoredBelief, T_imu_cam=T_imu_cam, at=at)
+    _, joint = with_clones(replace(DRIVE, duration_s=1.5), 2, 3, belief)
+    assert isinstance(joint, CloneAnchoredBelief)
+    rng = np.random.default_rng(1)
+    for clone, track_id, point in zip((0, 2), IDS, POINTS_CAM, strict=True):
+        in_world = transform(joint.clones[clone] @ T_imu_cam, point[None])
+        joint.add_landmarks(np.array([track_id]), in_world, rng.normal(size=(3, 18)), 0.1 * np.eye(3)[None])
+        joint.anchors[-1] = clone
+    joint.move(0.1 * np.sqrt(np.diag(joint.cov)) * rng.normal(size=len(joint.cov)))
+    return joint
+
+
+every_linearisation = pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
+
+
+@pytest.mark.parametrize("forgotten", [0, 1])
+def test_an_anchored_landmark_moves_as_in_metres_to_first_order(sequence, forgotten):
+    """Whatever its anchor: the first leaves with the oldest clone, and the landmark gets the newest."""
+    joint = anchored(sequence.rig.T_imu_cam, AtLatestEstimates())
+    points, cov = joint.points, joint.cov
+    joint.forget_clones(forgotten)
+    assert joint.anchors.tolist() == ([0, 2] if not forgotten else [1, 1])
+    np.testing.assert_allclose(joint.points, points, rtol=1e-12)
+    kept = slice(0, joint.landmark_columns.stop)
+    np.testing.assert_array_equal(joint.cov[kept, kept], cov[kept, kept])
+    delta = 1e-6 * np.random.default_rng(2).normal(size=len(joint.cov))
+    in_metres = joint.points + delta[joint.landmark_columns].reshape(-1, 3)
+    # The second order: (1e-6)^2 over a depth of metres, or times one of 80 m.
+    np.testing.assert_allclose(joint.displaced(delta).points, in_metres, atol=1e-9)
+
+
+@every_linearisation
+def test_a_move_leaves_the_gaussian_of_anchored_errors(sequence, at):
+    """By numerical Jacobians of the triples and the clones' errors, at the linearisation points before and after."""
+    joint = anchored(sequence.rig.T_imu_cam, at)
+
+    def of_anchored_errors() -> Array:
+        there, plain = copy(joint), JointBelief(joint.core)
+        plain.clones, plain.points, plain._cov = at.clones(joint), at.points(joint), joint.cov
+
+        def triples(delta: Array) -> Array:
+            moved = plain.displaced(delta)
+            there.clones, there.points = moved.clones, moved.points
+            return there.triples().ravel()
+
+        jacobian = np.eye(len(joint.cov))
+        jacobian[joint.landmark_columns] = numerical_jacobian(triples, len(joint.cov))
+        return jacobian @ joint.cov @ jacobian.T
+
+    before, points = of_anchored_errors(), joint.points
+    joint.move(0.5 * np.sqrt(np.diag(joint.cov)) * np.random.default_rng(4).normal(size=len(joint.cov)))
+    assert np.abs(joint.points - points).max() > 0.1, "there was something to carry"
+    sigmas = np.sqrt(np.diag(before))
+    np.testing.assert_allclose(
+        of_anchored_errors() / np.outer(sigmas, sigmas), before / np.outer(sigmas, sigmas), atol=1e-6
+    )

@@ -6,12 +6,14 @@ compared with the batch on a problem that is linear in effect, as in test_joint_
 
 import copy
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 import pytest
 
+from filters.kalman.coordinates import CloneAnchoredBelief
 from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief, propagate
 from filters.kalman.tracks import EliminatedTracks, WindowPoses, WindowTracks, eliminated_tracks
 from filters.msckf import Msckf
@@ -141,7 +143,12 @@ def seen_twice(sequence):
 
 # With room for every track, each sighting is used once however long the run; with none, while the window fills. In view
 # of the newest pose, tracks have corrected nothing that is kept, and the answer is that of the batch all the same.
-SIZES = {"in view": (9, 0, 7), "one window": (9, 0, 10), "every landmark kept": (4, 10**6, 21)}
+SIZES = {
+    "in view": (9, 0, 7),
+    "one window": (9, 0, 10),
+    "every landmark kept": (4, 10**6, 21),
+    "every landmark anchored": (4, 10**6, 21),
+}
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
@@ -156,7 +163,9 @@ def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, siz
     # A pose leaves in the frame in which it is older than the window.
     lag_s = (clones - 0.5) / scenario.camera.rate_hz
     settings = Settings(window=WindowSettings(lag_s=lag_s))
-    msckf = Msckf(replace(recording.setup, settings=settings), at, landmarks)
+    anchored = partial(CloneAnchoredBelief, T_imu_cam=rig.T_imu_cam, at=at)
+    belief = anchored if size == "every landmark anchored" else JointBelief
+    msckf = Msckf(replace(recording.setup, settings=settings), at, landmarks, belief=belief)
     for packet in recording.sequence.packets():
         estimate = msckf.step(packet)
         assert estimate.info["gate_accepted"] == estimate.info["gate_tested"]
