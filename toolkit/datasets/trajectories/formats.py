@@ -97,14 +97,14 @@ class Rows:
                 return np.fromiter(map(float, chain.from_iterable(self.cells)), dtype=float).reshape(-1, width)
         return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
 
-    def stamps(self, per_unit_ns: int) -> IntArray:
-        """Return the first cells, in units of ``per_unit_ns``, as int64 nanoseconds (N,), rounded only there.
+    def stamps(self, per_unit_ns: int, at: int = 0) -> IntArray:
+        """Return the cells of a column, in units of ``per_unit_ns``, as int64 nanoseconds (N,), rounded only there.
 
         A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
         or beyond what 64 bits hold.
         """
-        first = [cells[0] for cells in self.cells]
-        return exact_ns(first, per_unit_ns, lambda row: f"{self.path}: line {self.line_numbers[row]}")
+        cells = [of_line[at] for of_line in self.cells]
+        return exact_ns(cells, per_unit_ns, lambda row: f"{self.path}: line {self.line_numbers[row]}")
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
         return zip(self.line_numbers, self.cells, strict=True)
@@ -272,7 +272,7 @@ class Stamped:
         pose = [1 + self.order.index(column) for column in range(7)]
         # A view where nothing is moved: a copy lies in another order, in which sums may differ in the last bit.
         values = table[:, 1:8] if pose == [*range(1, 8)] else table[:, pose]
-        file = _stamped_poses(rows, self._stamps(rows, table), values, self.name)
+        file = _stamped_poses(rows, _stamps(rows, table, self.unit_ns), values, self.name)
         if len(file) < len(table):
             table = table[np.isfinite(values).all(axis=1)]
         v_world, bias = self._motion(table)
@@ -296,18 +296,6 @@ class Stamped:
         except DataError as error:
             raise DataError(f"{rows.path}: its header: {error}") from error
         return StatedCovariances(from_triangle(entries, lower=lower), convention)
-
-    def _stamps(self, rows: Rows, table: Array) -> IntArray:
-        _check_digits(rows, table)
-        if self.unit_ns == NS_PER_S:
-            stamps_ns(rows.path, "time", table[:, 0])  # names a wrong unit
-            return rows.stamps(self.unit_ns)
-        t_ns, unit = rows.stamps(self.unit_ns), probable_unit_of_ns(table[:, 0])
-        if unit is not None:
-            is_tum = unit.startswith("seconds") and rows.width == self._width
-            hint = "; a TUM file has blanks between its columns" if is_tum else ""
-            raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}{hint}")
-        return t_ns
 
     def read(self, path: Path, kind: str | None = None) -> Trajectory:
         """Read a file; ``kind`` describes it in the error where that fails. Raises DataError as :meth:`parse` does."""
@@ -502,24 +490,28 @@ def _is_usual(named: Named, rows: Rows) -> bool:
 
 def _by_name(rows: Rows, named: Named) -> PosesFile:
     table = rows.numbers(rows.width, ", ".join(rows.heading) or POSITIONS_ALONE)
-    t_ns = _stamps_by_name(rows, named, table)
+    if named.nanoseconds is not None:
+        t_ns = rows.stamps(NS_PER_S, named.stamp) + rows.stamps(1, named.nanoseconds)
+    else:
+        t_ns = _stamps(rows, table, named.unit_ns or _unit_ns(table[:, named.stamp]), named.stamp)
     turns = table[:, named.quaternion] if named.quaternion else np.tile([0.0, 0.0, 0.0, 1.0], (len(table), 1))
     kind = "columns by name" if named.quaternion else "positions alone"
     file = _stamped_poses(rows, t_ns, np.hstack([table[:, named.position], turns]), kind)
     return replace(file, other_order=_MISNAMED) if named.quaternion else file
 
 
-def _stamps_by_name(rows: Rows, named: Named, table: Array) -> IntArray:
-    def column(at: int, unit_ns: int) -> IntArray:
-        return replace(rows, cells=[[cells[at]] for cells in rows.cells]).stamps(unit_ns)
-
-    if named.nanoseconds is not None:
-        return column(named.stamp, NS_PER_S) + column(named.nanoseconds, 1)
-    _check_digits(rows, table, named.stamp)
-    unit_ns = _unit_ns(table[:, named.stamp]) if named.unit_ns is None else named.unit_ns
+def _stamps(rows: Rows, table: Array, unit_ns: int, at: int = 0) -> IntArray:
+    """Return the stamps of rows (N,) ns; raises DataError naming a wrong unit, or stamps of too few digits."""
+    _check_digits(rows, table, at)
     if unit_ns == NS_PER_S:
-        stamps_ns(rows.path, "time", table[:, named.stamp])
-    return column(named.stamp, unit_ns)
+        stamps_ns(rows.path, "time", table[:, at])  # names a wrong unit
+    t_ns = rows.stamps(unit_ns, at)
+    unit = probable_unit_of_ns(table[:, at]) if unit_ns == 1 else None
+    if unit is not None:
+        is_tum = unit.startswith("seconds") and rows.commas and rows.width == 1 + len(tum.order)
+        hint = "; a TUM file has blanks between its columns" if is_tum else ""
+        raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}{hint}")
+    return t_ns
 
 
 def _unit_ns(stamps: Array) -> int:
