@@ -82,12 +82,8 @@ def _imu_around(frames_t_ns: IntArray) -> ImuSamples:
 
 
 def _imu_noise() -> ImuNoise:
-    """Read the sigmas shipped beside the samples, which are continuous densities.
-
-    The scatter of the samples (robust, second differences) is a density of 0.0018-0.0033 m/s^2/sqrt(Hz) and
-    0.4e-4-1.6e-4 rad/s/sqrt(Hz) over the three axes. The stated 0.01 and 1.75e-4 lie above it, as densities should
-    that also cover vibration and scale errors; read as sigmas of one 10 ms sample they would be densities of 0.001 and
-    0.175e-4, below what the samples themselves show.
+    """Read the sigmas shipped beside the samples: continuous densities, for as those of one 10 ms sample they would lie
+    below what the samples' second differences show (0.0018-0.0033 m/s^2/sqrt(Hz), 0.4e-4-1.6e-4 rad/s/sqrt(Hz)).
     """
     header, values = _path("KittiEquivBiasedImu_metadata").read_text(encoding="ascii").splitlines()[:2]
     stated: Mapping[str, float] = dict(zip(header.split(), map(float, values.split()), strict=True))

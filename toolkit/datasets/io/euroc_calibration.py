@@ -5,12 +5,8 @@ Cameras are stated by Kalibr's names or EuRoC's.
 Where tracks are simulated camera 1 serves for the baseline only: that pair is rectified, with the left camera as it is
 mounted. Real images are rectified with both cameras.
 
-The stated white noise is that of the sensor at rest. In flight, integrated over the 50 ms between frames and compared
-with the truth that the tracks are simulated on, rotation and velocity scatter as densities of 1.5 to 2.8 times (gyro)
-and 3 to 9 times (accelerometer) the stated ones on V1_01_easy and V2_01_easy: rotor vibration, scale and axis errors,
-and the error of the truth. With the stated noise the smoother ends 0.14 m off on V2_01_easy, and the pose NEES of a
-filter on V1_01_easy is 25. So every recording's white densities are multiplied by the same two numbers, near the upper
-ends of those ranges; the walks stay as stated. A simulated IMU errs as it states.
+The stated white noise is that of the sensor at rest: in flight every recording's white densities are multiplied by the
+same two numbers (docs/images.md). A simulated IMU errs as it states.
 """
 
 from collections.abc import Iterator
