@@ -9,7 +9,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from toolkit.files.documents import number, reader, rounded
 from toolkit.geometry import Array
 from toolkit.noise import Card
-from toolkit.report.comparison_table import sequence_line
+from toolkit.report.comparison_table import sequence_line, tracks_measured
 from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, filled
 from toolkit.sequence import Sequence
 
@@ -87,12 +87,9 @@ def _noise(card: Card) -> str:
             f"errors of a track are white (correlation from frame to frame {lags} in column, disparity and row): what "
             "every estimator assumes, so that a smoother, which uses more data, should be the most accurate"
         )
-    covered = "the stated noise is large enough to cover that, and every sighting counts in full"
-    if weight.value < 1.0:
-        covered = f"a sighting counts for {weight.value:.2g} +- {weight.error:.1g} of its stated information"
     return (
-        f"errors of a track are correlated, {weight.correlation:.2f} from frame to frame ({lags} in column, disparity "
-        f"and row), with {weight.variance:.2g} times the stated variance: {covered} (noise.track_weight)"
+        f"sightings: {tracks_measured(weight)}; in column, disparity and row {lags}, with {weight.variance:.2g} times "
+        "the stated variance (noise.track_weight)"
     )
 
 

@@ -181,7 +181,7 @@ def noise_line(comparison: Comparison) -> str:
     rig, settings, measured = comparison.sequence.rig, comparison.settings.noise, comparison.measured
     tracks = motion = ""
     if measured is not None:
-        tracks, scale = _tracks_measured(measured.tracks), measured.motion
+        tracks, scale = tracks_measured(measured.tracks), measured.motion
         times = f"{scale.value:.2g} +- {scale.error:.1g} times as noisy as stated"
         motion = "as stated" if scale.value == 1.0 else times
     if settings.track_weight != "auto":
@@ -200,7 +200,8 @@ def noise_line(comparison: Comparison) -> str:
     return f"{line}; measured on the {basis}"
 
 
-def _tracks_measured(weight: TrackWeight) -> str:
+def tracks_measured(weight: TrackWeight) -> str:
+    """Return in words how correlated the errors of a track are, and what a sighting counts for then."""
     if not weight.correlation:
         return "white along tracks"
     along = f"errors along tracks correlated, {weight.correlation:.2f} from frame to frame"
