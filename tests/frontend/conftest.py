@@ -15,8 +15,7 @@ import pytest
 from toolkit.frontend import Camera, RectifiedPair, already_rectified, rectified
 from toolkit.frontend.cameras import Image
 from toolkit.geometry import Array, se3, so3_exp
-from toolkit.simulation.renderer import Eye, light
-from toolkit.simulation.surfaces import Panel
+from toolkit.simulation.renderer import Eye, Panel, light
 
 SIZE = (320, 240)
 BASELINE_M = 0.12

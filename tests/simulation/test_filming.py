@@ -17,8 +17,7 @@ from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
 from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
 from toolkit.simulation.filming import Filming, errors_px, film
-from toolkit.simulation.renderer import Eye, Floats, light
-from toolkit.simulation.surfaces import Panel, furnished_hall
+from toolkit.simulation.renderer import Eye, Floats, Panel, furnished_hall, light
 
 SHORT = replace(FLIGHT, duration_s=0.2)
 FRAMES = 5

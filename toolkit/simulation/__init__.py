@@ -2,7 +2,7 @@
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
 ``trajectory`` (B-splines) and ``sensors`` (visibility, tracks and noise). ``faults`` plants faults in a recording.
-``filming`` renders images instead of tracks, with ``surfaces`` (the visible world) and ``renderer``, and measures the
+``filming`` renders images instead of tracks, with ``renderer`` (which has the visible world), and measures the
 errors of tracks made of them.
 """
 

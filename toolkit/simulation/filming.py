@@ -30,10 +30,9 @@ from toolkit.motion_samples import ImuSamples
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
-from toolkit.simulation.renderer import Eye, SensorNoise, exposed, light
+from toolkit.simulation.renderer import Eye, Floats, SensorNoise, Surfaces, atlas, exposed, furnished_hall, light
 from toolkit.simulation.scenarios import START_NS, Scenario, simulate
 from toolkit.simulation.sensors import Imu
-from toolkit.simulation.surfaces import Floats, Surfaces, atlas, furnished_hall
 from toolkit.simulation.trajectory import SmoothTrajectory
 
 # The file that marks a folder in the layout of real recordings as simulated, and says what was simulated.

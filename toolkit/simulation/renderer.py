@@ -1,23 +1,270 @@
-"""Images of textured planes by a camera with or without distortion, and the noise of its sensor.
+"""The textured planes of the hall of `flight`, their images by a camera, and the noise of its sensor.
 
-Each pixel's ray is intersected with every plane and the nearest one is visible, so that positions, disparities and
-occlusions are exact: a plane's inverse depth is linear in the ray (x, y, 1), and the largest is the nearest.
+Walls and furniture belong to the scenario like the landmarks and are the same under every seed. Textures are periodic
+and kept at every halving of their resolution, so that a distant plane does not flicker (Williams, "Pyramidal
+parametrics", 1983). Each pixel's ray is intersected with every plane and the nearest one is visible, so that positions,
+disparities and occlusions are exact: a plane's inverse depth is linear in the ray (x, y, 1), and the largest is the
+nearest.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from toolkit.frontend.cameras import Camera
-from toolkit.geometry import Array, IntArray, se3_inverse, transform
-from toolkit.simulation.surfaces import LEVELS, TEXEL_M, TEXELS, Atlas, Floats, Grey, Panel, atlas
+from toolkit.geometry import Array, IntArray, about_z, se3, se3_inverse, transform
+from toolkit.simulation.scenes import HALL_LOWER_M, HALL_UPPER_M
 
+Grey = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float32]
+TEXEL_M = 0.004
+
+_WORLD_SEED = 21  # draws textures and furniture, the same for every seed of the scenario
+TEXELS, LEVELS = 2048, 7
+# Prints on each texture: plain walls, busy posters and boxes.
+_PRINTS = (130, 350, 900)
+_TEXTURES, _WALL_TEXTURES = len(_PRINTS), 2
+_FRAME = 4
+# Nothing stands where the camera flies: it keeps within 2.1 m of the middle, and above 1.4 m.
+_FLOWN_M, _LOWEST_M = 2.5, 1.2
+_POSTERS, _CRATES, _LAMPS = 44, 16, 8
+# Brightness of the faces of a box, by the direction they face: x, y, z and their opposites.
+_SHADES = (0.95, 0.85, 1.0, 0.8, 0.9, 0.7)
 _NEAREST_M = 0.05
 _NEARNESS_OF_NOTHING = 1e-6
 # The optics' own blur, as a Gaussian (px).
 _OPTICS_PX = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A textured rectangle, seen from the side its z-axis points to.
+
+    ``T_world_panel`` (4, 4) has its origin in a corner and the x and y axes along the edges; ``texture`` is the number
+    of its texture, ``offset_m`` (2,) the position of the corner in the texture, and ``shade`` multiplies its grey
+    values.
+    """
+
+    T_world_panel: Array
+    size_m: tuple[float, float]
+    texture: int
+    offset_m: tuple[float, float]
+    shade: float = 1.0
+
+    @property
+    def corners(self) -> Array:
+        """Return its corners (4, 3) in the world, in order around it."""
+        width, height = self.size_m
+        local = np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [width, height, 0.0], [0.0, height, 0.0]])
+        return np.asarray(local @ self.T_world_panel[:3, :3].T + self.T_world_panel[:3, 3])
+
+    def moved(self, T_world_body: Array) -> "Panel":
+        """Return the panel of a body at a pose (4, 4); this panel's own pose is relative to the body."""
+        return replace(self, T_world_panel=T_world_body @ self.T_world_panel)
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The visible world: fixed panels, and the panels of moving bodies at any time (s)."""
+
+    standing: tuple[Panel, ...]
+    moving: Callable[[float], tuple[Panel, ...]] | None = None
+
+    def at(self, t_s: float) -> tuple[Panel, ...]:
+        """Return all panels at a time."""
+        return self.standing if self.moving is None else self.standing + self.moving(t_s)
+
+
+def furnished_hall(moving: int = 0) -> Surfaces:
+    """Return the hall of `flight`: walls, posters up to 0.3 m before them, pillars, crates, lamps.
+
+    ``moving`` crates fly circles between the camera and the walls, at walking pace.
+    """
+    rng = np.random.default_rng(_WORLD_SEED)
+    standing = (*_walls(rng), *_posters(rng), *_pillars(rng), *_crates(rng), *_lamps(rng))
+    return Surfaces(standing, _circling(moving, rng) if moving else None)
+
+
+# The furniture ------------------------------------------------------------------------------------------------------
+
+
+def _walls(rng: np.random.Generator) -> Iterator[Panel]:
+    """Yield the six faces of the hall, seen from inside."""
+    for axis in range(3):
+        for far in (False, True):
+            wall = _on_wall(axis, far, HALL_LOWER_M, HALL_UPPER_M - HALL_LOWER_M, rng)
+            yield replace(wall, texture=axis % _WALL_TEXTURES)
+
+
+def _on_wall(axis: int, far: bool, corner_m: Array, size_m: Array, rng: np.random.Generator) -> Panel:
+    """Return a panel on the face of a box that is crossed by an axis, the near or the far one, looking inwards.
+
+    The box is given by its lower corner (3,) and its size (3,).
+    """
+    inwards = -1.0 if far else 1.0
+    z = inwards * np.eye(3)[axis]
+    x, y = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+    edges_m = float(size_m[(axis + 1) % 3]), float(size_m[(axis + 2) % 3])
+    origin = corner_m + far * size_m * np.eye(3)[axis]
+    if far:  # x, y and z stay right-handed
+        x, y, edges_m = y, x, edges_m[::-1]
+    shade = _SHADES[axis] if inwards > 0.0 else _SHADES[3 + axis]
+    return _painted(se3(np.stack([x, y, z], axis=1), origin), edges_m, shade, rng)
+
+
+def _painted(T_world_panel: Array, size_m: tuple[float, float], shade: float, rng: np.random.Generator) -> Panel:
+    offset_m = rng.uniform(0.0, TEXELS * TEXEL_M, 2).tolist()
+    return Panel(T_world_panel, size_m, int(rng.integers(_TEXTURES)), (offset_m[0], offset_m[1]), shade)
+
+
+def _posters(rng: np.random.Generator) -> Iterator[Panel]:
+    """Yield rectangles parallel to the walls and up to 0.3 m before them, as the landmarks of the scene are."""
+    size_m = HALL_UPPER_M - HALL_LOWER_M
+    for i in range(_POSTERS):
+        axis, far = i % 3, bool(i // 3 % 2)
+        edges_m = rng.uniform(0.5, 1.5, 3)
+        corner_m = HALL_LOWER_M + rng.uniform(size=3) * (size_m - edges_m)
+        proud_m = rng.uniform(0.03, 0.3)
+        edges_m[axis] = 0.0
+        corner_m[axis] = HALL_UPPER_M[axis] - proud_m if far else HALL_LOWER_M[axis] + proud_m
+        yield _on_wall(axis, far, corner_m, edges_m, rng)
+
+
+def box(size_m: Array, rng: np.random.Generator) -> tuple[Panel, ...]:
+    """Return the six faces of a box of some size (3,) about the origin, seen from outside."""
+    faces = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            z, x = sign * np.eye(3)[axis], np.eye(3)[(axis + 1) % 3]
+            y = np.cross(z, x)
+            edges_m = float(size_m[(axis + 1) % 3]), float(size_m[(axis + 2) % 3])
+            origin = 0.5 * (z * size_m[axis] - x * edges_m[0] - y * edges_m[1])
+            shade = _SHADES[axis if sign > 0.0 else 3 + axis]
+            faces.append(_painted(se3(np.stack([x, y, z], axis=1), origin), edges_m, shade, rng))
+    return tuple(faces)
+
+
+def _standing(size_m: Array, centre_m: Array, yaw_rad: float, rng: np.random.Generator) -> Iterator[Panel]:
+    pose = se3(about_z(yaw_rad), centre_m)
+    return (face.moved(pose) for face in box(size_m, rng))
+
+
+def _pillars(rng: np.random.Generator) -> Iterator[Panel]:
+    height_m = HALL_UPPER_M[2]
+    for x, y in ((3.6, 3.4), (-3.5, 3.7), (-3.7, -3.3), (3.4, -3.6)):
+        yield from _standing(np.array([0.45, 0.45, height_m]), np.array([x, y, 0.5 * height_m]), 0.0, rng)
+
+
+def _crates(rng: np.random.Generator) -> Iterator[Panel]:
+    """Yield crates on the floor; those where the camera flies are low enough to be flown over."""
+    for _ in range(_CRATES):
+        place_m = rng.uniform(-4.2, 4.2, 2)
+        below = np.abs(place_m).max() < _FLOWN_M + 0.7
+        size_m = np.append(rng.uniform(0.4, 0.9, 2), rng.uniform(0.3, 0.7 if below else 1.6))
+        yield from _standing(size_m, np.append(place_m, 0.5 * size_m[2]), float(rng.uniform(0.0, np.pi)), rng)
+
+
+def _lamps(rng: np.random.Generator) -> Iterator[Panel]:
+    """Yield boxes that hang from the ceiling, above where the camera flies."""
+    for _ in range(_LAMPS):
+        size_m = np.append(rng.uniform(0.3, 0.9, 2), rng.uniform(0.1, 0.3))
+        place_m = np.append(rng.uniform(-4.0, 4.0, 2), rng.uniform(3.7, 4.1))
+        yield from _standing(size_m, place_m, float(rng.uniform(0.0, np.pi)), rng)
+
+
+def _circling(count: int, rng: np.random.Generator) -> Callable[[float], tuple[Panel, ...]]:
+    """Return crates that circle around the middle of the hall, beyond where the camera flies, and turn as they go."""
+    bodies = [box(rng.uniform(0.4, 0.8, 3), rng) for _ in range(count)]
+    phase = rng.uniform(0.0, 2.0 * np.pi, count)
+    radius_m, height_m = rng.uniform(3.3, 4.3, count), rng.uniform(_LOWEST_M, 3.2, count)
+    turn_radps = rng.choice([-1.0, 1.0], count) * rng.uniform(0.6, 1.4, count) / radius_m
+
+    def panels(t_s: float) -> tuple[Panel, ...]:
+        angle = phase + turn_radps * t_s
+        places = np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), height_m], axis=1)
+        return tuple(
+            face.moved(se3(about_z(float(2.0 * a)), place))
+            for body, a, place in zip(bodies, angle, places, strict=True)
+            for face in body
+        )
+
+    return panels
+
+
+# The textures -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """All textures at all levels in one image: textures side by side, and of each the halved ones below each other.
+
+    ``first_column`` (textures,) and ``first_row`` (levels,) say where an image begins; its first rows and columns are
+    repeated after the last ones, so that interpolation needs no special case at the border.
+    """
+
+    image: Grey
+    first_column: Floats
+    first_row: Floats
+
+
+@lru_cache(maxsize=1)
+def atlas() -> Atlas:
+    """Return the textures; a texel of the finest level is ``TEXEL_M`` wide. Made once in a process."""
+    columns = [_column(_texture(i, np.random.default_rng([_WORLD_SEED, i]))) for i in range(_TEXTURES)]
+    heights = [(TEXELS >> level) + _FRAME for level in range(LEVELS)]
+    width = TEXELS + _FRAME
+    first_row = np.concatenate([[0.0], np.cumsum(heights)[:-1]]).astype(np.float32)
+    return Atlas(np.hstack(columns), (width * np.arange(_TEXTURES)).astype(np.float32), first_row)
+
+
+def _column(image: Grey) -> Grey:
+    """Return the levels of a texture below each other, each padded periodically."""
+    import cv2
+
+    column = np.zeros((sum((TEXELS >> level) + _FRAME for level in range(LEVELS)), TEXELS + _FRAME), np.uint8)
+    row = 0
+    for level in range(LEVELS):
+        size = TEXELS >> level
+        halved = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+        column[row : row + size + _FRAME, : size + _FRAME] = np.pad(halved, ((0, _FRAME), (0, _FRAME)), mode="wrap")
+        row += size + _FRAME
+    return column
+
+
+def _texture(which: int, rng: np.random.Generator) -> Grey:
+    """Return a periodic image: plaster with prints of many greys and sizes over it, more for higher numbers."""
+    import cv2
+
+    image = (125.0 + 20.0 * _clouds(rng, 1.3)).astype(np.float32)
+    for size in np.geomspace(350.0, 12.0, _PRINTS[which]):
+        middle, angle = rng.uniform(0.0, TEXELS, 2), rng.choice([0.0, rng.uniform(0.0, np.pi)])
+        half = 0.5 * size * rng.uniform(0.4, 1.0, 2)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        outline = middle + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
+        grey = float(rng.uniform(35.0, 215.0))
+        for shift in np.ndindex(3, 3):  # also across the borders, because the image is periodic
+            place = outline + TEXELS * (np.array(shift) - 1)
+            if (place.max(axis=0) >= 0.0).all() and (place.min(axis=0) < TEXELS).all():
+                cv2.fillPoly(image, [np.rint(place).astype(np.int32)], grey)
+    image += (10.0 * _clouds(rng, 0.9)).astype(np.float32)
+    smooth = cv2.GaussianBlur(np.pad(image, _FRAME, mode="wrap"), (0, 0), 0.8)[_FRAME:-_FRAME, _FRAME:-_FRAME]
+    return np.clip(np.rint(smooth), 5, 250).astype(np.uint8)
+
+
+def _clouds(rng: np.random.Generator, roughness: float) -> Array:
+    """Return a periodic noise whose amplitude falls with the frequency to the power of the roughness; mean 0, sd 1."""
+    size = TEXELS // 2
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((size, size))) / np.maximum(frequency, 4e-3) ** roughness
+    clouds = np.fft.irfft2(spectrum, s=(size, size))
+    return np.tile(clouds / clouds.std(), (2, 2))
+
+
+# The images ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
