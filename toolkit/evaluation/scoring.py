@@ -34,7 +34,6 @@ from toolkit.metrics import (
     clock_offset,
     coverage,
     drift,
-    kitti,
     nees,
     rpe,
     uncertainty,
@@ -77,7 +76,6 @@ _NEES_KEYS = (*nees.OF_POSE, *(metric.key for metric in uncertainty.METRICS))
 METRICS: tuple[Metric, ...] = (
     *ate.METRICS,
     *rpe.METRICS,
-    *kitti.METRICS,
     *drift.METRICS,
     *clock_offset.METRICS,
     *(metric for metric in nees.METRICS if metric.key in _NEES_KEYS),
@@ -346,7 +344,7 @@ def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile,
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
     scores = Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)})
     with np.errstate(all="ignore"):  # a value that is not finite becomes None, with that as its reason
-        for metrics in (ate, rpe, kitti, drift, clock_offset):
+        for metrics in (ate, rpe, drift, clock_offset):
             scores |= Scores.attempt(metrics.METRICS, partial(metrics.score, pairs))
         return scores | _nees_scores(file, estimate, truth, level=terms.level)
 

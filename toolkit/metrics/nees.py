@@ -10,13 +10,17 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.metrics.parts.consistency import (
+    NO_SUCH_BLOCK,
     PLACED,
     POSE_DOF,
     UNCOUPLED,
     StatedErrors,
+    bias_errors,
+    layout_of,
     nees_band,
     nees_of,
     stated_errors,
+    velocity_errors,
 )
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
@@ -101,9 +105,6 @@ def of_stated(stated: StatedErrors) -> Scores:
 
 def _of_state(evaluation: Evaluation) -> Scores:
     """Score the stated covariances of velocity and biases against the truth."""
-    # With GTSAM, which the evaluation of trajectory files does without.
-    from toolkit.metrics.parts.state_errors import NO_SUCH_BLOCK, bias_errors, layout_of, velocity_errors
-
     stated = stated_errors(evaluation)
     layout = layout_of(stated)
 

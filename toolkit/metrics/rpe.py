@@ -1,6 +1,9 @@
-"""Relative pose error over one second and over 100 metres: drift, independent of earlier errors.
+"""Relative pose error over one second and over 100 metres, and KITTI's drift: independent of earlier errors.
 
-Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3. Geiger, Lenz and Urtasun,
+"Are we ready for autonomous driving?" (CVPR 2012), as its development kit computes them: segments start at every tenth
+pose, end at the first pose whose distance along the truth exceeds the length, and their errors are divided by the
+nominal length; the mean is over all segments of all lengths.
 """
 
 from functools import cache
@@ -23,7 +26,7 @@ from toolkit.metrics.parts.against_truth import (
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 20
-METRICS = (
+RPE = (
     Metric("rpe_1s_m", "RMSE of the translation error over 1 s (m)", "m", ("RPE", "1 s")),
     Metric("rpe_1s_deg", "RMSE of the rotation error over 1 s (deg)", "deg", ("RPE rot", "1 s")),
     Metric(
@@ -34,7 +37,18 @@ METRICS = (
         table="always",
     ),
 )
+KITTI = (
+    Metric(
+        "kitti_t_percent", "mean translation error over segments of 100 ... 800 m (percent)", "%", ("KITTI", "trans")
+    ),
+    Metric(
+        "kitti_r_deg_per_m", "mean rotation error over segments of 100 ... 800 m (deg/m)", "deg/m", ("KITTI", "rot")
+    ),
+)
+METRICS = RPE + KITTI
 INTERVAL_M = 100.0
+SEGMENT_LENGTHS_M = np.arange(100.0, 801.0, 100.0)
+START_EVERY = 10
 # A pair may exceed the interval by this much; a longer one spans a gap and is left out: 1.5 steps of the matched stamps
 # for one second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as in evo).
 _LATEST_IN_STEPS = 1.5
@@ -49,15 +63,30 @@ class _Intervals(NamedTuple):
 
 
 def score(evaluation: AgainstTruth) -> Scores:
-    """Score drift over one second and over 100 m."""
+    """Score drift over one second and over 100 m, and KITTI's."""
     errors_of_a_second = cache(lambda: _errors_of_a_second(evaluation))
-    return evaluate(
+    rpe = evaluate(
         {
             "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
             "rpe_1s_deg": lambda: rmse(angles_deg(errors_of_a_second()[:, :3, :3])),
             "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.oriented),
         }
     )
+    return rpe | Scores.attempt(KITTI, lambda: _kitti(evaluation.oriented))
+
+
+def _kitti(matched: Matched) -> Scores:
+    starts = np.arange(0, len(matched), START_EVERY)
+    first, length_m = (grid.ravel() for grid in np.meshgrid(starts, SEGMENT_LENGTHS_M, indexing="ij"))
+    last = np.searchsorted(matched.path_m, matched.path_m[first] + length_m, side="right")
+    complete = last < len(matched)
+    if not complete.any():
+        raise Unavailable(f"the matched path, {matched.path_m[-1] - matched.path_m[0]:.1f} m, has no segment of 100 m")
+    errors = relative_errors(matched, first[complete], last[complete])
+    t_per_m, r_deg_per_m = (
+        of(part) / length_m[complete] for of, part in ((lengths, errors[:, :3, 3]), (angles_deg, errors[:, :3, :3]))
+    )
+    return Scores({"kitti_t_percent": 100.0 * float(t_per_m.mean()), "kitti_r_deg_per_m": float(r_deg_per_m.mean())})
 
 
 def hundred_metres_percent(matched: Matched) -> float:
