@@ -26,7 +26,15 @@ import numpy as np
 
 from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import InverseDepthBelief
-from filters.kalman.joint import AtFirstEstimates, JointBelief, Linearisation, linearisation, propagate
+from filters.kalman.joint import (
+    AtFirstEstimates,
+    JointBelief,
+    Linearisation,
+    forget,
+    forget_lost,
+    linearisation,
+    propagate,
+)
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
@@ -105,8 +113,8 @@ class JointEkf:
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone()
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
-        joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
+        forget_lost(self._joint, packet.frame, self._memory)
+        forget(self._joint, self._at.outdated(self._joint), self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)
         self._joint.forget_clones(1)

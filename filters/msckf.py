@@ -13,8 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from filters.kalman import joint_landmarks
-from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, Linearisation, forget_lost, propagate
 from filters.kalman.online_output import LandmarkMemory, OnlineOutput
 from filters.kalman.thinning import Thinned
 from filters.kalman.tracks import (
@@ -85,7 +84,7 @@ class Msckf:
         self._joint.clone()
         self._clone_t_ns.append(frame.t_ns)
         gate = FrameGate(outliers.gate_probability, outliers.joint_huber, self._rig.track_weight)
-        joint_landmarks.forget_lost(self._joint, frame, self._memory)
+        forget_lost(self._joint, frame, self._memory)
         correct_by_landmarks(self._joint, frame, self._at, self._rig, gate)
         self._tracks.add_frame(self._without_landmarks(frame))
         leaving = bisect_left(self._clone_t_ns, frame.t_ns - self._lag_ns)

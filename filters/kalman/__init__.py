@@ -2,7 +2,7 @@
 
 Decoupled filters: ``landmark_map`` (one small Gaussian a landmark, and its correction). Joint filters:
 ``joint`` (the belief, its covariance, where it is linearised), ``joint_landmarks``, and ``coordinates``, the other
-errors of ekf-slam, riekf and iekf; ``tracks`` for the MSCKFs, with what is compiled of them in
+errors of ekf-slam, riekf, iekf and of anchored landmarks; ``tracks`` for the MSCKFs, with what is compiled of them in
 ``kernels``. ``online_output`` makes an estimator of each; ``thinning`` gives one with a window, filter or smoother, no
 more frames than the window may hold.
 """

@@ -17,9 +17,11 @@ import numpy as np
 from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
 
+from filters.kalman.online_output import LandmarkMemory
+from toolkit.arrays import is_among
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
-from toolkit.measurements import Motion
+from toolkit.measurements import Motion, StereoFrame
 from toolkit.models.state import POSE, Belief, Increment, Prediction, Predictor
 from toolkit.settings.records import Scalar
 
@@ -266,6 +268,19 @@ def propagate(joint: JointBelief, model: Predictor, at: Linearisation, motion: M
     increment = model.integrate(motion, core.bias)
     prediction = increment.predict(core)
     joint.propagate(prediction, at.transition(joint, increment, prediction))
+
+
+def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
+    """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last estimates."""
+    if len(joint.landmark_ids):
+        forget(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
+
+
+def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
+    """Marginalise landmarks (L,) of the state; the memory keeps their last estimates."""
+    if which.any():
+        memory.remember(joint.landmark_ids[which], joint.points[which])
+        joint.forget_landmarks(which)
 
 
 def cholesky_root(cov: Array) -> Array:

@@ -9,9 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from filters.kalman.joint import JointBelief, Linearisation
-from filters.kalman.online_output import LandmarkMemory
-from toolkit.arrays import is_among
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import FrameGate, mahalanobis_squared
@@ -50,19 +48,6 @@ class StackedSightings(NamedTuple):
         places = np.repeat(self.own[rows], 3, axis=0)
         H = csr_array((values.ravel(), places.ravel(), np.arange(0, values.size + 1, 9)), (3 * len(rows), self.k))
         return H, (roots[:, None] * self.residuals[rows]).reshape(-1)
-
-
-def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
-    """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last estimates."""
-    if len(joint.landmark_ids):
-        forget(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
-
-
-def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
-    """Marginalise landmarks (L,) of the state; the memory keeps their last estimates."""
-    if which.any():
-        memory.remember(joint.landmark_ids[which], joint.points[which])
-        joint.forget_landmarks(which)
 
 
 def correct(

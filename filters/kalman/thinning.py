@@ -24,6 +24,7 @@ class Thinned:
         self._motion = setup.motion
         self._prior = self._motion.initial_belief(setup.prior)
         self._kept_ns: list[int] = []
+        self._kept_interval = 0
         self._left_out: list[tuple[int, int, Motion]] = []
         self._since: Motion | None = None
         self._newest: Estimate | None = None
@@ -32,14 +33,15 @@ class Thinned:
         """Take in one packet and return the state at its frame."""
         t_ns = packet.frame.t_ns
         self._since = _concatenated(self._since, packet.motion)
-        if self._newest is not None and self._interval(t_ns) == self._interval(self._kept_ns[-1]):
+        interval = self._window.interval(t_ns - (self._kept_ns or [t_ns])[0], self._motion_kind)
+        if self._newest is not None and interval == self._kept_interval:
             assert self._since is not None
             self._left_out.append((len(self._kept_ns) - 1, t_ns, self._since))
             return self._carried(self._newest, t_ns, self._since)
         answer = self._estimator.step(Packet(len(self._kept_ns), self._since, packet.frame))
         assert answer is not None
         self._kept_ns.append(t_ns)
-        self._newest, self._since = answer, None
+        self._kept_interval, self._newest, self._since = interval, answer, None
         return answer
 
     def finish(self) -> Finished:
@@ -50,9 +52,6 @@ class Thinned:
         states = finished.trajectory.states()
         carried = [self._carried(states[k], t_ns, motion) for k, t_ns, motion in self._left_out]
         return replace(finished, trajectory=Trajectory.of(sorted([*states, *carried], key=lambda state: state.t_ns)))
-
-    def _interval(self, t_ns: int) -> int:
-        return self._window.interval(t_ns - self._kept_ns[0], self._motion_kind)
 
     def _carried(self, state: Estimate, t_ns: int, motion: Motion) -> Estimate:
         answer = predicted(self._prior.at(state), self._motion, motion).estimate(t_ns)

@@ -12,9 +12,8 @@ import gtsam
 import numpy as np
 
 from filters.ekf_slam import JointEkf
-from filters.kalman import joint_landmarks
 from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
-from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
+from filters.kalman.joint import AtLatestEstimates, JointBelief, forget_lost, propagate
 from filters.kalman.online_output import LandmarkMemory
 from toolkit import runner
 from toolkit.estimate import Estimate
@@ -191,7 +190,7 @@ def carried(
         ekf.step(packet)
     joint, frame = ekf.joint, packets[6].frame
     propagate(joint, motion_model(sequence.noise, sequence.gravity_world), at, packets[6].motion)
-    joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
+    forget_lost(joint, frame, LandmarkMemory())
     assert len(joint.landmark_ids) > 5
     return joint, frame, sequence.rig
 
