@@ -8,6 +8,7 @@ adds and what is measured. A constant factor on all covariances changes nothing 
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,7 +29,7 @@ _ALIKE = 1.5
 # rightly none had another in which they change less by more than 0.2 % (docs/conventions.md).
 _STEADIER = 1.25
 # The change is the median over so many poses, spread over the file.
-_MOST_POSES = 1000
+_FEWEST_POSES, _MOST_POSES = 10, 1000
 # In these a covariance that is the same in each line, whatever it means, does not change at all.
 _STATIC = frozenset(name for name, convention in CONVENTIONS.items() if convention.perturbation == "left")
 
@@ -52,20 +53,23 @@ def change_under_each(stated: StatedCovariances, T_world_imu: Array) -> Mapping[
     """Return by how much covariances (N, d, d) at poses (N, 4, 4) change from pose to pose under each convention.
 
     That is the median distance of a pose's to the one carried on from the pose before, the root of the sum of ln^2 of
-    their generalised eigenvalues (Foerstner & Moonen, "A metric for covariance matrices", 1999). Empty where less than
-    two poses in succession state the whole covariance.
+    their generalised eigenvalues (Foerstner & Moonen, "A metric for covariance matrices", 1999). Empty where few poses
+    in succession state the whole covariance, and one that is positive definite.
     """
     whole = np.asarray(np.isfinite(stated.values[:, :6, :6]).all(axis=(1, 2)))
     pairs = np.flatnonzero(whole[:-1] & whole[1:])
-    if not pairs.size:
-        return {}
     pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, min(pairs.size, _MOST_POSES)).astype(int))]
-    onward = se3_adjoint(se3_inverse(T_world_imu[pairs + 1]) @ T_world_imu[pairs])
+    own = stated.values[np.stack([pairs, pairs + 1]), :6, :6]
+    definite = (np.linalg.eigvalsh(own)[..., 0] > 0.0).all(axis=0)
+    if definite.sum() < _FEWEST_POSES:
+        return {}
+    before, after = (replace(stated, values=values[definite]) for values in own)
+    T_world_before, T_world_after = T_world_imu[pairs[definite]], T_world_imu[pairs[definite] + 1]
+    onward = se3_adjoint(se3_inverse(T_world_after) @ T_world_before)
     found = {}
     for name, convention in CONVENTIONS.items():
-        cov = stated.read_as(convention, T_world_imu)[:, :6, :6]
-        carried = onward @ cov[pairs] @ transposed(onward)
-        ratios = np.abs(np.linalg.eigvals(np.linalg.solve(carried, cov[pairs + 1])))
+        carried = onward @ before.read_as(convention, T_world_before) @ transposed(onward)
+        ratios = np.abs(np.linalg.eigvals(np.linalg.solve(carried, after.read_as(convention, T_world_after))))
         found[name] = float(np.median(np.sqrt(np.sum(np.log(ratios) ** 2, axis=1))))
     return found
 
@@ -90,7 +94,7 @@ def likelier_reading(stated: StatedCovariances, T_world_imu: Array, errors: Erro
     fits = under.get(said, np.inf) < (_TIMES if is_near else _TIMES_ANY) * least
     if said in steady or (fits and not steady):
         return ""
-    how = "follow the motion" if fits else "fit the errors"
+    how = "follow the motion" if fits or likely[0] not in fitting else "fit the errors"
     told += f"; change from pose to pose: {_listed(change.items())}" if steady else ""
     return (
         f"the covariances are said to be {said} and {how} only as {' or '.join(likely)}: correct its header or, where "
