@@ -25,18 +25,6 @@ _FAILED: Mapping[Finding, str] = {
     "changed metric": "computed differently",
     "missing": "missing",
 }
-# What a metric that the gate tests is called in a sentence.
-WORDS = {
-    "ate_se3_m": "position error (ATE, SE(3))",
-    "ate_yaw_m": "position error (ATE, yaw)",
-    "ate_sim3_m": "position error (ATE, Sim(3))",
-    "ate_se3_deg": "rotation error (ATE, SE(3))",
-    "rpe_100m_percent": "drift over 100 m",
-    "heldout_reproj_median_px": "held-out reprojection",
-    "nis_mean": "consistency (NIS)",
-    "nees_pose_mean": "consistency (NEES)",
-    "coverage_percent": "coverage",
-}
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
 # A length below this (m) is written in millimetres; a value has at most this many digits.
@@ -109,6 +97,11 @@ def _metric(key: str) -> Metric | None:
     return next((metric for metric in known_metrics() if metric.key == key), None)
 
 
+def _name(key: str) -> str:
+    metric = _metric(key)
+    return key if metric is None else metric.name
+
+
 def _percent(value: float | None, sign: str = "") -> str:
     if value is None:
         return MISSING
@@ -140,7 +133,7 @@ def failure_lines(check: Check) -> Iterator[str]:
 
 def about(verdict: Verdict) -> str:
     """Return what a verdict is about, in words."""
-    what = WORDS.get(verdict.metric, verdict.metric)
+    what = _name(verdict.metric)
     found = _FAILED.get(verdict.finding, "")
     return f"{_of(verdict)}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
 
@@ -177,7 +170,7 @@ def _detected(check: Check) -> Iterator[str]:
     for key in dict.fromkeys(verdict.metric for verdict in tested):
         seen = sorted((v.seen_percent or 0.0, _of(v)) for v in tested if v.metric == key)
         ends = [f"{_percent(percent)} % ({of})" for percent, of in dict.fromkeys((seen[0], seen[-1]))]
-        yield f"{WORDS.get(key, key)} {' to '.join(ends)}"
+        yield f"{_name(key)} {' to '.join(ends)}"
 
 
 def plan_table(plan: Sequence[Planned]) -> Table:

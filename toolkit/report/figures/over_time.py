@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.patches import Patch
 
-from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
@@ -35,7 +34,6 @@ _FAR_FROM_MIDDLE = 10.0
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
 _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _SIGMAS = 3.0
-_ROWS = ("x", "y", "z")
 # An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
 _BAND_ALPHA = 0.16
@@ -127,43 +125,49 @@ def _telling(comparison: Comparison) -> list[str]:
 def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
     rows = [row for row in comparison.lines if row.estimator == name]
     found = [(row, one) for row in rows if (one := components(comparison, row)) is not None]
-    if found:
-        yield _components_figure(comparison, name, found)
-
-
-def _components_figure(comparison: Comparison, name: str, found: list[tuple[Row, Components]]) -> NamedFigure:
-    figure = style.new_figure(4.6)
-    grid = figure.subplots(3, 2, sharex=True)
+    if not found:
+        return
     reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
     what = "error" if reference is None else f"difference from {reference.name}"
-    colour = style.colour_of(comparison, name)
-    for column, block, label in ((0, POSITION, "{} [m]"), (1, ROTATION, "about {} [deg]")):
-        for i, axis in enumerate(_ROWS):
-            axes = grid[i, column]
-            for row, one in found:
-                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, colour, style.shown_as(row))
-            _limit(axes, [one for _, one in found], block.start + i)
-            style.label_axes(axes, "", "time [s]" if i == 2 else "", label.format(axis))
+    figure, colour, entries = style.new_figure(4.6), style.colour_of(comparison, name), []
+    grid = figure.subplots(3, 2, sharex=True)
+    in_order = [*grid[:, 1], *grid[:, 0]]  # rotations first, as in Components
+    for row, one in found:
+        output, t_s = style.shown_as(row), comparison.sequence.elapsed_s(one.t_ns)
+        line, alpha = style.line_of(output), _BAND_ALPHA if output == "final" else 0.0
+        label = "causal = final" if row.label == "both" else row.output
+        for i, axes in enumerate(in_order):
+            if one.sigma is not None:
+                band = _SIGMAS * one.sigma[:, i]
+                axes.fill_between(t_s, -band, band, color=colour, alpha=alpha, linewidth=0.0)
+                axes.plot(t_s, np.stack([-band, band], axis=1), color=colour, linestyle=line, linewidth=0.6)
+            axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
+        entries.append(Entry.of_line(f"{label}: {what.split(maxsplit=1)[0]}", colour, line))
+        if one.sigma is not None:
+            filled = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
+            entries.append(Entry(f"{label}: ± 3 standard deviations", filled))
+    for i, axes in enumerate(in_order):
+        _limit(axes, [one for _, one in found], i)
+        axis = f"about {'xyz'[i]} [deg]" if i < len("xyz") else f"{'xyz'[i - 3]} [m]"
+        style.label_axes(axes, "", "time [s]" if i % 3 == 2 else "", axis)
     nees = [number(value) for row, _ in found if (value := row.value("nees_pose_mean")) is not None]
     stated = f" (mean NEES {', '.join(nees)})" if nees and reference is None else ""
     style.add_title(figure, f"{comparison.name}: {name}{stated}")
-    grid[0, 0].set_title(f"position {what}", fontsize=style.TITLE_PT, loc="left")
-    grid[0, 1].set_title(f"rotation {what}", fontsize=style.TITLE_PT, loc="left")
+    for axes, kind in zip(grid[0], ("position", "rotation"), strict=True):
+        axes.set_title(f"{kind} {what}", fontsize=style.TITLE_PT, loc="left")
     figure.align_ylabels(grid)
-    style.legend_below(figure, _entries(found, what.split(maxsplit=1)[0], colour))
-    caption = _caption(name, reference.name if reference is not None else "", comparison.sequence.truth is not None)
-    return NamedFigure(f"components_{plain_name(name)}", caption, figure)
+    style.legend_below(figure, entries)
+    yield NamedFigure(f"components_{plain_name(name)}", _OF_COMPONENTS[reference is None].format(name, what), figure)
 
 
-def _plot(axes: Axes, t_s: Array, one: Components, i: int, colour: str, shown_as: Output) -> None:
-    line = style.line_of(shown_as)
-    if one.sigma is not None:
-        band = _SIGMAS * one.sigma[:, i]
-        if shown_as == "final":
-            axes.fill_between(t_s, -band, band, color=colour, alpha=_BAND_ALPHA, linewidth=0.0)
-        for side in (-band, band):
-            axes.plot(t_s, side, color=colour, linestyle=line, linewidth=0.6)
-    axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
+_OF_COMPONENTS = {
+    True: "Error of {0} by component along and about the world's axes, z up, as the NEES takes it: where the start is "
+    "not in the truth's world, its first pose is placed on the truth's. The band is three standard deviations that it "
+    "states: a consistent estimator is inside nearly always, and fills it.",
+    False: "There is no truth: {1}, of {0}, by component along and about the world's axes, z up, not aligned. The band "
+    "is three standard deviations that {0} states; a difference far outside it means that one of the two is "
+    "overconfident.",
+}
 
 
 def _limit(axes: Axes, drawn: Collection[Components], i: int) -> None:
@@ -173,34 +177,6 @@ def _limit(axes: Axes, drawn: Collection[Components], i: int) -> None:
     reach = max(error, _LEAST, min(max(bands, default=0.0), _BAND_REACH * max(error, _LEAST)))
     axes.set_ylim(-1.08 * reach, 1.08 * reach)
     axes.axhline(0.0, color=style.ZERO_COLOUR, linewidth=0.8, zorder=1)
-
-
-def _entries(found: list[tuple[Row, Components]], what: str, colour: str) -> list[Entry]:
-    entries = []
-    for row, one in found:
-        name = "causal = final" if row.label == "both" else row.output
-        line = style.line_of(style.shown_as(row))
-        entries.append(Entry.of_line(f"{name}: {what}", colour, line))
-        if one.sigma is not None:
-            alpha = _BAND_ALPHA if style.shown_as(row) == "final" else 0.0
-            band = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
-            entries.append(Entry(f"{name}: ± 3 standard deviations", band))
-    return entries
-
-
-def _caption(name: str, reference: str, has_truth: bool) -> str:
-    axes = "by component along and about the world's axes, z up"
-    if not has_truth:
-        of_whom = f" from {reference}" if reference else ""
-        return (
-            f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "
-            f"deviations that {name} states; a difference far outside it means that one of the two is overconfident."
-        )
-    return (
-        f"Error of {name} {axes}, as the NEES takes it: where the start is not in the truth's world, its first pose is "
-        "placed on the truth's. The band is three standard deviations that it states: a consistent estimator is inside "
-        "nearly always, and fills it."
-    )
 
 
 _OF_BOUND = (
