@@ -9,7 +9,7 @@ The extrinsics are called IMU to camera, and files are about that hold camera to
 A sequence has them as they are called; the audit decides (:mod:`toolkit.audit.conventions`).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from toolkit.datasets.io.fields import (
     rectified_observations,
     stamps_ns,
 )
-from toolkit.datasets.io.image_pairs import seen_in
+from toolkit.datasets.io.image_pairs import pinhole_of, seen_in
 from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
@@ -67,10 +67,13 @@ def load(path: Path) -> Sequence:
     """
     parts = _parts(path)
     features = parts.stored.get(_FEATURES)
-    if not isinstance(features, np.ndarray):
-        nothing = np.empty(0, dtype=np.int64)
-        return _sequence(parts, _rig(parts), Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,))
-    return _sequence(parts, _rig(parts), *_sightings(parts, features))
+    left = parts.K[0]
+    pinhole_px = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
+    rig = StereoRig(*pinhole_px, parts.baseline_m, parts.T_imu_left, pixel_covariance(2))
+    if isinstance(features, np.ndarray):
+        return _sequence(parts, rig, *_sightings(parts, features))
+    nothing = np.empty(0, dtype=np.int64)
+    return _sequence(parts, rig, Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,))
 
 
 def uses_images(path: Path, tracks: Tracks) -> bool:
@@ -94,9 +97,8 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     spool = ImageSpool(str(_beside(path)))
     try:
         pairs, size_px = _spooled(parts, spool, progress)
-        pair = _pair(parts, size_px)
-        T_imu_left = se3_inverse(parts.fields.rigid("extL_T_imu"))
-        seen = seen_in(path, ImageRecording(pairs, pair, spool), T_imu_left, frontend, progress)
+        filmed = ImageRecording(pairs, _pair(parts, size_px), spool)
+        seen = seen_in(path, filmed, parts.T_imu_left, frontend, progress)
     finally:
         spool.close()
     return replace(_sequence(parts, seen.rig, seen.observations, seen.facts), frames_t_ns=seen.frames_t_ns)
@@ -104,12 +106,17 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """What a file holds, its calibration and its stamps (T,)."""
+    """What a file holds: stamps (T,), twists (T, 3), both camera matrices, where the left one stands, the baseline."""
 
     path: Path
     stored: Mapping[str, Any]
-    fields: Fields
     t_ns: IntArray
+    v_mps: Array
+    w_radps: Array
+    K: tuple[Array, ...]
+    T_imu_left: Array
+    baseline_m: float
+    facts: tuple[str, ...]
 
 
 def _parts(path: Path) -> _Parts:
@@ -121,7 +128,23 @@ def _parts(path: Path) -> _Parts:
     fields.require(*_REQUIRED)
     t_ns = stamps_ns(path, "timestamps", fields.vector("timestamps"))
     check_frame_count(path, t_ns.size)
-    return _Parts(path, stored, fields, t_ns)
+    v_mps, w_radps = (fields.array(key, t_ns.size, 3) for key in ("v_t", "w_t"))
+    matrices = (camera_matrix(path, key, fields.constant(key, 3, 3)) for key in ("K_l", "K_r"))
+    left, right = (fields.rigid(key) for key in ("extL_T_imu", "extR_T_imu"))
+    turned_rad = float(np.linalg.norm(so3_log(left[:3, :3].T @ right[:3, :3])))
+    turned = f"{np.rad2deg(turned_rad):.2f} deg"
+    if turned_rad > _MOST_TURNED_RAD:
+        raise DataError(
+            f"{path}: extL_T_imu and extR_T_imu are turned by {turned}, and a rectified pair is not; rectify the "
+            "recording"
+        )
+    # The same number in whatever direction and axes the extrinsics are.
+    baseline_m = float(np.linalg.norm(left[:3, 3] - right[:3, 3]))
+    if not baseline_m > 0.0:
+        raise DataError(f"{path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; correct one")
+    fact = f"the extrinsics of the cameras differ by {turned}; the pair is assumed to be rectified"
+    facts = (fact,) if turned_rad > _TURNED_RAD else ()
+    return _Parts(path, stored, t_ns, v_mps, w_radps, tuple(matrices), se3_inverse(left), baseline_m, facts)
 
 
 def _array(value: Any) -> Any:
@@ -132,53 +155,15 @@ def _array(value: Any) -> Any:
 
 
 def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[str, ...]) -> Sequence:
-    fields, t_ns = parts.fields, parts.t_ns
-    v_mps, w_radps = (fields.array(key, t_ns.size, 3) for key in ("v_t", "w_t"))
     return Sequence(
         name=parts.path.stem,
         rig=rig,
-        noise=twist_noise(t_ns, v_mps, w_radps),
-        frames_t_ns=t_ns,
+        noise=twist_noise(parts.t_ns, parts.v_mps, parts.w_radps),
+        frames_t_ns=parts.t_ns,
         observations=seen,
-        motion=TwistSamples(t_ns, v_mps, w_radps),
-        provenance=Provenance("course-npy", str(parts.path), (*facts, *_turned(fields), EXTRINSIC_UNCERTAIN)),
+        motion=TwistSamples(parts.t_ns, parts.v_mps, parts.w_radps),
+        provenance=Provenance("course-npy", str(parts.path), (*facts, *parts.facts, EXTRINSIC_UNCERTAIN)),
     )
-
-
-def _rig(parts: _Parts) -> StereoRig:
-    left = camera_matrix(parts.path, "K_l", parts.fields.constant("K_l", 3, 3))
-    T_imu_cam = se3_inverse(parts.fields.rigid("extL_T_imu"))
-    return StereoRig(
-        left[0, 0], left[1, 1], left[0, 2], left[1, 2], _baseline_m(parts.fields), T_imu_cam, pixel_covariance(2)
-    )
-
-
-def _baseline_m(fields: Fields) -> float:
-    """Return how far apart the cameras are: the same number in whatever direction and axes the extrinsics are."""
-    left, right = fields.rigid("extL_T_imu"), fields.rigid("extR_T_imu")
-    turned_deg = _turned_deg(fields)
-    if turned_deg > np.rad2deg(_MOST_TURNED_RAD):
-        raise DataError(
-            f"{fields.path}: extL_T_imu and extR_T_imu are turned by {turned_deg:.1f} deg, and a rectified pair is "
-            "not; rectify the recording"
-        )
-    baseline_m = float(np.linalg.norm(left[:3, 3] - right[:3, 3]))
-    if not baseline_m > 0.0:
-        raise DataError(
-            f"{fields.path}: extL_T_imu and extR_T_imu are the same, and so without a baseline; correct one"
-        )
-    return baseline_m
-
-
-def _turned_deg(fields: Fields) -> float:
-    left, right = fields.rigid("extL_T_imu"), fields.rigid("extR_T_imu")
-    return float(np.rad2deg(np.linalg.norm(so3_log(left[:3, :3].T @ right[:3, :3]))))
-
-
-def _turned(fields: Fields) -> Iterator[str]:
-    turned_deg = _turned_deg(fields)
-    if turned_deg > np.rad2deg(_TURNED_RAD):
-        yield f"the extrinsics of the cameras differ by {turned_deg:.2f} deg; the pair is assumed to be rectified"
 
 
 def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple[str, ...]]:
@@ -189,7 +174,7 @@ def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple
 
 def _as_one_camera(parts: _Parts, corners_px: Array) -> Array:
     """Return corners (N, 4) px with the right ones as the left camera would see them from there."""
-    left, right = (camera_matrix(parts.path, key, parts.fields.constant(key, 3, 3)) for key in ("K_l", "K_r"))
+    left, right = parts.K
     if np.array_equal(left, right):
         return corners_px
     scale, centres = np.diag(left)[:2] / np.diag(right)[:2], (left[:2, 2], right[:2, 2])
@@ -230,10 +215,8 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
 
 def _pair(parts: _Parts, size_px: tuple[int, int]) -> RectifiedPair:
     """Return the cameras as a rectified pair; where they differ in K alone, the images are made alike."""
-    matrices = [camera_matrix(parts.path, key, parts.fields.constant(key, 3, 3)) for key in ("K_l", "K_r")]
-    left, right = (Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), "none", np.zeros(4), size_px) for K in matrices)
-    baseline_m = _baseline_m(parts.fields)
-    if np.array_equal(matrices[0], matrices[1]):
-        return already_rectified(left.pinhole_px, baseline_m, size_px)
-    T_right_left = se3(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
+    left, right = (Camera(pinhole_of(K), "none", np.zeros(4), size_px) for K in parts.K)
+    if np.array_equal(parts.K[0], parts.K[1]):
+        return already_rectified(left.pinhole_px, parts.baseline_m, size_px)
+    T_right_left = se3(np.eye(3), np.array([-parts.baseline_m, 0.0, 0.0]))
     return rectified(left, right, T_right_left, str(parts.path))
