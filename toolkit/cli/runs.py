@@ -67,7 +67,7 @@ def export(options: argparse.Namespace) -> int:
     the estimator's world; nothing is aligned. Or bundle what others need to repeat the run.
     """
     from toolkit.datasets.trajectories.covariances import convention_called
-    from toolkit.report.export import Wanted, export, write_bundle
+    from toolkit.report.export import export, write_bundle
 
     if options.bundle is not None:
         if any((options.format, options.out, options.estimator, options.output, options.cov_convention)):
@@ -77,8 +77,7 @@ def export(options: argparse.Namespace) -> int:
     if options.format is None or options.out is None:
         raise UsageError("give --format and --out for a trajectory, or --bundle (see vislam export --help)")
     convention = None if options.cov_convention is None else convention_called(options.cov_convention)
-    wanted = Wanted(options.estimator, options.output, options.format, convention)
-    written = export(options.run, wanted, options.out)
+    written = export(options.run, options.out, options.format, options.estimator, options.output, convention)
     print(printable(f"{options.out}: {written}"))
     return 0
 

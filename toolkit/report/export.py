@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from importlib.metadata import distributions
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct
 
@@ -18,7 +18,6 @@ from toolkit.datasets.trajectories import FORMATS, read_poses, tum
 from toolkit.datasets.trajectories.covariances import CovConvention
 from toolkit.datasets.trajectories.formats import Stamped
 from toolkit.errors import DataError, did_you_mean
-from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import TRUTH
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import documents
@@ -36,53 +35,45 @@ _REMEDY = "make it again with vislam export --bundle"
 _DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
 
 
-class Wanted(NamedTuple):
-    """A trajectory in a run directory, and how it is written.
-
-    Without an estimator there must be only one; ``truth`` is the ground truth. Without an output it is the final one,
-    where there is one. Covariances are written where a convention for them is given.
-    """
-
-    estimator: str | None
-    output: Output | None
-    format_name: str
-    cov_convention: CovConvention | None = None
-
-
-def export(directory: Path, wanted: Wanted, target: Path) -> str:
+def export(
+    directory: Path,
+    target: Path,
+    format_name: str,
+    estimator: str | None = None,
+    output: Output | None = None,
+    cov_convention: CovConvention | None = None,
+) -> str:
     """Write a trajectory of a run directory as a file and return in words which it is.
 
-    Raises DataError where there is no such trajectory or the format cannot hold it,
-    OutputError where the file cannot be written.
+    Without an estimator there must be only one; ``truth`` is the ground truth. Without an output it is the final one,
+    where there is one. Covariances are written where a convention for them is given. Raises DataError where there is
+    no such trajectory or the format cannot hold it, OutputError where the file cannot be written.
     """
     run = read_run(directory)
     if isinstance(run, SeedsFiles):
         raise DataError(
             f"{directory} is a comparison over seeds and holds no trajectories; run one seed without --seeds"
         )
-    what, name, states = _chosen(directory, run.report, wanted.estimator, wanted.output)
+    what, name, states = _chosen(directory, run.report, estimator, output)
     trajectory = tum.read(directory / name, "a run that diverged may leave no finite pose")
     if states is not None and (directory / states).is_file():
         trajectory = read_poses(directory / states).trajectory(trajectory.t_ns)
-    frames = run.scores.sequence.frames
-    if wanted.format_name == "kitti" and len(trajectory) != frames:
+    frames, one = run.scores.sequence.frames, FORMATS[format_name]
+    if format_name == "kitti" and len(trajectory) != frames:
         raise DataError(
             f"{what} has {len(trajectory)} poses for {frames} frames, and KITTI's rows are the frames; "
             "choose a format with stamps"
         )
-    write_text(target, _text(trajectory, wanted, what))
-    return f"{what}, {len(trajectory)} poses"
-
-
-def _text(trajectory: Trajectory, wanted: Wanted, what: str) -> str:
-    one, convention = FORMATS[wanted.format_name], wanted.cov_convention
-    if convention is None:
-        return one.text(trajectory)
-    if not isinstance(one, Stamped):
-        raise DataError(f"a {wanted.format_name} file has no place for covariances; choose another format")
-    if trajectory.cov is None:
+    if cov_convention is None:
+        text = one.text(trajectory)
+    elif not isinstance(one, Stamped):
+        raise DataError(f"a {format_name} file has no place for covariances; choose another format")
+    elif trajectory.cov is None:
         raise DataError(f"no covariances of {what} are in the run directory; leave out --cov-convention")
-    return one.text_with_covariances(trajectory, convention)
+    else:
+        text = one.text_with_covariances(trajectory, cov_convention)
+    write_text(target, text)
+    return f"{what}, {len(trajectory)} poses"
 
 
 def _chosen(
