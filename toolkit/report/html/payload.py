@@ -5,7 +5,6 @@ recording's points, as many as a screen can show, to keep the file small.
 """
 
 import base64
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -53,16 +52,10 @@ def payload_of(runs: Sequence[Files]) -> Json:
 
 
 def _titles(runs: Sequence[Files]) -> list[str]:
-    """Return the sequences' names, with the directory's where several share one, as given where that is shared too."""
-    forms = ["{name}", "{name} ({short})", "{name} ({given})"]
-    named = [
-        {"name": one.scores.sequence.name, "short": one.directory.resolve().name, "given": str(one.directory)}
-        for one in runs
-    ]
-    counts = Counter(form.format(**names) for names in named for form in forms)
+    """Return the sequences' names, with the directory's where several share one."""
+    names = [one.scores.sequence.name for one in runs]
     return [
-        next((title for form in forms if counts[title := form.format(**names)] == 1), forms[-1].format(**names))
-        for names in named
+        name if names.count(name) == 1 else f"{name} ({one.directory})" for name, one in zip(names, runs, strict=True)
     ]
 
 
