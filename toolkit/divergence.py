@@ -101,7 +101,11 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])
-    least = _least_accepted(info, float(accepted.sum()))
+    least = LEAST_ACCEPTED
+    if "nis_dof" in info and accepted.any():
+        # Of tracks as long as the accepted ones are on average.
+        sightings = float(np.nansum(info["nis_dof"]) / (3.0 * accepted.sum()))
+        least = min(least, float((1.0 - _MOST_OUTLIERS) ** sightings))
     for part, part_name in (
         (slice(None), "its measurements"),
         (slice(3 * tested.size // 4, None), "its last quarter's"),
@@ -113,14 +117,6 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
                 f"error (at least {100.0 * least:.0f} % pass in a run that works)"
             )
     return None
-
-
-def _least_accepted(info: Mapping[str, Array], accepted: float) -> float:
-    """Return the least share of measurements that must pass, for tracks as long as the accepted ones are on average."""
-    if "nis_dof" not in info or not accepted:
-        return LEAST_ACCEPTED
-    sightings = float(np.nansum(info["nis_dof"])) / (3.0 * accepted)
-    return min(LEAST_ACCEPTED, float((1.0 - _MOST_OUTLIERS) ** sightings))
 
 
 def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from toolkit.arrays import freeze_arrays
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, read_only
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measurements import (
     GRAVITY_WORLD,
     NS_PER_S,
@@ -181,7 +181,9 @@ class Sequence:
         if self.track_budget is None:
             return seen
         parts = parts_of_view(seen.uv_px, (self.rig.cx_px, self.rig.cy_px), self.track_budget)
-        given = within_budget(self.track_budget, self._frame_starts(seen), seen.track_id, _ages(seen), parts)
+        _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
+        ages = seen.frame - seen.frame[first][track]
+        given = within_budget(self.track_budget, self._frame_starts(seen), seen.track_id, ages, parts)
         return seen.select(given)
 
     def _frame_starts(self, seen: Observations) -> IntArray:
@@ -249,13 +251,6 @@ def is_held_out(track_ids: IntArray) -> BoolArray:
     """Say for each track id (N,) whether it is withheld: one in ten, by a fixed multiplicative hash."""
     mixed = track_ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.asarray((mixed >> np.uint64(33)) % np.uint64(HELD_OUT_ONE_IN) == 0)
-
-
-def _ages(seen: Observations) -> IntArray:
-    """Return for each sighting (N,) the number of frames since the first of its track."""
-    _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
-    ages: IntArray = read_only(seen.frame - seen.frame[first][track], np.int64)
-    return ages
 
 
 def check_runnable(sequence: Sequence) -> None:

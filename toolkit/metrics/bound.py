@@ -108,7 +108,9 @@ def score(evaluation: Evaluation) -> Scores:
 
     scores = evaluate(
         {
-            "efficiency_percent": lambda: of_excess(lambda: 100.0 * position_m / np.hypot(position_m, _lost_m(found))),
+            "efficiency_percent": lambda: of_excess(
+                lambda: 100.0 * position_m / np.hypot(position_m, rmse(lengths(found.excess[:, POSITION])))
+            ),
             "bound_position_m": lambda: position_m,
             "bound_rotation_deg": lambda: float(np.degrees(_rms(found.bound, ROTATION))),
             # The RMS distance from the true positions is that of the NEES: aligned by the first pose if need be.
@@ -137,10 +139,6 @@ def _against_claimed_bound(evaluation: Evaluation) -> AgainstBound:
 
 def _rms(bound: Array, block: slice) -> float:
     return float(np.sqrt(np.mean(np.trace(bound[:, block, block], axis1=1, axis2=2))))
-
-
-def _lost_m(found: AgainstBound) -> float:
-    return rmse(lengths(found.excess[:, POSITION]))
 
 
 def _excess(found: AgainstBound, block: slice | None) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from toolkit.metrics.parts.against_truth import AgainstTruth
-from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 40
 METRICS = (
@@ -18,12 +18,9 @@ METRICS = (
 
 def score(evaluation: AgainstTruth) -> Scores:
     """Score the drift at the last matched pair."""
-    return evaluate({"end_drift_percent": lambda: _end_drift_percent(evaluation)})
-
-
-def _end_drift_percent(evaluation: AgainstTruth) -> float:
     matched = evaluation.compared
     length_m = float(matched.path_m[-1] - matched.path_m[0])
     if length_m == 0.0:
         raise Unavailable("the matched path has no length")
-    return 100.0 * float(np.linalg.norm(evaluation.placed[-1, :3, 3] - matched.truth[-1, :3, 3])) / length_m
+    off_m = float(np.linalg.norm(evaluation.placed[-1, :3, 3] - matched.truth[-1, :3, 3]))
+    return Scores({"end_drift_percent": 100.0 * off_m / length_m})

@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.answers import Run
 from toolkit.arrays import rows_of
 from toolkit.estimate import Landmarks, Trajectory
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
+from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.leave_one_out import CAP_PX, FEWEST_VIEWS, errors_left_out, reprojection_errors_px
@@ -82,9 +82,14 @@ METRICS = (*_IN_SAMPLE, *_HELD_OUT, *_OVER_MOTION)
 
 def score(evaluation: Evaluation) -> Scores:
     """Score the reprojection errors, each kind where it can be computed."""
+    visible, held_out = evaluation.sequence.visible, evaluation.sequence.held_out
+    unknown = "lack a landmark, a second sighting or a pose of their frame"
+    few = f"belong to frames without a pose or to tracks with fewer than {FEWEST_VIEWS} posed views"
     return (
-        Scores.attempt(_IN_SAMPLE, lambda: _in_sample(evaluation))
-        | Scores.attempt(_HELD_OUT, lambda: _held_out(evaluation))
+        Scores.attempt(_IN_SAMPLE, lambda: _pixel_scores("reproj", in_sample_errors(evaluation), len(visible), unknown))
+        | Scores.attempt(
+            _HELD_OUT, lambda: _pixel_scores("heldout_reproj", held_out_errors(evaluation), len(held_out), few)
+        )
         | Scores.attempt(_OVER_MOTION, lambda: _over_motion(evaluation))
     )
 
@@ -107,12 +112,6 @@ def _pixel_scores(prefix: str, errors_px: Array, observation_count: int, why_lef
     return scores.remarked(scores.values, "; ".join(parts))
 
 
-def _in_sample(evaluation: Evaluation) -> Scores:
-    """Score the reprojection of the run's landmarks from the evaluated poses."""
-    lacking = "lack a landmark, a second sighting or a pose of their frame"
-    return _pixel_scores("reproj", in_sample_errors(evaluation), len(evaluation.sequence.visible), lacking)
-
-
 def in_sample_errors(evaluation: Evaluation) -> Array:
     """Return the reprojection error (N,) px of every visible observation that has a landmark and a pose.
 
@@ -123,23 +122,12 @@ def in_sample_errors(evaluation: Evaluation) -> Array:
         raise Unavailable("the estimator has no landmarks")
     observations = evaluation.sequence.visible
     row, has_landmark = rows_of(observations.track_id, landmarks.track_ids)
-    known = has_landmark & evaluation.has_pose[observations.frame] & _seen_again(observations.track_id)
+    _, track, counts = np.unique(observations.track_id, return_inverse=True, return_counts=True)
+    known = has_landmark & evaluation.has_pose[observations.frame] & (counts[track] > 1)
     T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)
     return reprojection_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)
-
-
-def _seen_again(track_ids: IntArray) -> BoolArray:
-    """Say for each observation (N,) whether its track has another one."""
-    _, row_of, counts = np.unique(track_ids, return_inverse=True, return_counts=True)
-    return np.asarray(counts[row_of] > 1)
-
-
-def _held_out(evaluation: Evaluation) -> Scores:
-    """Score how well the evaluated poses predict the withheld tracks."""
-    lacking = f"belong to frames without a pose or to tracks with fewer than {FEWEST_VIEWS} posed views"
-    return _pixel_scores("heldout_reproj", held_out_errors(evaluation), len(evaluation.sequence.held_out), lacking)
 
 
 def held_out_errors(evaluation: Evaluation) -> Array:
@@ -176,7 +164,9 @@ def _paired(evaluation: Evaluation) -> _Paired:
     sequence = evaluation.sequence
     motion = _motion_alone(evaluation.estimate, sequence)
     seen, errors_px = evaluation.held_out_errors
-    drawn = _of_some_tracks(sequence.held_out.track_id[seen])
+    ids = np.unique(sequence.held_out.track_id[seen])
+    some = ids[np.linspace(0, ids.size - 1, min(ids.size, _MOST_TRACKS)).round().astype(int)]  # an even draw
+    drawn = np.isin(sequence.held_out.track_id[seen], some)
     tracks, errors_px = sequence.held_out.select(seen[drawn]), errors_px[drawn]
     poses_by_motion = Evaluation(motion, "causal", sequence).poses_of_frames
     _, by_motion_px = errors_left_out(tracks, poses_by_motion, sequence.rig)
@@ -207,13 +197,6 @@ def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
         poses.append(belief.T_world_imu)
     motion = Trajectory(np.array([packet.frame.t_ns for packet in packets], dtype=np.int64), np.array(poses))
     return Run("the measured motion", "ok", motion, None, Landmarks.none(), timings=None)
-
-
-def _of_some_tracks(track_ids: IntArray) -> BoolArray:
-    """Say which sightings (N,) belong to an even draw of at most ``_MOST_TRACKS`` tracks."""
-    ids = np.unique(track_ids)
-    some = ids[np.linspace(0, ids.size - 1, min(ids.size, _MOST_TRACKS)).round().astype(int)]
-    return np.isin(track_ids, some)
 
 
 def _harm(paired: _Paired, kind: str) -> str:

@@ -64,7 +64,7 @@ class _Intervals(NamedTuple):
 
 def score(evaluation: AgainstTruth) -> Scores:
     """Score drift over one second and over 100 m, and KITTI's."""
-    errors_of_a_second = cache(lambda: _errors_of_a_second(evaluation))
+    errors_of_a_second = cache(lambda: relative_errors(evaluation.oriented, *_one_second(evaluation.oriented)))
     rpe = evaluate(
         {
             "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
@@ -93,10 +93,6 @@ def hundred_metres_percent(matched: Matched) -> float:
     """Return the RMSE of the translation error over 100 m of true path, in percent; may raise Unavailable."""
     errors = relative_errors(matched, *_hundred_metres(matched))
     return rmse(lengths(errors[:, :3, 3])) / INTERVAL_M * 100.0
-
-
-def _errors_of_a_second(evaluation: AgainstTruth) -> Array:
-    return relative_errors(evaluation.oriented, *_one_second(evaluation.oriented))
 
 
 def _one_second(matched: Matched) -> _Intervals:

@@ -6,12 +6,10 @@ average, for the one that errors come from, so neither a larger covariance nor a
 are those of the NEES, in the tangent space of the estimate.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.consistency import UNCOUPLED, Nees, StatedErrors, chi2_quantile, nees_of, stated_errors
+from toolkit.metrics.parts.consistency import UNCOUPLED, StatedErrors, chi2_quantile, nees_of, stated_errors
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores
 
@@ -59,7 +57,7 @@ def of_stated(stated: StatedErrors) -> Scores:
     found: dict[str, float | None] = {metric.key: None for metric in METRICS}
     for block, (_, dof) in _BLOCKS.items():
         rows = slice(0, 3) if block == "ori" else slice(3, 6) if block == "pos" else slice(0, 6)
-        squared = dof * _of_block(nees, block)
+        squared = dof * {"pose": nees.pose, "ori": nees.orientation, "pos": nees.position}[block]
         for percent in REGIONS_PERCENT:
             inside = squared <= chi2_quantile(percent / 100.0, dof)
             found[f"inside_{percent}_{block}_percent"] = 100.0 * float(inside.mean())
@@ -70,16 +68,7 @@ def of_stated(stated: StatedErrors) -> Scores:
             found["energy_ori_deg"] = float(np.degrees(energy_scores(nees.errors[:, rows], covs).mean()))
         elif block == "pos":
             found["energy_pos_m"] = float(energy_scores(nees.errors[:, rows], covs).mean())
-    scores = Scores(found)
-    return scores if nees.is_coupled else scores.without(_keys_of("pose"), UNCOUPLED)
-
-
-def _of_block(nees: Nees, block: str) -> Array:
-    return {"pose": nees.pose, "ori": nees.orientation, "pos": nees.position}[block]
-
-
-def _keys_of(block: str) -> Iterable[str]:
-    return (metric.key for metric in METRICS if f"_{block}" in metric.key)
+    return Scores(found).without(() if nees.is_coupled else [key for key in found if "_pose" in key], UNCOUPLED)
 
 
 def energy_scores(errors: Array, covs: Array) -> Array:

@@ -89,17 +89,13 @@ class StereoFactors:
         pose = X(k)
         for track_id, uv_px in zip(frame.track_ids.tolist(), frame.uvs_px.tolist(), strict=True):
             if isnan(uv_px[1]):
-                yield self._by_left(np.array([uv_px[0], uv_px[2]]), pose, L(track_id))
+                left = np.array([uv_px[0], uv_px[2]]), self._left_noise
+                yield gtsam.GenericProjectionFactorCal3_S2(
+                    *left, pose, L(track_id), self._left_calibration, self._T_imu_cam
+                )
             else:
-                yield self._by_both(gtsam.StereoPoint2(*uv_px), pose, L(track_id))
-
-    def _by_both(self, measured: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:
-        return gtsam.GenericStereoFactor3D(measured, self._noise, pose, landmark, self._calibration, self._T_imu_cam)
-
-    def _by_left(self, measured_px: Array, pose: int, landmark: int) -> gtsam.NonlinearFactor:
-        return gtsam.GenericProjectionFactorCal3_S2(
-            measured_px, self._left_noise, pose, landmark, self._left_calibration, self._T_imu_cam
-        )
+                both = gtsam.StereoPoint2(*uv_px), self._noise
+                yield gtsam.GenericStereoFactor3D(*both, pose, L(track_id), self._calibration, self._T_imu_cam)
 
 
 def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.noiseModel.Base:

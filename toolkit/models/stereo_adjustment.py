@@ -13,7 +13,6 @@ States that leave are marginalised by a Schur complement, together with every tr
 used once (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -341,7 +340,10 @@ class Evaluated:
     def of(cls, window: StereoWindow, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: Python factors cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
-        return cls(window, _joined_graph(window.motion).linearize(window.values), _off_prior(window), vision)
+        motion = gtsam.NonlinearFactorGraph()
+        for graph in window.motion:
+            motion.push_back(graph)
+        return cls(window, motion.linearize(window.values), _off_prior(window), vision)
 
     @cached_property
     def error(self) -> float:
@@ -373,13 +375,6 @@ class Evaluated:
             information, vector = augmented[:-1, :-1], augmented[-1, :-1]
         rest = size - len(vector)
         return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
-
-
-def _joined_graph(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
-    whole = gtsam.NonlinearFactorGraph()
-    for graph in graphs:
-        whole.push_back(graph)
-    return whole
 
 
 def _off_prior(window: StereoWindow) -> Array:

@@ -206,7 +206,7 @@ def _described(record: type[Struct], prefix: str) -> Iterator[Described]:
 
 
 def _one(key: str, hint: Any, default: Any) -> Described:
-    metas = list(_metas(hint))
+    metas = [m for part in _parts(hint) for m in getattr(part, "__metadata__", ()) if isinstance(m, Meta)]
     extra = {name: text for meta in metas for name, text in (meta.extra or {}).items()}
     bounds = {name: getattr(meta, name) for meta in metas for name in _BOUNDS if getattr(meta, name) is not None}
     bounds_text = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
@@ -228,8 +228,3 @@ def _parts(hint: Any) -> Iterator[Any]:
     for part in get_args(hint):
         if not isinstance(part, Meta):
             yield from _parts(part)
-
-
-def _metas(hint: Any) -> Iterator[Meta]:
-    for part in _parts(hint):
-        yield from (meta for meta in getattr(part, "__metadata__", ()) if isinstance(meta, Meta))

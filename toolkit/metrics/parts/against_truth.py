@@ -136,25 +136,17 @@ class Alignment:
         return se3(self.rotation @ poses[:, :3, :3], positions)
 
 
-def place_pose(truth: Array, estimate: Array) -> Alignment:
-    """Make one estimated pose (4, 4) coincide with the true one; nothing is fitted."""
-    T_truth_estimate = truth @ se3_inverse(estimate)
-    return Alignment(T_truth_estimate[:3, :3], T_truth_estimate[:3, 3])
-
-
-def place_yaw(truth: Array, estimate: Array) -> Alignment:
-    """Make the position of an estimated pose (4, 4) coincide with the true one, its heading as nearly as possible."""
-    rotation = about_z(_best_yaw(truth[:3, :3] @ estimate[:3, :3].T))
-    return Alignment(rotation, truth[:3, 3] - rotation @ estimate[:3, 3])
-
-
 def place_first(truth: Array, estimate: Array, level: bool) -> Alignment:
     """Place the first estimated pose (4, 4) on the true one, by heading and position alone where the world is level.
 
     An estimator starts in a world of its own. With an IMU the vertical is measured, so that a tilt is an error and
     stays; without one the whole first pose is arbitrary.
     """
-    return place_yaw(truth, estimate) if level else place_pose(truth, estimate)
+    if level:
+        rotation = about_z(_best_yaw(truth[:3, :3] @ estimate[:3, :3].T))
+        return Alignment(rotation, truth[:3, 3] - rotation @ estimate[:3, 3])
+    T_truth_estimate = truth @ se3_inverse(estimate)
+    return Alignment(T_truth_estimate[:3, :3], T_truth_estimate[:3, 3])
 
 
 def fit_se3(truth: Array, estimate: Array) -> Alignment:

@@ -10,7 +10,6 @@ g_i). That is linear in the number of sightings, but view i still influences the
 are solved again from there without view i; in a longer one its influence is negligible.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -194,7 +193,8 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     views, T_last_view = _views(track_ids, uv_px, T_world_cam, rig)
     points = _without_each(views, _solve(views, _start(views, T_last_view, rig), _ITERATIONS))
     again = np.flatnonzero(views.count[views.track] <= _MOST_VIEWS_SOLVED_AGAIN)
-    for rows in _in_parts(again, views.count[views.track[again]] - 1):
+    part = np.cumsum(views.count[views.track[again]] - 1) // _VIEWS_AT_A_TIME
+    for rows in np.split(again, np.flatnonzero(np.diff(part)) + 1) if again.size else ():
         points[:, rows] = _solve(views.others(rows), points[:, rows], _ITERATIONS_AGAIN)
     return views.predict(points)
 
@@ -209,12 +209,6 @@ def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_fro
     means_px2 = np.where(is_left_only(uv_measured_px), squares_px2[:, [0, 2]].mean(axis=1), squares_px2.mean(axis=1))
     errors_px = np.sqrt(means_px2)
     return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
-
-
-def _in_parts(rows: IntArray, others: IntArray) -> Iterator[IntArray]:
-    """Yield the rows (n,) in parts whose total number of other views (n,) is at most ``_VIEWS_AT_A_TIME``."""
-    part = np.cumsum(others) // _VIEWS_AT_A_TIME
-    yield from (of_part for of_part in np.split(rows, np.flatnonzero(np.diff(part)) + 1) if of_part.size)
 
 
 def _views(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> tuple[Views, Array]:
