@@ -134,16 +134,16 @@ def point_to_lfs(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
 
 
-LEFT_OUT: list[tuple[str, Callable[[Path], object], str]] = [
-    ("truncated", lambda d: images(d, 0)[7].write_bytes(images(d, 0)[7].read_bytes()[:900]), "damaged or truncated"),
-    ("empty", lambda d: images(d, 1)[7].write_bytes(b""), "it is empty"),
-    ("missing", lambda d: images(d, 1)[7].unlink(), "missing"),
-    ("no image", lambda d: images(d, 0)[7].write_bytes(b"<html>"), "no image"),
-    ("mispaired", lambda d: rewrite(images(d, 1)[7], lambda i: i[::-1]), "not of the same instant"),
+LEFT_OUT: list[tuple[Callable[[Path], object], str]] = [
+    (lambda d: images(d, 0)[7].write_bytes(images(d, 0)[7].read_bytes()[:900]), "damaged or truncated"),
+    (lambda d: images(d, 1)[7].write_bytes(b""), "it is empty"),
+    (lambda d: images(d, 1)[7].unlink(), "missing"),
+    (lambda d: images(d, 0)[7].write_bytes(b"<html>"), "no image"),
+    (lambda d: rewrite(images(d, 1)[7], lambda i: i[::-1]), "not of the same instant"),
 ]
 
 
-@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in LEFT_OUT], ids=[m[0] for m in LEFT_OUT])
+@pytest.mark.parametrize(("spoil", "complaint"), LEFT_OUT)
 def test_one_bad_image_is_named_and_left_out(asl: Path, spoil: Callable[[Path], object], complaint: str) -> None:
     name = images(asl, 0)[7].name
     spoil(asl)
@@ -158,18 +158,18 @@ def test_one_bad_image_is_named_and_left_out(asl: Path, spoil: Callable[[Path], 
     assert across.size > 20  # the tracks go on behind it
 
 
-USED: list[tuple[str, Callable[[Path], object]]] = [
-    ("colour", lambda d: [every(d, c, lambda i: cv2.merge([i, i, i])) for c in (0, 1)]),
-    ("16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)]),
-    ("8 against 16 bit", lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256)),
-    ("rows backwards", lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)]),
-    ("no table", lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)]),
-    ("no headings", lambda d: [edit(d / f"mav0/cam{c}/data.csv", "#timestamp [ns],filename\n", "") for c in (0, 1)]),
-    ("crlf", lambda d: edit(d / "mav0/cam0/data.csv", "\n", "\r\n")),
+USED: list[Callable[[Path], object]] = [
+    lambda d: [every(d, c, lambda i: cv2.merge([i, i, i])) for c in (0, 1)],
+    lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)],
+    lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256),
+    lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)],
+    lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)],
+    lambda d: [edit(d / f"mav0/cam{c}/data.csv", "#timestamp [ns],filename\n", "") for c in (0, 1)],
+    lambda d: edit(d / "mav0/cam0/data.csv", "\n", "\r\n"),
 ]
 
 
-@pytest.mark.parametrize("change", [m[1] for m in USED], ids=[m[0] for m in USED])
+@pytest.mark.parametrize("change", USED)
 def test_the_same_images_in_another_guise_give_the_same_tracks(asl: Path, change: Callable[[Path], object]) -> None:
     before = load_sequence(str(asl))
     change(asl)
@@ -222,38 +222,29 @@ def test_images_outside_the_time_of_the_imu_are_reported(asl: Path) -> None:
 
 
 YAML = "mav0/cam{}/sensor.yaml"
-REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "mav0: missing imu0/sensor.yaml"),
-    ("other model", lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
-    ("other lens", lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
-    ("no focal", lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
-    ("mirrored pose", lambda d: edit(d / YAML.format(0), "[0, 0, 1,", "[0, 0, -1,"), "a reflection|not a rotation"),
-    ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
-    ("all black", lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
-    ("all of another size", lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
-    ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam0/data has images and .*cam1/data has none"),
-    ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "two clocks"),
-    ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
-    ("wrong tilt", lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
+REFUSED: list[tuple[Callable[[Path], object], str]] = [
+    (lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "mav0: missing imu0/sensor.yaml"),
+    (lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
+    (lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
+    (lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
+    (lambda d: edit(d / YAML.format(0), "[0, 0, 1,", "[0, 0, -1,"), "a reflection|not a rotation"),
+    (lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
+    (lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
+    (lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
+    (lambda d: shutil.rmtree(d / "mav0/cam1"), "cam0/data has images and .*cam1/data has none"),
+    (lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "two clocks"),
+    (lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
+    (lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
+    (lambda d: one_instant(d / "mav0/imu0/data.csv"), "IMU are all of one instant"),
+    (lambda d: [point_to_lfs(p) for c in (0, 1) for p in images(d, c)], "images with git lfs pull"),
     (
-        "imu of one instant",
-        lambda d: one_instant(d / "mav0/imu0/data.csv"),
-        "IMU are all of one instant",
-    ),
-    (
-        "pointers",
-        lambda d: [point_to_lfs(p) for c in (0, 1) for p in images(d, c)],
-        "images with git lfs pull",
-    ),
-    (
-        "left copied",
         lambda d: [shutil.copy(a, b) for a, b in zip(images(d, 0), images(d, 1), strict=True)],
         "left and right images are the same ones",
     ),
 ]
 
 
-@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in REFUSED], ids=[m[0] for m in REFUSED])
+@pytest.mark.parametrize(("spoil", "complaint"), REFUSED)
 def test_a_folder_that_cannot_be_used_is_one_clear_line(
     asl: Path, spoil: Callable[[Path], object], complaint: str
 ) -> None:
@@ -317,21 +308,6 @@ def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str, write: Ca
     # twelve printed digits move a rectified pixel by nothing that shows
     np.testing.assert_allclose(np.sort(after.observations.uv_px[:, 0])[::50], _left_columns(before)[::50], atol=0.05)
     assert any("camchain-imucam.yaml" in fact for fact in after.provenance.facts)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "complaint"),
-    [
-        ("camera_model: pinhole", "camera_model: omni", "camera_model omni; images are rectified of pinhole"),
-    ],
-)
-def test_a_camchain_that_is_of_no_use_says_why(asl: Path, old: str, new: str, complaint: str) -> None:
-    T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
-    T_right_left = _right_left(asl)
-    kalibr(asl, lambda c: as_rows("T_cam_imu", T_left_imu) if c == 0 else as_rows("T_cn_cnm1", T_right_left))
-    edit(asl / "camchain-imucam.yaml", old, new)
-    with pytest.raises(DataError, match=complaint):
-        load_sequence(str(asl))
 
 
 def camchain(root: Path, more: str = "", of_both: str = "") -> None:
