@@ -128,10 +128,10 @@ def linearise_point(
     intrinsics, whitener, left_whitener, _ = camera
     fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     x, y, depth = moved(T_cam_world, j, points, f)
-    per_z = 1.0 / divisible(depth)
-    r0 = uvs_px[t, j, 0] - (fx * x * per_z + cx)
-    r1 = uvs_px[t, j, 1] - (fx * (x - baseline_m) * per_z + cx)
-    r2 = uvs_px[t, j, 2] - (fy * y * per_z + cy)
+    z = divisible(depth)
+    r0 = uvs_px[t, j, 0] - (fx * x / z + cx)
+    r1 = uvs_px[t, j, 1] - (fx * (x - baseline_m) / z + cx)
+    r2 = uvs_px[t, j, 2] - (fy * y / z + cy)
     W = whitener
     if math.isnan(r1):
         W, r1 = left_whitener, 0.0
