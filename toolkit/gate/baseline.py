@@ -7,6 +7,7 @@ The file is JSON that people can read and review, the values of all seeds of a m
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -93,6 +94,8 @@ DEFAULT_BOUNDS = BoundsRecord(
     speed_ratio=1.3,
 )
 COVERAGE, SPEED = "coverage_percent", "speed"
+# Characters of an entry of a list that stands on one line.
+_SHORT = 43
 # The chance of any false alarm among all statistical tests of one check.
 FALSE_ALARM_RATE = 0.05
 
@@ -312,20 +315,9 @@ def _case(record: CaseRecord) -> tuple[Case, Measured]:
 
 def json_text(value: object) -> str:
     """Return JSON for people to review: a list of numbers or of short words is one line."""
-    return _text(value, "") + "\n"
+    return re.sub(r"\[[^][{}]*\]", _on_one_line, json.dumps(value, indent=2, allow_nan=False)) + "\n"
 
 
-def _text(value: object, indent: str) -> str:
-    """Return JSON in which a list of numbers or short words is one line, and of hashes a line each."""
-    inner = indent + "  "
-    if isinstance(value, Mapping):
-        entries = [f"{json.dumps(key)}: {_text(entry, inner)}" for key, entry in value.items()]
-        brackets = "{}"
-    elif isinstance(value, tuple) and any(isinstance(entry, Mapping) or len(str(entry)) > 40 for entry in value):
-        entries = [_text(entry, inner) for entry in value]
-        brackets = "[]"
-    else:
-        return json.dumps(value, allow_nan=False)
-    if not entries:
-        return brackets
-    return brackets[0] + "\n" + ",\n".join(inner + entry for entry in entries) + f"\n{indent}" + brackets[1]
+def _on_one_line(found: "re.Match[str]") -> str:
+    entries = [line.strip() for line in found[0][1:-1].splitlines()]
+    return f"[{' '.join(entries).strip()}]" if max(map(len, entries), default=0) <= _SHORT else found[0]
