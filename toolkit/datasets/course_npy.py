@@ -24,7 +24,7 @@ from toolkit.datasets.io.fields import (
     stamps_ns,
 )
 from toolkit.datasets.io.image_pairs import pinhole_of, seen_in
-from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict, sparse_array
+from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend import (
@@ -44,7 +44,6 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import EXTRINSIC_UNCERTAIN, NO_FEATURES, Observations, Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
 
-_NOT_SEEN = -1.0
 _REQUIRED = ("v_t", "w_t", "timestamps", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
 _FEATURES, _IMAGES = "features", ("cam_imgs_L", "cam_imgs_R")
 _IMAGES_SUFFIX = "_imgs"
@@ -167,8 +166,7 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
 
 
 def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple[str, ...]]:
-    sparse = sparse_array(parts.path, _FEATURES, features, (4, None, parts.t_ns.size), _NOT_SEEN)
-    frame, track, corners_px, facts = corners_of(sparse)
+    frame, track, corners_px, facts = corners_of(parts.path, _FEATURES, features, parts.t_ns.size)
     return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px)), facts
 
 

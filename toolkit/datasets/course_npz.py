@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
-from toolkit.datasets.io.numpy_files import NpzArchive, array_names, corners_of, opened
+from toolkit.datasets.io.numpy_files import NpzArchive, array_names, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import StereoRig
@@ -18,7 +18,6 @@ from toolkit.motion_samples import TwistSamples
 from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence
 
 CITES = ("geiger2013kitti",)
-_NOT_SEEN = -1.0
 # Two spellings of one quantity differ by the digits they were written with.
 _ALIKE = 1e-4
 _REQUIRED = (
@@ -92,5 +91,5 @@ def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> tuple[Obser
     if "features" not in archive.keys:
         nothing = np.empty(0, dtype=np.int64)
         return Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,)
-    frame, track, corners_px, facts = corners_of(archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN))
+    frame, track, corners_px, facts = archive.corners("features", frame_count)
     return rectified_observations(path, frame, track, corners_px), facts

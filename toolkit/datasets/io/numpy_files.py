@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, Literal, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -62,52 +62,9 @@ def _first_line(error: BaseException) -> str:
     return printable(str(error).partition("\n")[0])[:200] or type(error).__name__
 
 
-# Sparse arrays ------------------------------------------------------------------------------------------------
+# Features -----------------------------------------------------------------------------------------------------
 
-
-class SparseArray(NamedTuple):
-    """The entries of a dense array that differ from its filler: indices per axis, each (E,), and values (E,)."""
-
-    shape: tuple[int, ...]
-    indices: tuple[IntArray, ...]
-    value: Array
-
-
-def sparse_array(
-    path: Path, key: str, array: npt.NDArray[np.generic], shape: tuple[int | None, ...], filler: float
-) -> SparseArray:
-    """Return what differs from the filler in an array that may be larger than memory, as a view of a file is.
-
-    Raises DataError, naming file and key, where it holds no real numbers or has another shape (None = any).
-    """
-    check_numeric(path, key, array.dtype)
-    check_shape(f"{path}: {key}", array.shape, shape)
-    flat = array.ravel(order="K")
-    step = _CHUNK_BYTES // array.itemsize
-    order = "F" if array.flags.f_contiguous else "C"
-    chunks = (flat[at : at + step] for at in range(0, flat.size, step))
-    return _sparse(f"{path}: {key}", _Layout(array.shape, order == "F", array.dtype), chunks, filler)
-
-
-def _sparse(what: str, layout: _Layout, chunks: Iterator[npt.NDArray[Any]], filler: float) -> SparseArray:
-    """Keep what is not the filler of an array's values in the order of its memory.
-
-    NaN is not, unless the array has no filler at all: then it stands for it.
-    """
-    size, expected = 0, math.prod(layout.shape)
-    positions, kept_values = [np.empty(0, dtype=np.int64)], [np.empty(0)]
-    for values in chunks:
-        kept = np.flatnonzero(values != filler)
-        positions.append(kept + size)
-        kept_values.append(values[kept].astype(np.float64))
-        size += values.size
-    if size != expected:
-        raise DataError(f"{what} ends after {size} of {expected} values; save it again")
-    position, value = np.concatenate(positions), np.concatenate(kept_values)
-    if value.size == expected and np.isnan(value).any():
-        position, value = position[~np.isnan(value)], value[~np.isnan(value)]
-    indices = np.unravel_index(position, layout.shape, order="F" if layout.fortran_order else "C")
-    return SparseArray(layout.shape, indices, value)
+_NOT_SEEN = -1.0
 
 
 class Corners(NamedTuple):
@@ -119,16 +76,41 @@ class Corners(NamedTuple):
     facts: tuple[str, ...]
 
 
-def corners_of(features: SparseArray) -> Corners:
-    """Return the sightings of features (4, M, T), without those that are 0 in every coordinate, as none is.
+def corners_of(path: Path, key: str, features: npt.NDArray[np.generic], frame_count: int) -> Corners:
+    """Return the sightings of features (4, M, T), which may be larger than memory, as a view of a file is.
 
-    A sighting that lacks a coordinate has NaN there: both of the right image, or one, for the audit to find.
+    They are -1 where nothing is seen, or NaN where nothing is -1; those that are 0 in every coordinate are none. One
+    that lacks a coordinate has NaN there: both of the right image, or one, for the audit to find. Raises DataError,
+    naming file and key, where the array holds no real numbers or has another shape.
     """
-    coordinate, track, frame = features.indices
-    tracks = max(features.shape[1], 1)
+    is_fortran = features.flags.f_contiguous
+    flat, step = features.ravel(order="K"), _CHUNK_BYTES // features.itemsize
+    chunks = (flat[at : at + step] for at in range(0, flat.size, step))
+    return _corners(path, key, _Layout(features.shape, is_fortran, features.dtype), chunks, frame_count)
+
+
+def _corners(path: Path, key: str, layout: _Layout, chunks: Iterator[npt.NDArray[Any]], frame_count: int) -> Corners:
+    """Return the sightings of features whose values come in the order of their memory."""
+    what, size, expected = f"{path}: {key}", 0, math.prod(layout.shape)
+    check_numeric(path, key, layout.dtype)
+    check_shape(what, layout.shape, (4, None, frame_count))
+    positions, kept_values = [np.empty(0, dtype=np.int64)], [np.empty(0)]
+    for values in chunks:
+        kept = np.flatnonzero(values != _NOT_SEEN)
+        positions.append(kept + size)
+        kept_values.append(values[kept].astype(np.float64))
+        size += values.size
+    if size != expected:
+        raise DataError(f"{what} ends after {size} of {expected} values; save it again")
+    position, value = np.concatenate(positions), np.concatenate(kept_values)
+    if value.size == expected and np.isnan(value).any():
+        position, value = position[~np.isnan(value)], value[~np.isnan(value)]
+    order: Literal["F", "C"] = "F" if layout.fortran_order else "C"
+    coordinate, track, frame = np.unravel_index(position, layout.shape, order=order)
+    tracks = max(layout.shape[1], 1)
     cell, row = np.unique(frame * tracks + track, return_inverse=True)
     corners_px: Array = np.full((cell.size, 4), np.nan)
-    corners_px[row, coordinate] = features.value
+    corners_px[row, coordinate] = value
     seen = corners_px.any(axis=1)  # NaN is something
     unseen = int((~seen).sum())
     facts = (f"{unseen} features are 0 in every coordinate: unseen, as those that are -1",) if unseen else ()
@@ -154,17 +136,11 @@ class NpzArchive:
         """Read every array whole, but for the keys left out."""
         return Fields(self.path, {key: self._dense(key) for key in self.keys if key not in left_out})
 
-    def sparse(self, key: str, shape: tuple[int | None, ...], filler: float) -> SparseArray:
-        """Stream one array of a shape (None = any), in either memory order; keep what differs from the filler.
-
-        Raises DataError, naming the key, where it holds no real numbers, has another shape, or ends too early.
-        """
-        what = f"{self.path}: {key}"
+    def corners(self, key: str, frame_count: int) -> Corners:
+        """Stream features as :func:`corners_of`; raises DataError also where they end too early."""
         with self.archive.open(f"{key}.npy") as stream:
-            layout = _header(stream, what)
-            check_numeric(self.path, key, layout.dtype)
-            check_shape(what, layout.shape, shape)
-            return _sparse(what, layout, _chunks(stream, layout), filler)
+            layout = _header(stream, f"{self.path}: {key}")
+            return _corners(self.path, key, layout, _chunks(stream, layout), frame_count)
 
     def _dense(self, key: str) -> npt.NDArray[np.generic]:
         what, name = f"{self.path}: {key}", f"{key}.npy"
