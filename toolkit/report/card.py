@@ -38,10 +38,7 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     intervals: Annotated[int, Meta(ge=0)]
     intervals_without_common_track: Annotated[int, Meta(ge=0)]
     correlated: Annotated[bool, Meta(description="whether the errors of a track are correlated")]
-    track_weight: (
-        Annotated[float, Meta(description="share of its information that a sighting has; not in version 1", ge=0, le=1)]
-        | UnsetType
-    ) = UNSET
+    track_weight: Annotated[float, Meta(description="what a sighting counts for", ge=0, le=1)] | UnsetType = UNSET
     track_weight_error: float | UnsetType = UNSET
     correlation: Annotated[Lags, Meta(description="autocorrelation of residuals along a track")]
     left_right_correlation: float

@@ -81,13 +81,7 @@ class ContributionRecord(Struct, frozen=True, kw_only=True):
     error: FactorRecord | None
     variance: Annotated[FactorRecord | None, Meta(description="variance of the pose over the Cramér-Rao bound")]
     nees: FactorRecord | None
-    also_shown: (
-        Annotated[
-            tuple[Other, ...],
-            Meta(description="which of the others differ by more than chance too; absent before it was added"),
-        ]
-        | UnsetType
-    ) = UNSET
+    also_shown: Annotated[tuple[Other, ...] | UnsetType, Meta(description="of the others, those beyond chance")] = UNSET
 
     def shows(self, measure: str) -> bool:
         """Say whether a measure differs by more than chance."""

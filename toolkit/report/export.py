@@ -105,9 +105,7 @@ class BundleRecord(Struct, frozen=True, kw_only=True):
 
     schema: Literal["vislam.bundle/1"]
     name: Annotated[str, Meta(description="of the run directory")]
-    hashes: Annotated[
-        tuple[str | None, ...], Meta(description="SHA-256 of what the estimators read, one a seed; null where unknown")
-    ]
+    hashes: Annotated[tuple[str | None, ...], Meta(description="SHA-256 of what was read, one a seed; null: unknown")]
     packages: Annotated[dict[str, str], Meta(description="every installed package's release")]
     files: Annotated[dict[str, str], Meta(description="SHA-256 of each file, by its path in the run directory")]
 

@@ -59,14 +59,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
     git_revision: Annotated[str | None, Meta(description="-dirty where edited; null outside a checkout")]
     sequence: RecordingRecord
     start: Annotated[str, Meta(description="where every run started")]
-    noise: (
-        Annotated[MeasuredNoise, Meta(description="that was measured on the recording; absent where it is set")]
-        | UnsetType
-    ) = UNSET
+    noise: Annotated[MeasuredNoise | UnsetType, Meta(description="as measured; absent where it is set")] = UNSET
     estimators: Annotated[tuple[str, ...], Meta(description="that ran here")]
-    references: (
-        Annotated[tuple[str, ...], Meta(description="that were read from files; not over seeds")] | UnsetType
-    ) = UNSET
+    references: Annotated[tuple[str, ...] | UnsetType, Meta(description="read from files; not over seeds")] = UNSET
     seeds: SeedsUsed
     threads: Annotated[
         dict[str, int | str | None],
@@ -74,10 +69,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     ]
     cpu: str
     os: str
-    files: (
-        Annotated[tuple[str, ...], Meta(description="that the run wrote, relative to its directory, this one too")]
-        | UnsetType
-    ) = UNSET
+    files: Annotated[tuple[str, ...] | UnsetType, Meta(description="that the run wrote, this one too")] = UNSET
 
 
 def _of_today(manifest: Json) -> Json:

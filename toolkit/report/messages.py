@@ -343,9 +343,7 @@ class ContestRecord(Struct, frozen=True, kw_only=True):
     by: Annotated[str, Meta(description="what the test is over: stretches of the path or of time, or seeds")]
     rivals: Annotated[tuple[Rival, ...], Meta(description="from the least error up")]
     leaders: Annotated[tuple[str, ...], Meta(description="estimators that may be the best; one where it is decided")]
-    winner: Annotated[
-        str | None, Meta(description="the only leader, unless its stated uncertainty is marked; else null")
-    ]
+    winner: Annotated[str | None, Meta(description="the only leader, unless its uncertainty is marked; else null")]
 
 
 # The contest that the verdict is about is the first of these that there is.

@@ -79,10 +79,7 @@ class ErrorKind(Struct, frozen=True, kw_only=True):
     """What the errors of this report are."""
 
     what: Annotated[str, Meta(description="error, or the difference from whom")]
-    placing: (
-        Annotated[str, Meta(description="how estimates are placed; absent in older documents, whose caption says it")]
-        | UnsetType
-    ) = UNSET
+    placing: Annotated[str | UnsetType, Meta(description="how estimates are placed, which old captions say")] = UNSET
     caption: str
 
 
@@ -148,7 +145,7 @@ class DrawnRun(Struct, frozen=True, kw_only=True):
     nees: Annotated[NeesSeries | str, Meta(description="or why there is none")]
     nis: Annotated[NisSeries | str, Meta(description="or why there is none")]
     components: Annotated[
-        ComponentSeries | UnsetType, Meta(description="absent where there are none, or with the causal entry")
+        ComponentSeries | UnsetType, Meta(description="absent where none, or with the causal entry")
     ] = UNSET
 
 
@@ -207,10 +204,7 @@ class AuditMessage(Struct, frozen=True, kw_only=True):
 
 
 VerdictText = Annotated[str, Meta(description="in words; absent before it was added")] | UnsetType
-Contests = (
-    Annotated[tuple[ContestRecord, ...], Meta(description="who wins, or that nobody does; absent before it was added")]
-    | UnsetType
-)
+Contests = Annotated[tuple[ContestRecord, ...] | UnsetType, Meta(description="who wins, or that nobody does")]
 
 
 class Messages(Struct, frozen=True, kw_only=True):
@@ -240,9 +234,7 @@ class Report(Struct, frozen=True, kw_only=True):
     maps: tuple[DrawnMap, ...]
     words: Messages
     card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where requested")] = UNSET
-    frames: Annotated[
-        tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
-    ] = UNSET
+    frames: Annotated[tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks")] = UNSET
     contests: Contests = UNSET
 
 
@@ -260,9 +252,7 @@ class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
     estimator: str
     output: Output
     nees: MeanNeesSeries | None
-    position_rms_m: Annotated[
-        Numbers | None, Meta(description="root mean square over the seeds, from the common start")
-    ]
+    position_rms_m: Annotated[Numbers | None, Meta(description="RMS over the seeds, from the common start")]
 
 
 class SeedsMessages(Struct, frozen=True, kw_only=True):
@@ -270,9 +260,7 @@ class SeedsMessages(Struct, frozen=True, kw_only=True):
 
     sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
     verdict: VerdictText = UNSET
-    pairs: Annotated[
-        tuple[str, ...] | UnsetType, Meta(description="how each differs from the best; absent before it was added")
-    ] = UNSET
+    pairs: Annotated[tuple[str, ...] | UnsetType, Meta(description="how each differs from the best")] = UNSET
     notes: tuple[str, ...]
     verdicts: Annotated[tuple[str, ...], Meta(description="which estimators are overconfident")]
     start: str

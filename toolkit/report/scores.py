@@ -57,10 +57,7 @@ class AuditEntry(Struct, frozen=True, kw_only=True):
     detail: Annotated[str, Meta(description="one sentence")]
 
 
-Undecided = (
-    Annotated[dict[str, str], Meta(description="by fault, why it could not be decided; absent before it was added")]
-    | UnsetType
-)
+Undecided = Annotated[dict[str, str] | UnsetType, Meta(description="by fault, why it could not be decided")]
 
 
 class ConsistencyMark(Struct, frozen=True, kw_only=True):
@@ -68,25 +65,14 @@ class ConsistencyMark(Struct, frozen=True, kw_only=True):
 
     verdict: Annotated[
         Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"],
-        Meta(
-            description="by the mean: in, above, below its band; below, behind a gate that rejected many; corrections "
-            "that lean one way by more than their limit"
-        ),
+        Meta(description="mean in, above, below its band; below, behind a gate that rejected many; a trend"),
     ]
     metric: Annotated[str, Meta(description="key of the metric it rests on")]
     mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]
-    band: Annotated[
-        tuple[float, float], Meta(description="of 95 % of consistent estimators; of a correction trend 0 and its limit")
-    ]
+    band: Annotated[tuple[float, float], Meta(description="of 95 % of consistent estimators; of a trend to its limit")]
 
 
-Consistency = (
-    Annotated[
-        ConsistencyMark,
-        Meta(description="absent where neither NEES nor NIS nor a trend decides, and before it was added"),
-    ]
-    | UnsetType
-)
+Consistency = Annotated[ConsistencyMark | UnsetType, Meta(description="absent where no NEES, NIS or trend decides")]
 
 
 class ScoredRun(Struct, frozen=True, kw_only=True):
@@ -148,12 +134,7 @@ class MetricOverSeeds(Struct, frozen=True, kw_only=True):
     upper_quartile: float | None
     most: float | None
     values: Annotated[tuple[Value, ...], Meta(description="one a seed, whatever the run's status")]
-    quantiles_all: (
-        Annotated[
-            QuantilesAll, Meta(description="absent where no value is best, or none was had, and before it was added")
-        ]
-        | UnsetType
-    ) = UNSET
+    quantiles_all: Annotated[QuantilesAll | UnsetType, Meta(description="absent where no value is best or had")] = UNSET
 
 
 class WholeRuns(Struct, frozen=True, kw_only=True):
@@ -171,9 +152,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
 
     estimator: Annotated[str, Meta(description="its name, as in vislam list")]
     output: Annotated[Output, Meta(description="what it estimated at each frame, or from the whole recording")]
-    change: (
-        Annotated[str, Meta(description="on a ladder only: what it changes against the rung before")] | UnsetType
-    ) = UNSET
+    change: Annotated[str | UnsetType, Meta(description="on a ladder: what it changes against the rung before")] = UNSET
     status: Annotated[tuple[Status, ...], Meta(description="one a seed")]
     counts: Annotated[dict[Status, Count], Meta(description="how many seeds ended each way")]
     metrics: Annotated[dict[str, MetricOverSeeds], ALL_PROMISED]
@@ -208,10 +187,7 @@ class Seeds(Struct, frozen=True, kw_only=True):
     schema: Literal["vislam.seeds/1"]
     sequence: SequenceOfSeeds
     seeds: Annotated[tuple[int, ...], Meta(description="in order")]
-    hashes: Annotated[
-        tuple[str | None, ...],
-        Meta(description="of what was read under each seed; null where every run's process died"),
-    ]
+    hashes: Annotated[tuple[str | None, ...], Meta(description="of what was read, by seed; null where all runs died")]
     start: Annotated[str, Meta(description="where every run started")]
     estimators: Annotated[tuple[str, ...], Meta(description="in order")]
     runs: Annotated[tuple[RunOverSeeds, ...], Meta(description="by estimator, causal before final")]
