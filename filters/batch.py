@@ -18,10 +18,8 @@ them: keeping the 95 % that agree best with a solution selects measurements by t
 squared error, and made a simulated drive 1.7 times less accurate.
 
 What it approximates: only the noise, by its model. Every measurement is relinearised at every iteration (Dellaert &
-Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). The solver starts from the trajectory of msckf-fej and
-from landmarks mapped along it: from a start that has diverged, that is dead-reckoned or whose covariance is too small
-it converges to poor local minima. The window of that causal pass is as short with an IMU as without one, because the
-solver finds what a longer window would add.
+Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). The solver starts from the trajectory of ekf and
+from landmarks mapped along it: from one that has diverged or is dead-reckoned it converges to poor local minima.
 """
 
 from collections.abc import Iterator
@@ -30,10 +28,9 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from filters.kalman.joint import AtFirstEstimates
+from filters.ekf import DecoupledEkf, as_uncertain_as_stated
 from filters.kalman.landmark_map import KnownPoseMapper
 from filters.kalman.online_output import Filter
-from filters.msckf import Msckf
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.indeterminate import with_covariances
 from filters.smoothing.landmark_steps import FirstImages
@@ -48,7 +45,7 @@ from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kin
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.settings.records import DEFAULTS, Outliers
+from toolkit.settings.records import Outliers
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"
@@ -70,8 +67,7 @@ DEFAULT = True
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    causal_pass = Msckf(setup, AtFirstEstimates(), window_s=DEFAULTS.window.seconds("twist"))
-    return Batch(setup, causal_pass, causal_pass.log)
+    return Batch(setup, DecoupledEkf(setup, as_uncertain_as_stated))
 
 
 class Stage(NamedTuple):
@@ -103,13 +99,13 @@ def stages(outliers: Outliers) -> list[Stage]:
 
 
 class Batch:
-    """Keeps every packet and solves for all in the end, from the trajectory of a causal pass; ``log`` is said of it."""
+    """Keeps every packet and solves for all in the end, from the trajectory of a causal pass."""
 
-    def __init__(self, setup: Setup, causal_pass: Filter, log: tuple[str, ...] = ()) -> None:
+    def __init__(self, setup: Setup, causal_pass: Filter) -> None:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        self._causal_pass, self._log = causal_pass, log
+        self._causal_pass = causal_pass
         self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []
@@ -132,7 +128,7 @@ class Batch:
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         trajectory, log = with_covariances(Trajectory.of(states), smoothed.linear, self._motion)
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, (*self._log, *log))
+        return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()

@@ -55,8 +55,8 @@ class Msckf:
     """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
 
     Up to ``landmarks`` tracks that span the window are kept in the state for as long as they are seen (Li & Mourikis
-    2013, "Optimization-based estimator design for vision-aided inertial navigation"); ``window_s`` is the length of the
-    window in seconds, by default that of the settings; ``belief`` decides in which coordinates landmarks move.
+    2013, "Optimization-based estimator design for vision-aided inertial navigation"); ``belief`` decides in which
+    coordinates landmarks move.
     """
 
     def __init__(
@@ -64,14 +64,12 @@ class Msckf:
         setup: Setup,
         at: Linearisation,
         landmarks: int = 0,
-        window_s: float | None = None,
         belief: Callable[[Belief], JointBelief] = JointBelief,
     ) -> None:
         self.log = load_kernels(setup.progress)
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
         self._motion = setup.motion
-        if window_s is None:
-            window_s = setup.settings.window.seconds(setup.motion_kind)
+        window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: list[int] = []
         self._joint = belief(self._motion.initial_belief(setup.prior))
