@@ -60,7 +60,6 @@ COURSE: list[Broken] = [
     ({"time_stamps": np.zeros((2, 5))}, (), "time_stamps has shape"),
     ({"time_stamps": np.zeros((1, 1))}, (), "1 frame"),
     ({"time_stamps": np.zeros((1, 0))}, (), "0 frame"),
-    ({"time_stamps": 1e9 * FEW_S}, (), "look like nanoseconds: divide by 1e9"),
     ({"b": np.array(0.0)}, (), "b is 0, expected a positive"),
     ({"b": np.array(np.nan)}, (), "b is nan, expected a finite number"),
     ({"b": np.array([0.5, 0.5])}, (), "b has 2 values, expected one finite number"),
@@ -225,7 +224,6 @@ EUROC: list[Spoiled] = [
     (lambda d: change(d / "mav0/imu0/data.csv", "w_RS_S_y", "rate_y"), "imu0/data.csv: missing column w_RS_S_y"),
     (lambda d: change(d / "mav0/cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
     (lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "more than 10 aliases"),
-    (lambda d: (d / "mav0/cam0/sensor.yaml").write_text(f"a: {'[' * 5000}"), "is nested too deeply"),
     (lambda d: change(d / "mav0/cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
     (lambda d: change(d / "mav0/cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
     (

@@ -174,7 +174,6 @@ def test_a_pickle_that_would_run_something_is_refused_by_name_and_nothing_is_run
         (np.zeros(3), "one array of shape"),
         (np.array([1, "x", None], dtype=object), "holds no dict of named values"),
         ({"v_t": np.zeros((3, 3))}, "missing w_t, timestamps"),
-        ({"cam_imgs_L": [], "cam_imgs_R": []}, "the images of a recording alone; name the file beside it"),
         ({"v_t": frozenset("ab")}, "missing w_t|only plain numbers"),
         ({"v_t": np.array(["2026"], dtype="M8[Y]")}, "an array holds datetime64"),
         ({"v_t": 1j}, "only plain numbers"),

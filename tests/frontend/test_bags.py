@@ -312,7 +312,6 @@ def test_topics_are_those_stated(asl: Path, tmp_path: Path) -> None:
         ("left=/prot/image_raw", r"no topic is called /prot/image_raw \(did you mean /port/image_raw"),
         ("imu=/chatter", r"/chatter \(std_msgs/String\) cannot be imu, which is sensor_msgs/Imu"),
         ("ears=/imu0", "no role is called ears; there are left, right"),
-        ("imu=/imu0,imu=/imu0", "--topics names imu twice; leave one out"),
         (
             "left=/port/image_raw,right=/port/image_raw",
             "names /port/image_raw as left and right; a pair has a topic each",
