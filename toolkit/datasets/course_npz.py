@@ -48,8 +48,9 @@ def load(path: Path) -> Sequence:
         check_frame_count(path, t_ns.size)
         _check_features_named(path, archive.keys)
         seen, facts = _sightings(path, archive, t_ns.size)
+    rates = "angular_velocity" if "angular_velocity" in fields else "rotational_velocity"
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
-    w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
+    w_radps = fields.array(rates, 3, t_ns.size).T
     if "angular_velocity" in fields and "rotational_velocity" in fields:
         other = fields.array("rotational_velocity", 3, t_ns.size).T
         _check_alike(fields, "angular_velocity", w_radps, "rotational_velocity", other)

@@ -106,17 +106,13 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     )
     if truth is not None:
         sequence = with_truth(sequence, *_truth(truth))
-    return Read(
-        sequence, (*_unused(sightings, (*TRACKS, *ONE_ROW, *TWO_ROWS)), *_unused(measured, (*_imu(measured), *TWIST)))
-    )
+    used = {sightings: (*TRACKS, *ONE_ROW, *TWO_ROWS, *_STAMPS), measured: (*_imu(measured), *TWIST, *_STAMPS)}
+    unused = (f"{table.what}: {name}" for table, names in used.items() for name in table.names if name not in names)
+    return Read(sequence, tuple(unused))
 
 
 def _columns(what: str, given: Table) -> Columns:
     return columns_of_file(Path(given)) if isinstance(given, str | PathLike) else columns_given(what, given)
-
-
-def _unused(table: Columns, used: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{table.what}: {name}" for name in table.unused((*used, *_STAMPS)))
 
 
 def _has_two_rows(table: Columns) -> bool:

@@ -89,10 +89,6 @@ class Fields:
         check_shape(f"{self.path}: {key}", array.shape, shape)
         return array.astype(np.float64)
 
-    def first_of(self, *keys: str) -> str:
-        """Return the first of the keys that is there; one must be (see :meth:`require`)."""
-        return next(key for key in keys if key in self)
-
     def vector(self, key: str) -> Array:
         """Return an array stored as (), (n,), (1, n) or (n, 1) as (n,)."""
         array = self.arrays[key]

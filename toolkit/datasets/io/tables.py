@@ -8,7 +8,7 @@ import codecs
 import csv
 import gzip
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -143,11 +143,6 @@ class Columns:
     def at(self, row: int) -> str:
         """Return how a row is called."""
         return f"{self.row} {row if self.numbers_of_rows is None else self.numbers_of_rows[row]}"
-
-    def unused(self, used: Iterable[str]) -> tuple[str, ...]:
-        """Return the names of the columns that are none of those used."""
-        known = set(used)
-        return tuple(name for name in self.names if name not in known)
 
     def _numbers(self, name: str) -> Array:
         given = self.values[name]
