@@ -122,7 +122,8 @@ class _Steps:
     ) -> None:
         self._graph, self._ordering, self._sizes, self._ends = graph, ordering, sizes, ends_at_overshoot
         self._has_lowered = False
-        self._damping_factors: dict[float, gtsam.GaussianFactorGraph] = {}
+        # Those of the last damping alone, which far along a solve stays: each takes some megabytes.
+        self._damped_by, self._damping_factors = -1.0, gtsam.GaussianFactorGraph()
 
     def next(self, here: _Reached, images: FirstImages | None) -> _Reached:
         """Return the least damped step that lowers the error, with landmarks moved in images or, if None, in metres.
@@ -147,11 +148,11 @@ class _Steps:
 
     def _eliminated(self, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.VectorValues | None:
         """Return the damped step; None if the linear system does not determine it."""
-        if damping not in self._damping_factors:
-            self._damping_factors[damping] = _damping_factors(self._sizes, damping)
+        if damping != self._damped_by:
+            self._damped_by, self._damping_factors = damping, _damping_factors(self._sizes, damping)
         damped = gtsam.GaussianFactorGraph()
         damped.push_back(linear)
-        damped.push_back(self._damping_factors[damping])
+        damped.push_back(self._damping_factors)
         try:
             return damped.eliminateSequential(self._ordering).optimize()
         except RuntimeError as refusal:
