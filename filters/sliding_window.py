@@ -172,7 +172,8 @@ class SlidingWindow:
 
     def __init__(self, lag_ns: int, coordinates: Coordinates, kept: Kept) -> None:
         self._lag_ns, self._coordinates, self._kept = lag_ns, coordinates, kept
-        self._factors: list[gtsam.NonlinearFactor] = []
+        # Each with its keys, which every marginalisation asks of all of them.
+        self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         self._left: Gaussian | None = None
         self._values = gtsam.Values()
         # The states in the order of time, each with its keys, and the landmarks: both with their last stamps.
@@ -188,7 +189,8 @@ class SlidingWindow:
         """
         self._states.append((t_ns, sorted(extension.state_keys, key=_place)))
         self._landmarks |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
-        self._factors += [extension.factors.at(i) for i in range(extension.factors.size())]
+        added = (extension.factors.at(i) for i in range(extension.factors.size()))
+        self._factors += [(frozenset(factor.keys()), factor) for factor in added]
         self._values.insert(extension.values)
         oldest_ns = t_ns - self._lag_ns
         unseen = [key for key, seen_ns in self._landmarks.items() if seen_ns < oldest_ns]
@@ -201,7 +203,7 @@ class SlidingWindow:
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Remove landmarks and their sightings in the window; the others keep what older sightings told of them."""
         leaving = {L(i) for i in track_ids}
-        self._factors = [factor for factor in self._factors if leaving.isdisjoint(factor.keys())]
+        self._factors = [one for one in self._factors if leaving.isdisjoint(one[0])]
         self._marginalise(sorted(leaving))
         return self._solved()
 
@@ -220,15 +222,15 @@ class SlidingWindow:
     def _marginalise(self, leaving: list[int]) -> None:
         """Marginalise landmarks, or the variables of the state before the oldest one; what they told stays."""
         gone, values, state = set(leaving), self._values, self._states[0][1]
-        touched = [factor for factor in self._factors if not gone.isdisjoint(factor.keys())]
         linear = gtsam.GaussianFactorGraph()
-        for factor in touched:
-            linear.push_back(factor.linearize(values.extract(factor.keys())))
+        for keys_of, factor in self._factors:
+            if not gone.isdisjoint(keys_of):
+                linear.push_back(factor.linearize(values))
         if self._left is not None:
             linear.push_back(self._left.linear(values))
         known = set(linear.keyVector())
         if gone & known:
-            self._factors = [factor for factor in self._factors if gone.isdisjoint(factor.keys())]
+            self._factors = [one for one in self._factors if gone.isdisjoint(one[0])]
             _, rest = linear.eliminatePartialSequential(ordering_of(key for key in leaving if key in known))
             landmarks = sorted(key for key in known - gone if kind_of(key) == "l")
             before = leaving[0] if kind_of(leaving[0]) == "x" else state[0]
@@ -246,7 +248,7 @@ class SlidingWindow:
     def _solved(self) -> Recovery:
         """Iterate to the minimum; landmarks that are indeterminate are dropped."""
         graph = gtsam.NonlinearFactorGraph()
-        for factor in self._factors:
+        for _, factor in self._factors:
             graph.add(factor)
         try:
             converged = self._iterate(graph)
