@@ -298,7 +298,8 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
     for i in reversed(range(len(cliques))):
         joint = joints[next_of[i]].extended(cliques[i])
         covs |= {group[0]: joint.of(group) for group in groups[i]}
-        joints[i] = joint
+        if waiting[i]:
+            joints[i] = joint
         waiting[next_of[i]] -= 1
         if not waiting[next_of[i]]:
             del joints[next_of[i]]
