@@ -185,7 +185,7 @@ class EstimatorEntry:
             if option not in known:
                 names = ", ".join(sorted(known)) or "none"
                 others = [name for name, entry in discover().items() if option in entry.options()]
-                there = f"; {' and '.join(others)} has it" if others else ""
+                there = f"; {' and '.join(others)} {'have' if others[1:] else 'has'} it" if others else ""
                 raise EstimatorError(f"estimator {self.name} has no option {option}; it has {names}{there}")
             if known[option] and value not in known[option]:
                 values = " or ".join(str(one).lower() if isinstance(one, bool) else str(one) for one in known[option])

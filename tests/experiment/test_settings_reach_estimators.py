@@ -72,7 +72,7 @@ def test_an_estimator_is_given_its_options_and_the_common_settings(tunable):
     ("options", "expected"),
     [
         ({"tunable": {"gian": 1.0}}, "estimator tunable has no option gian; it has gain, mode"),
-        ({"plain": {"gain": 1.0}}, "estimator plain has no option gain; it has none"),
+        ({"plain": {"gain": 1.0}}, "estimator plain has no option gain; it has none; tunable has it"),
     ],
 )
 def test_an_option_nobody_reads_is_refused_before_anything_runs(tunable, monkeypatch, options, expected):
