@@ -51,7 +51,7 @@ WITHOUT = {
 # standard deviation. The weights of a robust loss change with every step, so that shorter steps are many.
 _NEGLIGIBLE = 0.5
 _MOST_STEPS, _MOST_HALVINGS = 10, 6
-_UNSOLVED = "the window was not solved to its minimum; further such windows are not listed"
+_UNSOLVED = "the last step in the window was longer than one standard deviation; further such windows are not listed"
 _UNIT = gtsam.noiseModel.Unit.Create(1)
 
 
@@ -272,7 +272,7 @@ class SlidingWindow:
             linear = self._linear(graph)
             self._tree = linear.eliminateMultifrontal(ordering)
             step = self._tree.optimize()
-            if linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step) <= _NEGLIGIBLE:
+            if abs(linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)) <= _NEGLIGIBLE:
                 self._values = self._values.retract(step)
                 return True
             shortened = (self._values.retract(step.scale(0.5**halvings)) for halvings in range(_MOST_HALVINGS + 1))

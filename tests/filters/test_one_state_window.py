@@ -84,4 +84,4 @@ def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_step
     sequence = simulate(replace(DRIVE, duration_s=0.6), 0)
     done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
     assert done.status == "ok"
-    assert sum("not solved to its minimum" in line for line in done.log) == told
+    assert sum("longer than one standard deviation" in line for line in done.log) == told
