@@ -795,7 +795,7 @@ ELSEWHERE = {
 def test_every_advice_about_a_recording_is_followed_in_a_test() -> None:
     folders = ("datasets", "frontend", "settings", "files")
     modules = {path for folder in folders for path in (TOOLKIT / folder).rglob("*.py")}
-    of_trajectories = set((TOOLKIT / "datasets/trajectories").iterdir())  # evaluation/test_public_cases
+    of_trajectories = set((TOOLKIT / "datasets/trajectories").glob("*.py"))  # evaluation/test_public_cases
     told = advice_in([*(modules - of_trajectories), TOOLKIT / "sequence.py", TOOLKIT / "arrays.py"])
     assert ELSEWHERE.keys() <= told
     lacking = {advice for advice in told - ELSEWHERE.keys() if not _WRITTEN_ANEW.match(advice)}

@@ -454,7 +454,7 @@ TYPED: list[tuple[Typed, str, Typed]] = [
 def test_every_advice_about_a_trajectory_is_followed_in_a_test() -> None:
     followed = [advice for _, steps in ADVICE for advice, _ in steps] + [advice for _, advice, _ in TYPED]
     followed += ["leave out the convention of covariances", "choose a format with stamps"]  # below
-    told = advice_in([*(TOOLKIT / "datasets/trajectories").iterdir(), TOOLKIT / "evaluation/scoring.py"])
+    told = advice_in([*(TOOLKIT / "datasets/trajectories").glob("*.py"), TOOLKIT / "evaluation/scoring.py"])
     assert ELSEWHERE.keys() <= told
     assert not [advice for advice in told - ELSEWHERE.keys() if not is_followed(advice, followed)]
 
