@@ -11,6 +11,7 @@ from msgspec import structs
 from toolkit.gate.baseline import (
     BaselineError,
     installed_releases,
+    json_text,
     load_baseline,
     other_releases,
     to_text,
@@ -35,6 +36,13 @@ def test_a_baseline_is_readable(baseline, path):
     rows = [line for line in text.splitlines() if '"ate_se3_m": [' in line]
     assert len(rows) == 6  # an estimator and sequence a line, all of its seeds on it
     assert all(line.endswith(("]", "],")) for line in rows)
+
+
+def test_brackets_in_a_text_stay_as_they_are():
+    given = {"truth": "/data/[ old ]/truth.tum", "names": ["x [", "y ]"], "empty": [], "seeds": [1, 2]}
+    text = json_text(given)
+    assert json.loads(text) == given
+    assert '"seeds": [1, 2]' in text
 
 
 def test_not_a_number_is_never_written(baseline):

@@ -315,7 +315,8 @@ def _case(record: CaseRecord) -> tuple[Case, Measured]:
 
 def json_text(value: object) -> str:
     """Return JSON for people to review: a list of numbers or of short words is one line."""
-    return re.sub(r"\[[^][{}]*\]", _on_one_line, json.dumps(value, indent=2, allow_nan=False)) + "\n"
+    # A line ends behind the bracket of a list alone, never inside a text.
+    return re.sub(r"\[\n[^][{}]*\n *\]", _on_one_line, json.dumps(value, indent=2, allow_nan=False)) + "\n"
 
 
 def _on_one_line(found: "re.Match[str]") -> str:
