@@ -82,6 +82,10 @@ def test_the_paired_difference_is_that_of_the_seeds_both_have():
     assert paired([1.0, 2.0], [1.0, 2.0]).seeds_needed == np.inf
 
 
+def test_a_difference_that_is_no_number_is_not_significant():
+    assert not Paired(3, -np.inf, np.nan).is_significant
+
+
 def test_equal_estimators_are_distinguished_at_5_percent_and_others_by_the_seeds_reported_to_be_needed():
     rng, half = np.random.default_rng(5), 0.5  # of the standard deviation of a difference
     needed = round(Paired(100, half, 1.0 / np.sqrt(100)).seeds_needed)

@@ -86,7 +86,7 @@ class Paired:
     def is_significant(self) -> bool:
         """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
         _, low, high = self.interval
-        return not low <= 0.0 <= high
+        return low > 0.0 or high < 0.0
 
     @property
     def seeds_needed(self) -> float:
