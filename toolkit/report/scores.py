@@ -163,7 +163,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         check_promised(dict(self.metrics))
-        if self.counts != {status: self.status.count(status) for status in self.counts}:
+        if self.counts != {status: self.status.count(status) for status in STATUS_MEANING}:
             raise ValueError("counts does not count status")
         for key, metric in self.metrics.items():
             if len(metric.values) != len(self.status):
