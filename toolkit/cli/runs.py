@@ -53,7 +53,7 @@ def report(options: argparse.Namespace) -> int:
     arg("--estimator NAME", "an estimator, or truth (default: the only one there is)"),
     choice("--output", ("causal", "final"), "default: final, where there is one"),
     choice("--format", FORMATS, "of the file; KITTI has no stamps"),
-    choice("--cov-convention NAME", COV_CONVENTIONS, "write covariances, too, in one of these conventions"),
+    choice("--cov-convention NAME", COV_CONVENTIONS, f"write covariances, too ({', '.join(COV_CONVENTIONS)})"),
     arg("--out FILE", "the file to write", Path),
     arg("--bundle FILE.zip", "write all of the run but its figures as one file for vislam reproduce", Path),
     examples=(
