@@ -320,3 +320,9 @@ def test_truth_and_trajectories_are_where_the_document_says(run_directory: Path)
     files += [one["landmarks"] for one in document["maps"]]
     assert len(files) == len(set(files)) > 5
     assert all((run_directory / name).is_file() for name in files)
+
+
+def test_counts_over_seeds_are_of_every_status() -> None:
+    document = json.loads((OLD / "seeds.json").read_text())
+    document["runs"][0]["counts"] = {}
+    assert "counts does not count status" in refused("seeds.json", document)
