@@ -180,10 +180,12 @@ def _calibration(file: Path, where: str) -> Fields:
     if not file.exists():
         raise DataError(f"{file}: is missing; {where}")
     arrays: dict[str, np.ndarray] = {}
-    for line in read_text_input(file, "KITTI's calibration is text").splitlines():
+    lines = [line for line in read_text_input(file, "KITTI's calibration is text").splitlines() if line.strip()]
+    # A row that is no numbers keeps its place, so that none after it is taken for another.
+    for row, line in enumerate(lines):
         key, colon, rest = line.rpartition(":")
         with suppress(ValueError):
-            arrays[key.strip() if colon else f"P{len(arrays)}"] = np.array([float(word) for word in rest.split()])
+            arrays[key.strip() if colon else f"P{row}"] = np.array([float(word) for word in rest.split()])
     return Fields(file, arrays)
 
 
