@@ -15,6 +15,7 @@ from tests.datasets.conftest import assert_refused
 from toolkit.cli import main
 from toolkit.datasets import own_tables
 from toolkit.datasets.trajectories import tum
+from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.measurements import is_left_only
@@ -237,6 +238,21 @@ def test_columns_of_an_imu_go_by_many_names(tmp_path: Path, names: tuple[str, ..
     table.write_text("\n".join([",".join([stamp, *names]), *table.read_text().splitlines()[1:]]) + "\n")
     np.testing.assert_array_equal(own_tables.load(folder).motion.values, original.motion.values)
     assert own_tables.read("own", folder / "tracks.csv", table, folder / "rig.toml").unused == ()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "others"),
+    [
+        (("a_RS_S_", "w_RS_S_"), ("b_w_RS_S_", "b_a_RS_S_")),
+        (("acc_", "gyro_"), ("gyro_bias_", "acc_bias_")),
+        (("linear_acceleration.", "angular_velocity."), ("angular_acceleration.",)),
+        (("linearAcceleration.", "angularVelocity."), ()),
+    ],
+)
+def test_columns_of_other_quantities_are_not_an_imus(wanted: tuple[str, ...], others: tuple[str, ...]) -> None:
+    expected = tuple(f"{name}{axis}" for name in wanted for axis in "xyz")
+    assert imu_columns([f"{name}{axis}" for name in others for axis in "xyz"]) == ()
+    assert imu_columns(["t", *(f"{name}{axis}" for name in others for axis in "xyz"), *expected]) == expected
 
 
 @pytest.mark.parametrize("empty", ["", "nan"])

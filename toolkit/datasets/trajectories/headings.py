@@ -17,8 +17,8 @@ _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nsecs", "nanosec"
 _STAMPS = ("t", "time", "timestamp", "stamp", "ts", "ns", *_SECONDS, *_NANOSECONDS)
 _POSITIONS = ("", "p", "pos", "position", "t", "trans", "translation", "location", "xyz")
 _QUATERNIONS = ("q", "quat", "quaternion", "orientation", "rot", "rotation")
-_ACCELERATIONS = ("alpha", "a", "acc", "accel", "acceleration", "accelerometer")
-_RATES = ("omega", "w", "g", "gyr", "gyro", "gyroscope", "angular")
+_ACCELERATIONS = ("arss", "alpha", "a", "acc", "accel", "acceleration", "accelerometer", "linearacceleration")
+_RATES = ("wrss", "omega", "w", "g", "gyr", "gyro", "gyroscope", "angularvelocity")
 _IN_BRACKETS, _BETWEEN_WORDS = re.compile(r"[\[(](.*?)[\])]"), re.compile(r"[^a-z0-9]+")
 
 
@@ -70,11 +70,14 @@ def imu_columns(names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of accelerations and of rates of rotation, x y z each, whatever a program calls them, or none.
 
     ``a_RS_S_x``, ``alpha_x`` (Kalibr), ``ax``, ``acc_x`` and ``linear_acceleration.x`` are one and the same, as are
-    ``w_RS_S_x``, ``omega_x``, ``wx``, ``gx``, ``gyro_x`` and ``angular_velocity.x``.
+    ``w_RS_S_x``, ``omega_x``, ``wx``, ``gx``, ``gyro_x`` and ``angular_velocity.x``. Names with more words are those of
+    other quantities: ``b_w_RS_S_x`` is a bias, ``angular_acceleration.x`` no force.
     """
-    there = list(names)
-    words = list(map(_words, there))
-    found = [there[at] for kinds in (_ACCELERATIONS, _RATES) for at in _axes(words, "xyz", kinds)]
+    plain = {"".join(_words(name)).removeprefix("field"): name for name in names}
+    found: list[str] = []
+    for kinds in (_ACCELERATIONS, _RATES):
+        sets = ([plain.get(f"{kind}{axis}", "") for axis in "xyz"] for kind in kinds)
+        found += next((one for one in sets if all(one)), [])
     return tuple(found) if len(found) == 6 else ()
 
 
