@@ -14,6 +14,7 @@ import toolkit
 from tests.datasets.conftest import assert_refused
 from toolkit.cli import main
 from toolkit.datasets import own_tables
+from toolkit.datasets.io.tables import columns_given
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError
@@ -201,6 +202,12 @@ def test_a_right_image_that_is_missing_leaves_the_sighting_of_the_left_one(
     uv_px = own_tables.read("own", **given, rig=rig_of(sequence)).sequence.observations.uv_px
     np.testing.assert_array_equal(is_left_only(uv_px), lacking)
     np.testing.assert_allclose(uv_px[:, [0, 2]], seen.uv_px[:, [0, 2]], rtol=0.0, atol=1e-12)  # v is a mean of two
+
+
+def test_an_empty_text_of_a_program_is_none_as_one_of_a_file_is() -> None:
+    for cells in (["1", " ", "3"], np.array(["1", "", "3"]), np.array(["1", "", "3"], dtype=object)):
+        found = columns_given("tracks", {"uR": cells}).numbers_or_none("uR")
+        np.testing.assert_array_equal(found[:, 0], [1.0, np.nan, 3.0])
 
 
 def test_an_empty_cell_of_the_right_image_is_none(tmp_path: Path) -> None:

@@ -105,8 +105,9 @@ class Columns:
         return np.stack([self._numbers(name) for name in names], axis=1)
 
     def numbers_or_none(self, *names: str) -> Array:
-        """Return columns as :meth:`numbers` does, with NaN where a CSV has nothing."""
-        texts = {name: values for name in names if isinstance(values := self.values[name], tuple)}
+        """Return columns as :meth:`numbers` does, with NaN where a text is empty."""
+        given = {name: self.values[name] for name in names}
+        texts = {name: cells for name, cells in given.items() if all(isinstance(cell, str) for cell in cells)}
         filled = {name: tuple(cell.strip() or "nan" for cell in cells) for name, cells in texts.items()}
         return replace(self, values={**self.values, **filled}).numbers(*names)
 
