@@ -11,6 +11,7 @@ import pytest
 
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
+from toolkit.errors import DataError
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.measurements import ImuMotion, ImuNoise
 from toolkit.models.stereo import project, triangulate
@@ -143,6 +144,15 @@ def test_extrinsics_are_made_relative_to_an_imu_that_is_not_the_body(recording: 
     (recording / "mav0/imu0/sensor.yaml").write_text(f"{text[0]}T_BS:{text[1]}{densities}")
     rig = load_sequence(str(recording)).rig
     np.testing.assert_allclose(rig.T_imu_cam, se3_inverse(T_body_imu) @ T_IMU_CAM0, atol=1e-10)
+
+
+def test_a_wrong_row_of_a_truth_is_named_as_an_editor_counts_it(recording: Path) -> None:
+    file = recording / "mav0/state_groundtruth_estimate0/data.csv"
+    heading, *rows = file.read_text().splitlines()
+    rows[1] = rows[0]  # the same stamp
+    file.write_text("\n".join(["# Of a program.", "", heading, "", *rows]))
+    with pytest.raises(DataError, match=r"data\.csv: line 6 "):
+        euroc.load(recording)
 
 
 def test_a_truth_of_another_body_is_moved_to_the_imu(recording: Path) -> None:

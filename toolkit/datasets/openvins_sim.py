@@ -159,7 +159,8 @@ def _truth(folder: Path) -> Truth | None:
     path = find_table(folder, _TRUTH)
     if path is None:
         return None
-    table = columns_of_file(path).numbers(*_TRUTH_COLUMNS)
+    columns = columns_of_file(path)
+    table = columns.numbers(*_TRUTH_COLUMNS)
     t_ns = stamps_ns(path, "timestamp", table[:, 0])
-    T_world_imu = checked_poses(path, list(range(2, len(table) + 2)), t_ns, table[:, 1:8])
+    T_world_imu = checked_poses(path, list(columns.numbers_of_rows or ()), t_ns, table[:, 1:8])
     return Truth(t_ns, T_world_imu, table[:, 8:11], table[:, 11:17])

@@ -218,7 +218,7 @@ def _read_csv(path: Path) -> TruthRead:
     values, t_ns = table.numbers(*pose, *(rest if complete else ())), table.whole(table.names[0])
     kept = known_poses(values[:, :7])
     t_ns, values = t_ns[kept], values[kept]
-    T_world_imu = checked_poses(path, (2 + np.flatnonzero(kept)).tolist(), t_ns, values[:, :7])
+    T_world_imu = checked_poses(path, np.array(table.numbers_of_rows)[kept].tolist(), t_ns, values[:, :7])
     lost = int((~kept).sum())
     facts = (f"{lost} of its {kept.size} poses are not finite and left out",) if lost else ()
     truth = Truth(t_ns, T_world_imu, values[:, 7:10], values[:, 10:16]) if complete else Truth(t_ns, T_world_imu)
