@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit.cli import main
 from toolkit.cli.arguments import TOPIC_ROLES
-from toolkit.datasets import load_images, load_sequence
+from toolkit.datasets import bags, load_images, load_sequence
 from toolkit.datasets.bags import ROLES
 from toolkit.datasets.io import bag_reader
 from toolkit.errors import DataError
@@ -531,6 +531,15 @@ def test_a_type_that_is_not_ros_own_is_not_read(asl: Path, tmp_path: Path) -> No
         load_sequence(str(path))
     with bag_reader.opened(path) as bag:
         assert any("of another definition than ROS's" in str(topic) for topic in bag.topics)
+
+
+def test_an_imu_that_published_nothing_is_not_one_to_convert(asl: Path, tmp_path: Path) -> None:
+    path = written(asl, "ros1", tmp_path / "bag", [*images_of(asl, raw(Ros.of("ros1")))])
+    with bag_reader.opened(path) as bag:
+        topics = (*bag.topics, bag_reader.Topic("/imu0", bag_reader.IMU, 0))
+        source = bags.recorded(bag, bags.choose(path, topics, None))
+    with pytest.raises(DataError, match="so nothing measures the motion; record one with the images"):
+        bags._motion_of(source)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

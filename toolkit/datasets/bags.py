@@ -214,7 +214,8 @@ def _twists(source: Recorded) -> TwistSamples:
     if topic is None:
         others = ", ".join(one.name for one in _usable(source.chosen.topics, ROLES["twist"]))
         missing = "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion"
-        like_imus = [one for one in source.chosen.topics if one.is_like(_LIKE_IMU) or one.type == ros.IMU]
+        topics = source.chosen.topics
+        like_imus = [one for one in topics if one.is_like(_LIKE_IMU) or (one.type == ros.IMU and one.unreadable)]
         if like_imus and not others:
             raise DataError(
                 f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read; "
