@@ -20,6 +20,8 @@ _EXAMPLES = 4
 # Which of these names an argument takes, by its destination.
 _KINDS_OF = {
     "estimators": "estimators",
+    "start_at": "estimators",
+    "goal": "estimators",
     "sequence": "sequences",
     "sequences": "sequences",
     "columns": "metrics",
