@@ -1,5 +1,6 @@
 """Comparisons within a program say what the command line says, from a script or a notebook."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -369,6 +370,14 @@ def test_nothing_slow_is_imported_before_it_is_used() -> None:
     messages = surrounded(["-c", program], None, Path())
     assert messages.startswith("[] ")
     assert all(repr(name) in messages for name in toolkit.__all__)
+
+
+def test_all_of_the_api_and_its_methods_are_explained() -> None:
+    for name in toolkit.__all__:
+        found = getattr(toolkit, name)
+        parts = vars(found).items() if isinstance(found, type) else ()
+        told = [found, *(getattr(found, part) for part, value in parts if callable(value) and part[0] != "_")]
+        assert all(inspect.getdoc(part) for part in told), name
 
 
 def test_a_sweep_is_the_rows_of_a_long_table_and_shows_itself() -> None:
