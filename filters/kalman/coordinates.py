@@ -6,12 +6,11 @@ parametrization for monocular SLAM"). A Gauss-Newton step in metres extrapolates
 at the linearisation point, overshoots, and pulls the pose along.
 
 Right-invariant: with X = (R, p, v, l_1 ... l_L) in SE_{2+L}(3), the velocity only where it is part of the state, the
-error is the xi of
-``X = exp(xi) X_estimated``: one rotation theta of the whole world and a displacement rho of each of its vectors. In
-terms of the other filters' errors, to first order, ``theta = R phi``, ``rho_p = R delta_p + p x theta``, likewise for
-the velocity, and ``rho_l = delta_l + l x theta``. A translation or rotation of the world is then the same vector xi at
-every estimate, so that Jacobians evaluated at changing estimates keep the same unobservable directions. The biases stay
-outside the group and are added (the "imperfect" invariant filter).
+error is the xi of ``X = exp(xi) X_estimated``: one rotation theta of the whole world and a displacement rho of each of
+its vectors. In terms of the other filters' errors, to first order, ``theta = R phi``, ``rho_p = R delta_p + p x
+theta``, likewise for the velocity, and ``rho_l = delta_l + l x theta``. A translation or rotation of the world is then
+the same vector xi at every estimate, so that Jacobians evaluated at changing estimates keep the same unobservable
+directions. The biases stay outside the group and are added (the "imperfect" invariant filter).
 
 Sources: Barrau & Bonnabel 2015, "An EKF-SLAM algorithm with consistency properties", sections III-IV; Barrau & Bonnabel
 2017, "The invariant extended Kalman filter as a stable observer".
@@ -28,7 +27,6 @@ from toolkit.geometry import (
     IntArray,
     se3_adjoint,
     se3_inverse,
-    se3_right_jacobian,
     skew,
     so3_left_jacobian,
     transform,
@@ -153,13 +151,21 @@ class CloneAnchoredBelief(JointBelief):
         return np.concatenate([of_point, of_point @ turn @ skew(in_imu), -of_point @ turn], axis=2)
 
 
-class InvariantBelief(JointBelief):
-    """A joint belief that is corrected on the group.
+class AnchoredBelief(LandmarkAnchors):
+    """A joint belief that is corrected on the group, with inverse-depth landmarks whose anchors move with the IMU.
 
     The covariance is kept in the coordinates of every joint belief, so that it can be read, propagated and extended by
     landmarks without conversion: to first order the two errors are linear functions of each other and propagate alike.
     They differ only where an estimate moves. An update yields the covariance of the right-invariant error; moving the
     estimate leaves that covariance unchanged, and the one kept here changes by the change of coordinates.
+
+    A landmark's depth is not Gaussian, while the stereo sighting that started it is linear in inverse depth. For an
+    update of one step this hardly matters. An iterated update would weight new sightings at the new depth, but the
+    prior, which stands for the old sightings, as if they had been made from the old depth; it would shrink or stretch
+    the world. So a landmark has an anchor here, the camera that first saw it, and its error is one of (x / z, y / z, 1
+    / z) in the anchor's axes (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). The
+    anchor moves with the IMU, so the error is that of the landmark relative to the pose. Translations and rotations of
+    the whole world are therefore the same vectors at every estimate.
     """
 
     def move(self, delta: Array) -> None:
@@ -168,70 +174,6 @@ class InvariantBelief(JointBelief):
         self._displace(delta)
         carried = self._carried(before, self._carried(before, self._cov).T)
         self._cov = 0.5 * (carried + carried.T)
-
-    def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
-        """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
-
-        In the right-invariant error a sighting does not depend on a translation or rotation of the whole world: its
-        Jacobian A to the landmark's rho is minus that to the position's, and its Jacobian to theta is zero. Only
-        ``rho_l - rho_p`` enters, and the left Jacobian of SE(3) at (theta, rho_l - rho_p) converts it to the error
-        before the move.
-        """
-        old, newest = self.clones[-1], delta[self.clone_columns][-6:]
-        turn, away = old[:3, :3], self.points - old[:3, 3]
-        theta, shift = turn @ newest[:3], turn @ newest[3:]
-        relative = delta[self.landmark_columns].reshape(-1, 3) - shift + np.cross(away, theta)
-        left = se3_right_jacobian(-np.column_stack([np.tile(theta, (len(away), 1)), relative]))
-        to_theta, to_rho = H_point @ left[:, 3:, :3], H_point @ left[:, 3:, 3:]
-        return np.concatenate([(to_theta + to_rho @ skew(away)) @ turn, -to_rho @ turn], axis=2), to_rho
-
-    def _displace(self, delta: Array) -> None:
-        super()._displace(self._on_the_group(delta))
-
-    def _on_the_group(self, delta: Array) -> Array:
-        """Return the error that moves velocity and landmarks by addition as the group's exponential map would.
-
-        ``exp(theta) l + J(theta) (delta_l + l x theta) = l + J(theta) delta_l``: the vector turns as it grows, like the
-        position in the exponential map of a pose.
-        """
-        result, layout, phi = delta.copy(), self._core.layout, delta[ROTATION]
-        own = delta[self.landmark_columns].reshape(-1, 3)
-        turning = so3_left_jacobian(self._core.T_world_imu[:3, :3] @ phi)
-        result[self.landmark_columns] = (own @ turning.T).reshape(-1)
-        if layout.velocity is not None:
-            result[layout.velocity] = so3_left_jacobian(phi) @ delta[layout.velocity]
-        return result
-
-    def _carried(self, before: JointBelief, rows: Array) -> Array:
-        """Return errors (n, m) at the estimates before a move as errors at the present estimates, for the same xi.
-
-        Only differences of positions enter, so no precision is lost far from the origin.
-        """
-        result, old, new = rows.copy(), before.core, self._core
-        theta = old.T_world_imu[:3, :3] @ rows[ROTATION]
-        result[POSE] = se3_adjoint(se3_inverse(new.T_world_imu) @ old.T_world_imu) @ rows[POSE]
-        velocity = old.layout.velocity
-        if velocity is not None:
-            in_world = old.T_world_imu[:3, :3] @ rows[velocity] - skew(new.v_world - old.v_world) @ theta
-            result[velocity] = new.T_world_imu[:3, :3].T @ in_world
-        turns = se3_adjoint(se3_inverse(self.clones) @ before.clones)
-        of_clones = turns @ rows[self.clone_columns].reshape(len(turns), 6, rows.shape[1])
-        result[self.clone_columns] = of_clones.reshape(-1, rows.shape[1])
-        result[self.landmark_columns] -= (skew(self.points - before.points) @ theta).reshape(-1, rows.shape[1])
-        return result
-
-
-class AnchoredBelief(LandmarkAnchors, InvariantBelief):
-    """An invariant belief with inverse-depth landmarks whose anchors move with the IMU.
-
-    A landmark's depth is not Gaussian, while the stereo sighting that started it is linear in inverse depth. For an
-    update of one step this hardly matters. An iterated update would weight new sightings at the new depth, but the
-    prior, which stands for the old sightings, as if they had been made from the old depth; it would shrink or stretch
-    the world. So a landmark has an anchor here, the camera that first saw it, and its error is one of (x / z, y / z, 1
-    / z) in the anchor's axes (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). The
-    anchor moves with the IMU, so the error is that of the landmark relative to the pose. Translations and rotations of
-    the whole world are therefore the same vectors at every estimate, as in the invariant belief.
-    """
 
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
@@ -246,13 +188,29 @@ class AnchoredBelief(LandmarkAnchors, InvariantBelief):
     def _displace(self, delta: Array) -> None:
         T_imu_world, anchored = se3_inverse(self._core.T_world_imu), self._anchored()
         change = inverse_depth_jacobian(anchored) @ self._relative(delta[:, None])
-        super()._displace(delta)
+        on_the_group, velocity = delta.copy(), self._core.layout.velocity
+        if velocity is not None:
+            # exp(theta) v + J(theta) (delta_v + v x theta) = v + J(theta) delta_v: the vector turns as it grows.
+            on_the_group[velocity] = so3_left_jacobian(delta[ROTATION]) @ delta[velocity]
+        super()._displace(on_the_group)
         self.anchors = self._core.T_world_imu @ T_imu_world @ self.anchors
         self.points = transform(self.anchors, inverse_depth(inverse_depth(anchored) + change[..., 0]))
 
-    def _carried(self, before: JointBelief, rows: Array) -> Array:
-        assert isinstance(before, AnchoredBelief)
-        result, turn = super()._carried(before, rows), self._core.T_world_imu[:3, :3]
+    def _carried(self, before: "AnchoredBelief", rows: Array) -> Array:
+        """Return errors (n, m) at the estimates before a move as errors at the present estimates, for the same xi.
+
+        Only differences of positions enter, so no precision is lost far from the origin.
+        """
+        result, old, new = rows.copy(), before.core, self._core
+        result[POSE] = se3_adjoint(se3_inverse(new.T_world_imu) @ old.T_world_imu) @ rows[POSE]
+        velocity, turn = old.layout.velocity, new.T_world_imu[:3, :3]
+        if velocity is not None:
+            theta = old.T_world_imu[:3, :3] @ rows[ROTATION]
+            in_world = old.T_world_imu[:3, :3] @ rows[velocity] - skew(new.v_world - old.v_world) @ theta
+            result[velocity] = turn.T @ in_world
+        turns = se3_adjoint(se3_inverse(self.clones) @ before.clones)
+        of_clones = turns @ rows[self.clone_columns].reshape(len(turns), 6, rows.shape[1])
+        result[self.clone_columns] = of_clones.reshape(-1, rows.shape[1])
         relative = self.anchors[:, :3, :3] @ before._stretch(self) @ before._relative(rows)
         with_imu = turn @ result[POSITION] - skew(self._away()) @ (turn @ result[ROTATION])
         result[self.landmark_columns] = (relative + with_imu).reshape(-1, rows.shape[1])

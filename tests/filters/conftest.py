@@ -6,15 +6,13 @@ a tiny share of the stated ones is linear in effect: what a filter linearises at
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import gtsam
 import numpy as np
 
-from filters.ekf_slam import JointEkf
-from filters.kalman.coordinates import AnchoredBelief, InvariantBelief
-from filters.kalman.joint import AtLatestEstimates, JointBelief, forget_lost, propagate
-from filters.kalman.online_output import LandmarkMemory
+from filters.kalman.coordinates import AnchoredBelief
+from filters.kalman.joint import AtLatestEstimates, JointBelief, propagate
 from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
@@ -180,26 +178,10 @@ def off_at_the_end_m(sequence: Sequence, estimate: Estimate) -> float:
     return float(np.linalg.norm(estimate.T_world_imu[:3, 3] - sequence.truth.T_world_imu[-1, :3, 3]))
 
 
-def carried(
-    scenario: Scenario, belief: Callable[..., JointBelief], tracks: int
-) -> tuple[JointBelief, StereoFrame, StereoRig]:
-    """Return a joint belief that has been filtered for six frames and carried to the next, that frame and its rig."""
-    sequence, at = short(scenario, 1.0, tracks, 3), AtLatestEstimates()
-    ekf, packets = JointEkf(setup_of(sequence), at, partial(belief, sequence.rig)), list(sequence.packets())
-    for packet in packets[:6]:
-        ekf.step(packet)
-    joint, frame = ekf.joint, packets[6].frame
-    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), at, packets[6].motion)
-    forget_lost(joint, frame, LandmarkMemory())
-    assert len(joint.landmark_ids) > 5
-    return joint, frame, sequence.rig
-
-
 # How a joint filter's belief is made of a rig and the first core.
 BELIEFS: dict[str, Callable[[StereoRig, Belief], JointBelief]] = {
     "plain": lambda rig, core: JointBelief(core),
-    "riekf": lambda rig, core: InvariantBelief(core),
-    "iekf": lambda rig, core: AnchoredBelief(core, rig.T_imu_cam),
+    "anchored": lambda rig, core: AnchoredBelief(core, rig.T_imu_cam),
 }
 
 
