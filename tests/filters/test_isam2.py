@@ -156,12 +156,6 @@ def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
     assert (run.status, run.log) == ("ok", ())
 
 
-@pytest.mark.parametrize("index", [0, 7, 2**56 - 1])
-def test_the_kind_of_a_key_is_that_of_gtsams_symbol(index):
-    for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index)}.items():
-        assert kind_of(key) == kind == chr(gtsam.Symbol(key).chr())
-
-
 def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     """What a frame may linearise anew is bounded, however far the past moves; in the end all of it is.
 

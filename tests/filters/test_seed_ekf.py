@@ -148,14 +148,6 @@ def assert_follows_the_report(sequence: Sequence, prior: Prior, run: Run, tolera
         np.testing.assert_allclose(ours / np.outer(sigma, sigma), expected_cov / np.outer(sigma, sigma), atol=tolerance)
 
 
-def test_it_is_the_report_where_the_gyro_bias_is_known(drive, run_estimator):
-    """With a bias known to 1e-9 rad/s the states our filter has beyond the report's six do nothing."""
-    prior = with_gyro_bias_sigma(drive.prior, 1e-9)
-    known = replace(drive, noise=replace(drive.noise, gyro_random_walk=np.full(3, 1e-9)))
-    # A bias of 1e-9 rad/s is a ten-millionth of the gyro's white noise over a step.
-    assert_follows_the_report(known, prior, run_estimator("seed-ekf", known, prior), 1e-6)
-
-
 def test_it_is_the_report_to_the_letter_from_the_start_of_a_real_recording(drive, run_estimator):
     """The report has no gyro bias: that a recording's start thinks it unknown to 0.02 rad/s must change nothing."""
     prior = with_gyro_bias_sigma(drive.prior, GYRO_BIAS_SIGMA)

@@ -6,8 +6,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.smart import Smart
-from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
@@ -21,9 +19,8 @@ from toolkit.models.stereo_adjustment import (
     Vision,
     solve_window,
 )
-from toolkit.progress import SILENT
 from toolkit.settings import DEFAULTS
-from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.simulation import FLIGHT, simulate
 
 RIG, HUBER = FLIGHT.rig, DEFAULTS.outliers.smoother_huber
 CAMERA = RobustCamera(RIG, HUBER)
@@ -141,15 +138,3 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     one, other = (Vision.at(poses, behind, s, CAMERA).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
     assert Vision.at(poses, behind, seen, CAMERA).losses.sum() > Vision.at(poses, behind, others, CAMERA).losses.sum()
-
-
-def test_the_window_bounds_what_is_kept_of_the_past(run_estimator):
-    """The final answer is each state as it left the window: a longer window corrects it longer."""
-    sequence = simulate(replace(DRIVE, duration_s=6.0, camera=replace(DRIVE.camera, max_tracks=40)), 2)
-
-    def error_m(lag_s):
-        run = runner.run("smart", lambda setup: Smart(setup, lag_s), sequence, sequence.prior, SILENT)
-        assert run.status == "ok"
-        return np.linalg.norm(run.final.positions - run.causal.positions, axis=1).mean()
-
-    assert error_m(0.05) < error_m(0.5) < error_m(2.0)
