@@ -66,35 +66,23 @@ def projection_factors(seen, huber=HUBER):
 
 
 def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landmarks_are_eliminated(scene):
+    """In its loss, in information and vector, and in the steps of the points that complete a step of the poses."""
     poses, points, seen = scene
     outlying = replace(seen, uv_px=seen.uv_px + np.where(np.arange(len(seen.pose)) == 3, 8.0, 0.0)[:, None])
-    linear = projection_factors(outlying).linearize(gtsam_values(poses, points))
-    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
-    n = 6 * POSES
+    factors, values = projection_factors(outlying), gtsam_values(poses, points)
+    vision = Vision.at(poses, points, outlying, CAMERA)
+    assert vision.losses.sum() == pytest.approx(factors.error(values), rel=1e-9)
+    information, vector = factors.linearize(values).hessian(ordering((X, POSES), (L, POINTS)))
+    n, reduced = 6 * POSES, vision.reduced()
     across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
-    reduced = Vision.at(poses, points, outlying, CAMERA).reduced()
     # Rounding, relative to the largest entry.
     scale = np.abs(reduced.information).max()
-    np.testing.assert_allclose(
-        reduced.information, information[:n, :n] - across @ information[n:, :n], atol=1e-9 * scale
-    )
+    expected = information[:n, :n] - across @ information[n:, :n]
+    np.testing.assert_allclose(reduced.information, expected, atol=1e-9 * scale)
     np.testing.assert_allclose(reduced.vector, vector[:n].ravel() - across @ vector[n:].ravel(), atol=1e-9 * scale)
-
-
-def test_its_loss_is_that_of_gtsam_projection_factors(scene):
-    poses, points, seen = scene
-    expected = projection_factors(seen).error(gtsam_values(poses, points))
-    assert Vision.at(poses, points, seen, CAMERA).losses.sum() == pytest.approx(expected, rel=1e-9)
-
-
-def test_point_steps_complete_the_step_of_the_whole_system(scene):
-    poses, points, seen = scene
-    linear = projection_factors(seen).linearize(gtsam_values(poses, points))
-    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
-    held = information + np.eye(len(information)) * np.repeat([1.0, 0.0], [6 * POSES, 3 * POINTS])
+    held = information + np.diag(np.repeat([1.0, 0.0], [n, 3 * POINTS]))
     step = np.linalg.solve(held, vector.ravel())
-    reduced = Vision.at(poses, points, seen, CAMERA).reduced()
-    np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
+    np.testing.assert_allclose(reduced.point_steps(step[:n]).ravel(), step[n:], atol=1e-9)
 
 
 def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_its_minimum(scene):
