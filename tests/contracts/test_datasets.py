@@ -1,6 +1,7 @@
 """What holds for every recording, whatever its source: one list of properties, run over all of them."""
 
 import os
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from toolkit.datasets import built_in_names, load_sequence
 from toolkit.sequence import Sequence
+from toolkit.verify.promises import arrays_of
 
 PROJECT = Path(__file__).parents[2]
 DATA = PROJECT / os.environ.get("VISLAM_DATA", "../shared/data")
@@ -37,22 +39,28 @@ def sequence(source: str) -> Sequence:
     return loaded(source)
 
 
-def test_observations_are_sorted_by_frame_then_track_without_repeats(sequence: Sequence) -> None:
-    frames_on, ids_on = np.diff(sequence.observations.frame), np.diff(sequence.observations.track_id)
-    assert ((frames_on > 0) | ((frames_on == 0) & (ids_on > 0))).all()
-
-
-def test_indices_are_int64_and_frames_exist(sequence: Sequence) -> None:
+def test_sightings_are_finite_and_sorted_by_frame_then_track_without_repeats(sequence: Sequence) -> None:
     seen = sequence.observations
+    frames_on, ids_on = np.diff(seen.frame), np.diff(seen.track_id)
+    assert ((frames_on > 0) | ((frames_on == 0) & (ids_on > 0))).all()
     assert seen.frame.dtype == seen.track_id.dtype == sequence.frames_t_ns.dtype == np.int64
     assert ((seen.frame >= 0) & (seen.frame < sequence.frame_count)).all()
     assert (seen.track_id >= 0).all()
+    assert np.isfinite(seen.uv_px).all()
 
 
-def test_values_are_finite_and_packets_can_be_read(sequence: Sequence) -> None:
-    assert np.isfinite(sequence.observations.uv_px).all()
+def test_packets_can_be_read_and_nothing_can_be_written(sequence: Sequence) -> None:
     assert np.isfinite(sequence.motion.values).all()
     assert sum(1 for _ in sequence.packets()) == sequence.frame_count
+    few = [array for packet in islice(sequence.packets(), 5) for array in arrays_of(packet)]
+    for array in (
+        *few,
+        sequence.frames_t_ns,
+        sequence.observations.uv_px,
+        sequence.motion.t_ns,
+        sequence.rig.T_imu_cam,
+    ):
+        assert not array.flags.writeable
 
 
 def test_calibration_and_noise_are_usable(sequence: Sequence) -> None:
@@ -80,16 +88,6 @@ def test_the_truth_covers_frames_with_rigid_motions(sequence: Sequence) -> None:
     )
 
 
-def test_arrays_cannot_be_written(sequence: Sequence) -> None:
-    for array in (sequence.frames_t_ns, sequence.observations.uv_px, sequence.motion.t_ns, sequence.rig.T_imu_cam):
-        assert not array.flags.writeable
-
-
-def test_loading_twice_gives_the_same_content(source: str, sequence: Sequence) -> None:
+def test_loading_twice_gives_the_same_content_and_says_whence(source: str, sequence: Sequence) -> None:
     assert loaded(source).content_hash() == sequence.content_hash()
-
-
-def test_provenance_says_format_and_source(sequence: Sequence) -> None:
-    assert sequence.name
-    assert sequence.provenance.format
-    assert sequence.provenance.source
+    assert all((sequence.name, sequence.provenance.format, sequence.provenance.source))

@@ -15,14 +15,13 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Trajectory
 from toolkit.estimator import Build, Estimator
 from toolkit.geometry import se3_inverse, se3_log
-from toolkit.measurements import Packet
 from toolkit.models.stereo import triangulate_world
 from toolkit.progress import SILENT
 from toolkit.registry import discover, find
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, noise_free, simulate
 from toolkit.verify import promises
-from toolkit.verify.promises import Watched, arrays_of, watch
+from toolkit.verify.promises import Watched, watch
 from toolkit.verify.threads import UNAVAILABLE, digests_at
 from toolkit.verify.verification import short
 
@@ -83,12 +82,6 @@ def watched(build: Build, scenario: str) -> Watched:
     return watch(build, recording(scenario))
 
 
-@cache
-def exact_run(name: str, build: Build, scenario: str) -> Run:
-    """Run an estimator once over a recording without noise."""
-    return run_on(name, build, exact_recording(scenario))
-
-
 @both_kinds
 def test_it_is_causal_and_deterministic(build: Build, scenario: str) -> None:
     """Withholding later packets leaves earlier answers bit-identical, and the same packets give the same to the end.
@@ -116,19 +109,14 @@ def assert_close_to_truth(trajectory: Trajectory, sequence: Sequence) -> None:
 
 
 @every_scenario
-def test_without_noise_it_recovers_the_truth(name: str, build: Build, scenario: str) -> None:
-    sequence, run = exact_recording(scenario), exact_run(name, build, scenario)
+def test_without_noise_it_recovers_the_truth_and_its_landmarks_are_where_they_are(name, build, scenario) -> None:
+    sequence = exact_recording(scenario)
+    run = run_on(name, build, sequence)
     assert run.status == "ok"
     for trajectory in (run.causal, run.final):
         if trajectory is not None:
             assert_close_to_truth(trajectory, sequence)
-
-
-@both_kinds
-def test_without_noise_its_landmarks_are_where_they_are(name: str, build: Build, scenario: str) -> None:
-    sequence = exact_recording(scenario)
-    landmarks = exact_run(name, build, scenario).landmarks
-    visible, truth = sequence.visible, sequence.truth
+    landmarks, visible, truth = run.landmarks, sequence.visible, sequence.truth
     assert (np.diff(landmarks.track_ids) > 0).all()
     assert np.isin(landmarks.track_ids, visible.track_id).all()
     _, first = np.unique(visible.track_id, return_index=True)
@@ -215,12 +203,6 @@ def test_every_estimator_has_a_one_line_summary(name: str) -> None:
     summary = find(name).summary()
     assert 20 <= len(summary) <= 120
     assert summary.endswith((".", ")"))
-
-
-def test_packet_arrays_are_read_only() -> None:
-    packet: Packet
-    for packet in recording("drive").packets():
-        assert all(not array.flags.writeable for array in arrays_of(packet))
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,12 @@ from toolkit.answers import Run
 from toolkit.audit import audit
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, IntArray, se3, se3_inverse, se3_log
+from toolkit.geometry import Array, about_z, se3, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
-from toolkit.measurements import Prior, StereoRig
+from toolkit.measurements import Prior
 from toolkit.metrics import score_run
-from toolkit.motion_samples import MotionSamples
 from toolkit.registry import discover, find
-from toolkit.sequence import Observations, Sequence, Truth, is_held_out
+from toolkit.sequence import Observations, Sequence, is_held_out
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 from toolkit.verify.verification import short
 
@@ -52,37 +51,21 @@ def turned(sequence: Sequence, yaw_rad: float, shift_m: Array) -> Sequence:
 
     Truth and prior are expressed in it; the measurements stay.
     """
-    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
-    T_new_old = se3(np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]), shift_m)
-    R_new_old, truth, prior = T_new_old[:3, :3], sequence.truth, sequence.prior
-    if truth is not None:
-        v_world = None if truth.v_world is None else truth.v_world @ R_new_old.T
-        truth = replace(truth, T_world_imu=T_new_old @ truth.T_world_imu, v_world=v_world)
-    if prior is not None:
-        prior = replace(prior, T_world_imu=T_new_old @ prior.T_world_imu, v_world=R_new_old @ prior.v_world)
+    T_new_old, truth, prior = se3(about_z(yaw_rad), shift_m), sequence.truth, sequence.prior
+    R_new_old = T_new_old[:3, :3]
+    truth = replace(truth, T_world_imu=T_new_old @ truth.T_world_imu, v_world=truth.v_world @ R_new_old.T)
+    prior = replace(prior, T_world_imu=T_new_old @ prior.T_world_imu, v_world=R_new_old @ prior.v_world)
     return replace(sequence, truth=truth, prior=prior)
-
-
-def renamed(sequence: Sequence, ids: IntArray) -> Sequence:
-    """Return a recording in which the sightings (N,) have other track ids (N,).
-
-    Which tracks are withheld follows from the ids: rename visible tracks alone, or leave the withheld ones out before.
-    """
-    seen = sequence.observations
-    return replace(sequence, observations=Observations.sorted(seen.frame, ids, seen.uv_px))
 
 
 def delayed(sequence: Sequence, by_ns: int) -> Sequence:
     """Return a recording with all stamps ``by_ns`` nanoseconds later."""
-    motion, truth, bridges = sequence.motion, sequence.truth, sequence.bridges
-    if bridges is not None:
-        bridges = replace(bridges, begin_t_ns=bridges.begin_t_ns + by_ns, end_t_ns=bridges.end_t_ns + by_ns)
+    motion, truth = sequence.motion, sequence.truth
     return replace(
         sequence,
         frames_t_ns=sequence.frames_t_ns + by_ns,
         motion=motion.of(motion.t_ns + by_ns, motion.values),
-        truth=None if truth is None else replace(truth, t_ns=truth.t_ns + by_ns),
-        bridges=bridges,
+        truth=replace(truth, t_ns=truth.t_ns + by_ns),
     )
 
 
@@ -92,58 +75,41 @@ def mirrored(sequence: Sequence) -> Sequence:
     The y-axes of body and world are reflected. The two cameras exchange their places, and columns are counted from the
     other side, so that the rig is an ordinary one again.
     """
-    seen, rig, prior = sequence.observations, sequence.rig, sequence.prior
+    seen, rig, motion = sequence.observations, sequence.rig, sequence.motion
+    prior, truth = sequence.prior, sequence.truth
     uv_px = seen.uv_px[:, [1, 0, 2]]
     uv_px[:, :2] = 2.0 * rig.cx_px - uv_px[:, :2]
+    T_left_right = se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
+    exchange = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return replace(
         sequence,
-        rig=_mirrored_rig(rig),
+        rig=replace(
+            rig,
+            T_imu_cam=_POSE_Y @ rig.T_imu_cam @ T_left_right @ _CAMERA_X,
+            cov_uv_px2=exchange @ rig.cov_uv_px2 @ exchange.T,
+        ),
         observations=replace(seen, uv_px=uv_px),
-        motion=_mirrored_samples(sequence.motion),
+        motion=motion.of(motion.t_ns, motion.values * np.concatenate([np.diag(_Y), np.diag(_ROTATION)])),
         gravity_world=_Y @ sequence.gravity_world,
-        prior=None if prior is None else _mirrored_prior(prior),
-        truth=None if sequence.truth is None else _mirrored_truth(sequence.truth),
+        prior=replace(
+            prior,
+            T_world_imu=mirrored_poses(prior.T_world_imu),
+            v_world=_Y @ prior.v_world,
+            bias=STATE_MIRROR[9:] * prior.bias,
+            cov=STATE_MIRROR[:, None] * prior.cov * STATE_MIRROR,
+        ),
+        truth=replace(
+            truth,
+            T_world_imu=mirrored_poses(truth.T_world_imu),
+            v_world=truth.v_world @ _Y,
+            bias=truth.bias * STATE_MIRROR[9:],
+        ),
     )
 
 
 def mirrored_poses(T_world_imu: Array) -> Array:
     """Return poses (..., 4, 4) as a mirror shows them, and those of a mirrored recording as they are."""
     return np.asarray(_POSE_Y @ T_world_imu @ _POSE_Y)
-
-
-def _mirrored_rig(rig: StereoRig) -> StereoRig:
-    T_left_right = se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
-    exchange = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return replace(
-        rig,
-        T_imu_cam=_POSE_Y @ rig.T_imu_cam @ T_left_right @ _CAMERA_X,
-        cov_uv_px2=exchange @ rig.cov_uv_px2 @ exchange.T,
-    )
-
-
-def _mirrored_samples(motion: MotionSamples) -> MotionSamples:
-    if not motion.values.size:
-        return motion
-    return motion.of(motion.t_ns, motion.values * np.concatenate([np.diag(_Y), np.diag(_ROTATION)]))
-
-
-def _mirrored_prior(prior: Prior) -> Prior:
-    return replace(
-        prior,
-        T_world_imu=mirrored_poses(prior.T_world_imu),
-        v_world=_Y @ prior.v_world,
-        bias=STATE_MIRROR[9:] * prior.bias,
-        cov=STATE_MIRROR[:, None] * prior.cov * STATE_MIRROR,
-    )
-
-
-def _mirrored_truth(truth: Truth) -> Truth:
-    return replace(
-        truth,
-        T_world_imu=mirrored_poses(truth.T_world_imu),
-        v_world=None if truth.v_world is None else truth.v_world @ _Y,
-        bias=None if truth.bias is None else STATE_MIRROR[9:] * truth.bias,
-    )
 
 
 @cache
@@ -153,11 +119,12 @@ def recording(scenario: str) -> Sequence:
 
 def with_other_names(sequence: Sequence) -> Sequence:
     """Return a recording with large names of tracks in the opposite order; the same tracks are withheld."""
-    names, track = np.unique(sequence.observations.track_id, return_inverse=True)
+    seen = sequence.observations
+    names, track = np.unique(seen.track_id, return_inverse=True)
     others = 10**9 + np.arange(40 * names.size)[::-1]
     withheld, new = is_held_out(names), np.empty_like(names)
     new[withheld], new[~withheld] = (others[is_held_out(others) == kind][: (withheld == kind).sum()] for kind in (1, 0))
-    return renamed(sequence, new[track])
+    return replace(sequence, observations=Observations.sorted(seen.frame, new[track], seen.uv_px))
 
 
 def as_it_is(sequence: Sequence) -> Sequence:
@@ -171,10 +138,8 @@ def retold(sequence: Sequence) -> Sequence:
 
 def back(T_world_imu: Array, yaw_rad: float, in_mirror: bool) -> Array:
     """Return poses (..., 4, 4) in the world of the recording as it was."""
-    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
-    T_new_old = se3(np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]), SHIFT_M)
     poses = mirrored_poses(T_world_imu) if in_mirror else T_world_imu
-    return np.asarray(se3_inverse(T_new_old) @ poses)
+    return np.asarray(se3_inverse(se3(about_z(yaw_rad), SHIFT_M)) @ poses)
 
 
 def signs(size: int) -> Array:
