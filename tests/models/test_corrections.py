@@ -30,23 +30,19 @@ def corrected(belief):
     return [belief.moved(gain @ root @ draw, belief.cov - gain @ S @ gain.T) for draw in draws]
 
 
-def test_a_consistent_correction_has_a_chi_square_length(belief, corrected):
-    found = [summed([Correction.of(belief, after)]) for after in corrected]
-    assert {test.dof for test in found} == {ROWS}
-    # The mean of so many chi-square variables is within four of its standard errors.
-    assert abs(np.mean([test.nis for test in found]) - ROWS) < 4.0 * np.sqrt(2.0 * ROWS / COUNT)
-
-
 def summed(corrections):
     """Return the test of a sum of corrections."""
     total = Correction(sum(each.moved for each in corrections), sum(each.taken for each in corrections))
     return total.test(np.sqrt(np.diag(total.taken)))
 
 
-def test_a_sum_of_independent_corrections_is_no_longer_than_chance_has_it(belief, corrected):
-    ten = [summed([Correction.of(belief, after) for after in corrected[k : k + 10]]) for k in range(0, COUNT, 10)]
-    assert {test.dof for test in ten} == {ROWS}
-    assert abs(np.mean([test.nis for test in ten]) - ROWS) < 4.0 * np.sqrt(2.0 * ROWS / len(ten))
+@pytest.mark.parametrize("together", [1, 10])
+def test_consistent_corrections_and_sums_of_them_have_chi_square_lengths(belief, corrected, together):
+    each = [Correction.of(belief, after) for after in corrected]
+    found = [summed(each[k : k + together]) for k in range(0, COUNT, together)]
+    assert {test.dof for test in found} == {ROWS}
+    # The mean of so many chi-square variables is within four of its standard errors.
+    assert abs(np.mean([test.nis for test in found]) - ROWS) < 4.0 * np.sqrt(2.0 * ROWS / len(found))
 
 
 def test_a_sum_shows_what_leans_one_way_and_no_single_correction_shows(belief, corrected):

@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from tests.models.conftest import numerical_jacobian
 from toolkit.datasets import load_sequence
 from toolkit.geometry import Array
 from toolkit.initialization import start_from_measurements
@@ -53,40 +52,6 @@ def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) 
 def predicted(motion: ImuMotion, start: Belief) -> Belief:
     """Return a state predicted over a motion that is preintegrated about its own bias."""
     return start.predicted(MODEL.integrate(motion, start.bias).predict(start))
-
-
-def test_bias_jacobian_describes_a_new_preintegration_too(motion):
-    """What the filter does at each frame: preintegrate afresh about the latest bias."""
-    start = at(np.eye(4), np.array([3.0, -1.0, 0.5]), BIAS)
-    end = predicted(motion, start)
-    numerical = numerical_jacobian(lambda d: end.error_to(predicted(motion, start.moved(d, start.cov))), 15)
-    transition = MODEL.integrate(motion, BIAS).predict(start).transition
-    dt_s = motion.dt_s.sum()
-    # The midpoint turn of each specific force also depends on the gyro bias, by half a step; GTSAM's Jacobian does not
-    # know: over n steps that is 1 / n of the effect on the velocity, 0.5 g dt^2, and less on the position.
-    half_step = 0.5 * 9.81 * dt_s**2 / len(motion.dt_s)
-    np.testing.assert_allclose(transition[:6], numerical[:6], atol=1.5 * half_step * dt_s)
-    np.testing.assert_allclose(transition[6:9], numerical[6:9], atol=1.5 * half_step)
-    np.testing.assert_allclose(transition[9:], numerical[9:], atol=1e-9)
-
-
-def test_noise_covariance_is_that_of_the_sampled_noise(motion):
-    """Monte Carlo: every sample of the interval gets the white noise of its density, the bias walks on."""
-    noise = FLIGHT.motion.noise
-    start, rng, draws = at(np.eye(4), np.zeros(3), np.zeros(6)), np.random.default_rng(7), 2000
-    clean, end = MODEL.integrate(motion, start.bias).predict(start), predicted(motion, start)
-    density = np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
-    errors = np.empty((draws, 9))
-    for i in range(draws):
-        white = density * rng.standard_normal((motion.dt_s.size, 6)) / np.sqrt(motion.dt_s)[:, None]
-        noisy = ImuMotion(motion.dt_s, motion.accel_mps2 + white[:, :3], motion.gyro_radps + white[:, 3:])
-        errors[i] = end.error_to(predicted(noisy, start))[:9]
-    normal = np.linalg.solve(np.linalg.cholesky(clean.noise[:9, :9]), errors.T)
-    # The sample covariance of 2000 normal draws: each entry has a standard error of 0.022 or 0.032; five of them.
-    # The midpoint rule shifts the white noise of the gyro by half a step, which is 1 / n of its effect at most.
-    np.testing.assert_allclose(normal @ normal.T / draws, np.eye(9), atol=0.16 + 0.05)
-    bias_walk = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3) ** 2 * motion.dt_s.sum()
-    np.testing.assert_allclose(clean.noise[9:, 9:], np.diag(bias_walk), rtol=1e-9, atol=1e-18)
 
 
 def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: Belief, end: Belief, k: int) -> tuple[Array, ...]:

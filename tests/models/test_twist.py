@@ -72,20 +72,6 @@ def test_covariance_carries_each_samples_noise_to_the_end(motion):
     np.testing.assert_allclose(step.cov, expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_noise_of_an_interval_does_not_depend_on_how_it_is_cut():
-    """A held twist cut in two is the same motion with the same noise: what a continuous density means."""
-    v_mps, w_radps = np.array([[7.0, 0.5, -0.2]]), np.array([[0.1, -0.2, 0.9]])
-    whole = twist.integrate(TwistMotion(np.array([0.1]), v_mps, w_radps), BIAS, NOISE)
-    halves = TwistMotion(np.array([0.04, 0.06]), np.repeat(v_mps, 2, axis=0), np.repeat(w_radps, 2, axis=0))
-    cut = twist.integrate(halves, BIAS, NOISE)
-    np.testing.assert_allclose(cut.T_start_end, whole.T_start_end, atol=1e-14)
-    np.testing.assert_allclose(cut.d_step_d_bias, whole.d_step_d_bias, atol=1e-14)
-    # Between the cuts the first part's noise is carried on by the motion, in one piece it acts on average: the
-    # difference is of second order in the step, (0.7 m)^2 of the rotation's variance.
-    assert np.abs(cut.cov - whole.cov).max() < 0.5 * 0.7**2 * whole.cov[:3, :3].max()
-    np.testing.assert_allclose(cut.cov[:3, :3], whole.cov[:3, :3], rtol=0.01, atol=0.01 * whole.cov[0, 0])
-
-
 def values_of(start: Array, end: Array, bias: Array) -> gtsam.Values:
     values = gtsam.Values()
     values.insert(X(4), gtsam.Pose3(start))

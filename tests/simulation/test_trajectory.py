@@ -23,22 +23,14 @@ def trajectory(request: pytest.FixtureRequest) -> SmoothTrajectory:
     return TRAJECTORIES[request.param]
 
 
-def test_velocity_is_the_derivative_of_position(trajectory: SmoothTrajectory) -> None:
-    before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
-    difference = (after.T_world_imu[:, :3, 3] - before.T_world_imu[:, :3, 3]) / (2.0 * STEP_S)
-    # Central differences err by step^2 / 6 times the third derivative, about 1e-8, and by rounding / step.
-    np.testing.assert_allclose(trajectory.at(AT_S).v_world, difference, atol=1e-7)
-
-
-def test_acceleration_is_the_derivative_of_velocity(trajectory: SmoothTrajectory) -> None:
-    difference = (trajectory.at(AT_S + STEP_S).v_world - trajectory.at(AT_S - STEP_S).v_world) / (2.0 * STEP_S)
-    np.testing.assert_allclose(trajectory.at(AT_S).a_world, difference, atol=1e-7)
-
-
-def test_angular_velocity_is_the_derivative_of_rotation_in_the_body(trajectory: SmoothTrajectory) -> None:
-    before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
-    turn = np.swapaxes(before.T_world_imu[:, :3, :3], 1, 2) @ after.T_world_imu[:, :3, :3]
-    np.testing.assert_allclose(trajectory.at(AT_S).w_imu, so3_log(turn) / (2.0 * STEP_S), atol=1e-7)
+def test_velocity_acceleration_and_turn_rate_in_the_body_are_derivatives(trajectory: SmoothTrajectory) -> None:
+    before, at, after = (trajectory.at(AT_S + step_s) for step_s in (-STEP_S, 0.0, STEP_S))
+    moved_m = after.T_world_imu[:, :3, 3] - before.T_world_imu[:, :3, 3]
+    turned = so3_log(np.swapaxes(before.T_world_imu[:, :3, :3], 1, 2) @ after.T_world_imu[:, :3, :3])
+    differences = ((at.v_world, moved_m), (at.a_world, after.v_world - before.v_world), (at.w_imu, turned))
+    for found, difference in differences:
+        # Central differences err by step^2 / 6 times the third derivative, about 1e-8, and by rounding / step.
+        np.testing.assert_allclose(found, difference / (2.0 * STEP_S), atol=1e-7)
 
 
 def test_blending_weights_sum_to_one_and_cubic_is_the_textbook_matrix() -> None:
