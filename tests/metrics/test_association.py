@@ -49,24 +49,18 @@ def test_nothing_is_scored_in_a_gap_or_outside_the_estimate():
     np.testing.assert_array_equal(matched.t_ns, t_ns[kept])
 
 
-def test_poses_that_are_not_finite_take_no_part_and_lower_the_coverage():
+def test_poses_that_are_not_finite_and_frames_that_are_missing_lower_the_coverage():
     sequence = make_sequence(drive_poses(300), track_count=60)
-    poses = sequence.truth.T_world_imu.copy()
+    poses, t_ns = sequence.truth.T_world_imu.copy(), sequence.frames_t_ns
     poses[40:70] = np.nan
     poses[100, 1, 3] = np.inf
-    scores = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence)
+    scores = score_run(make_run(t_ns, poses), "final", sequence)
     assert scores.values["pairs"] == 269
     assert scores.values["coverage_percent"] == pytest.approx(100.0 * 269 / 300)
     assert scores.values["ate_se3_m"] == pytest.approx(0.0, abs=1e-10)  # 300 m in doubles
     assert "observations scored" in scores.notes["heldout_reproj_median_px"]
-
-
-def test_a_run_that_tracked_a_tenth_shows_it():
-    sequence = make_sequence(drive_poses(300), track_count=60)
     drifting = perturb(sequence.truth.T_world_imu, 2e-3, seed=3)
-    t_ns = sequence.frames_t_ns
-    whole = score_run(make_run(t_ns, drifting), "final", sequence).values
-    tenth = score_run(make_run(t_ns[:30], drifting[:30]), "final", sequence).values
+    whole, tenth = (score_run(make_run(t_ns[:n], drifting[:n]), "final", sequence).values for n in (300, 30))
     assert tenth["ate_se3_m"] < whole["ate_se3_m"]  # looks better ...
     assert (tenth["coverage_percent"], tenth["pairs"]) == (pytest.approx(10.0), 30)  # ... and says why
     assert (whole["coverage_percent"], whole["pairs"]) == (100.0, 300)

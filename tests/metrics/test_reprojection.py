@@ -79,20 +79,6 @@ def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise():
     assert all(1.5 * small < large for small, large in itertools.pairwise(medians))
 
 
-def test_held_out_error_needs_no_truth_and_ignores_the_world():
-    sequence = replace(make_sequence(drive_poses(120), pixel_sigma=0.5), truth=None)
-    poses = perturb(drive_poses(120), 1e-4, seed=2)
-    moved = se3_exp(np.array([1.0, -2.0, 0.5, 300.0, 20.0, -7.0])) @ poses
-    here = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence)
-    there = score_run(make_run(sequence.frames_t_ns, moved), "final", sequence)
-    for key in ("heldout_reproj_median_px", "heldout_reproj_rmse_px"):
-        assert there.values[key] == pytest.approx(here.values[key], rel=1e-6)  # 300 m of lever times rounding
-    assert here.values["ate_se3_m"] is None
-    assert here.notes["ate_se3_m"] == "the sequence has no ground truth"
-    assert here.values["coverage_percent"] == 100.0
-    assert here.values["pairs"] is None
-
-
 def tracks_of(sequence, poses):
     """All tracks with three views or more, sorted by track: ids, measurements, camera poses."""
     seen = sequence.observations
@@ -187,14 +173,6 @@ def test_tracks_with_fewer_than_three_posed_views_are_counted_not_scored():
     assert scores.values["heldout_reproj_rmse_px"] < 1e-9  # exact: rounding only
 
 
-def test_absurd_poses_end_at_the_cap_and_not_in_an_error():
-    sequence = make_sequence(drive_poses(60), track_count=200)
-    poses = np.random.default_rng(0).permutation(drive_poses(60)) @ se3_exp(np.full((60, 6), 2.0))
-    poses[:, :3, 3] *= 1e6
-    values = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence).values
-    assert 10.0 < values["heldout_reproj_median_px"] <= CAP_PX
-
-
 @pytest.fixture
 def recording() -> Sequence:
     """20 s with 240 withheld tracks and half a pixel of noise, whose twists scatter by 0.1 m/s and 0.005 rad/s."""
@@ -232,13 +210,9 @@ def test_an_estimate_that_leaps_for_three_seconds_is_reported_with_the_time(reco
     assert scores.values[RATIO] < 1.5  # three seconds of twenty hardly show in the whole
     assert "worse than dead reckoning" in scores.notes[RATIO]
     assert " times at 10-12 s" in scores.notes[RATIO]
-
-
-def test_an_estimate_that_is_worse_all_along_is_reported_with_its_standard_error(recording) -> None:
     poses = perturb(recording.truth.T_world_imu, 0.02, seed=3)
-    scores = scored(recording, make_run(recording.frames_t_ns, poses))
-    assert scores.values[RATIO] > 2.0
-    assert f"{scores.values[RATIO]:.2f} +- " in scores.notes[RATIO]
+    worse = scored(recording, make_run(recording.frames_t_ns, poses))  # all along: with its standard error
+    assert f"{worse.values[RATIO]:.2f} +- " in worse.notes[RATIO]
 
 
 def test_no_ratio_is_made_up_where_there_is_nothing_to_compare_with(recording) -> None:
