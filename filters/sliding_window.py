@@ -159,11 +159,17 @@ def whole(root: Array, told: Array, size: int) -> tuple[Array, Array]:
 
 
 def without_cross_covariances(root: Array, told: Array, size: int) -> tuple[Array, Array]:
-    """Return the Gaussian as if the state and the landmarks were independent."""
+    """Return the Gaussian as if state and landmarks were independent; raise EstimatorError if it is singular."""
     information = root.T @ root
-    cov, mean = np.linalg.inv(information), np.linalg.solve(information, root.T @ told)
-    cov[:size, size:], cov[size:, :size] = 0.0, 0.0
-    root = np.linalg.inv(np.linalg.cholesky(cov))
+    try:
+        cov, mean = np.linalg.inv(information), np.linalg.solve(information, root.T @ told)
+        cov[:size, size:], cov[size:, :size] = 0.0, 0.0
+        root = np.linalg.inv(np.linalg.cholesky(cov))
+    except np.linalg.LinAlgError as refusal:
+        raise EstimatorError(
+            "what left the window does not determine its state and landmarks, so their cross-covariances cannot be "
+            "left out: set cross_covariances to true, or a larger noise"
+        ) from refusal
     return root, root @ mean
 
 

@@ -12,6 +12,7 @@ import pytest
 from filters import fixed_lag, iekf, sliding_window
 from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded, short
 from toolkit import runner
+from toolkit.errors import EstimatorError
 from toolkit.settings import Settings
 from toolkit.settings.records import POLICIES, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
@@ -85,3 +86,8 @@ def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_step
     done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
     assert done.status == "ok"
     assert sum("longer than one standard deviation" in line for line in done.log) == told
+
+
+def test_a_gaussian_that_is_not_determined_cannot_lose_its_cross_covariances_and_says_so():
+    with pytest.raises(EstimatorError, match=r"does not determine .* set cross_covariances to true"):
+        sliding_window.without_cross_covariances(np.eye(2, 3), np.zeros(2), size=1)
