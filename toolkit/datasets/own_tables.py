@@ -96,7 +96,7 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     facts = (*(() if _has_two_rows(sightings) else (ONE_ROW_FOR_BOTH,)), *unseen, *joined)
     sequence = Sequence(
         name=name,
-        rig=_rig(fields, 2 if TWO_ROWS[0] in sightings.values else 1),
+        rig=_rig(fields, 2 if TWO_ROWS[0] in sightings else 1),
         noise=noise,
         frames_t_ns=frames_t_ns,
         observations=observations,
@@ -116,7 +116,7 @@ def _columns(what: str, given: Table) -> Columns:
 
 
 def _has_two_rows(table: Columns) -> bool:
-    return any(name in table.values for name in TWO_ROWS)
+    return any(name in table for name in TWO_ROWS)
 
 
 def _observations(table: Columns) -> tuple[IntArray, Observations, tuple[str, ...]]:

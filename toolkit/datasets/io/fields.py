@@ -61,8 +61,8 @@ _UNITS_OF_NS = (
 _DIALECT = "%YAML:"
 # A calibration of a rig of many cameras takes some thousand characters.
 _MOST_CHARACTERS = 1_000_000
-# An alias may repeat all that stands before it: nine lists of ten, each of the one before, are a billion values.
-_MOST_ALIASES = 10
+# Nine lists of ten, each of aliases of the one before, are a billion values in 600 characters.
+_MOST_VALUES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,14 +344,19 @@ def read_fields(path: Path) -> Fields:
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """PyYAML's safe loader, which takes OpenCV's matrices as the mappings they are, and a key only once."""
 
-    aliases = 0
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._values, self._values_in = 0, dict[int, int]()
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return the next node; raises YAMLError where aliases make a small file into a huge document."""
-        self.aliases += self.check_event(yaml.AliasEvent)
-        if self.aliases > _MOST_ALIASES:
-            raise yaml.YAMLError(f"more than {_MOST_ALIASES} aliases (*name) repeat parts of it")
-        return super().compose_node(parent, index)
+        """Return the next node; raises YAMLError where aliases make a small file into a huge document, or endless."""
+        before, is_alias = self._values, self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        self._values += self._values_in.get(id(node), _MOST_VALUES) if is_alias else 1
+        if self._values > _MOST_VALUES:
+            raise yaml.YAMLError(f"more than {_MOST_VALUES} values, with those that aliases (*name) repeat")
+        self._values_in[id(node)] = self._values - before
+        return node
 
 
 def _mapping(loader: _Loader, node: Any) -> dict[Any, Any]:

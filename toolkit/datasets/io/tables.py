@@ -8,9 +8,11 @@ import codecs
 import csv
 import gzip
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,31 +67,32 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """A table: what it is called in a complaint, its columns (N,) by name, and what rows are called.
+    """A table: what it is called in a complaint, the names of its columns, and what is in them and in its rows.
 
-    The columns of a file are tuples of texts, those of a program arrays.
-    ``numbers_of_rows`` are those of a file's lines, as an editor counts them; None counts from 0.
+    ``given`` are the columns (N,) of a program, ``rows`` the cells of a file's lines, by ``numbers_of_rows`` as an
+    editor counts them. ``plain`` are these lines where nothing in them is quoted, with what separates their cells.
     """
 
     what: Path
-    values: Mapping[str, Sequence[Any] | npt.NDArray[Any]]
-    row: str = "row"
-    numbers_of_rows: tuple[int, ...] | None = None
+    names: tuple[str, ...]
+    given: Mapping[str, npt.NDArray[Any]] | None = None
+    rows: Callable[[], Sequence[Sequence[str]]] = tuple
+    plain: tuple[Sequence[str], str] | None = None
+    numbers_of_rows: Sequence[int] | None = None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of all columns."""
-        return tuple(self.values)
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
 
     def require(self, *alternatives: str) -> None:
-        """Raise DataError for columns that are missing, with the like-named there are; ``"a|b"`` is either."""
-        missing = [names for names in alternatives if not any(name in self.values for name in names.split("|"))]
-        if not missing:
-            return
-        hints = (self._hint(names.split("|")) for names in missing)
-        wanted = ", ".join(names.replace("|", " or ") + hint for names, hint in zip(missing, hints, strict=True))
-        there = printable(", ".join(self.names))[:200] or "nothing"
-        raise DataError(f"{self.what}: missing column {wanted}; it has {there}")
+        """Raise DataError for columns that are there twice or missing, with what is like-named; ``"a|b"`` is either."""
+        for name in (name for names in alternatives for name in names.split("|")):
+            if self.names.count(name) > 1:
+                raise DataError(f"{self.what}: the column {name} is there twice; rename or remove one")
+        missing = [names for names in alternatives if not any(name in self for name in names.split("|"))]
+        if missing:
+            wanted = ", ".join(names.replace("|", " or ") + self._hint(names.split("|")) for names in missing)
+            there = printable(", ".join(self.names))[:200] or "nothing"
+            raise DataError(f"{self.what}: missing column {wanted}; it has {there}")
 
     def _hint(self, wanted: Sequence[str]) -> str:
         free = [name for name in self.names if name not in wanted]
@@ -102,21 +105,21 @@ class Columns:
         Raises DataError naming the columns that are missing, or the row of a text.
         """
         self.require(*names)
-        return np.stack([self._numbers(name) for name in names], axis=1)
+        if self.plain is not None:
+            lines, separator = self.plain
+            with suppress(ValueError):  # the cell is named below
+                at = list(map(self.names.index, names))
+                return np.loadtxt(lines, delimiter=separator, usecols=at, comments=None, ndmin=2)
+        return self.numbers_or_none(*names, empty="")
 
-    def numbers_or_none(self, *names: str) -> Array:
+    def numbers_or_none(self, *names: str, empty: str = "nan") -> Array:
         """Return columns as :meth:`numbers` does, with NaN where a text is empty."""
-        given = {name: self.values[name] for name in names}
-        texts = {name: cells for name, cells in given.items() if all(isinstance(cell, str) for cell in cells)}
-        filled = {name: tuple(cell.strip() or "nan" for cell in cells) for name, cells in texts.items()}
-        return replace(self, values={**self.values, **filled}).numbers(*names)
+        return np.stack([self._numbers(name, empty) for name in names], axis=1)
 
     def whole(self, name: str) -> IntArray:
         """Return a column of whole numbers (N,); raises DataError naming the row of anything else."""
-        values = self.values[name]
-        if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
-            return values.astype(np.int64)
-        return np.array([self._whole(name, i, value) for i, value in enumerate(values)], dtype=np.int64)
+        self.require(name)
+        return np.array([self._whole(name, i, cell) for i, cell in enumerate(self._cells(name))], dtype=np.int64)
 
     def stamps(self) -> IntArray:
         """Return the stamps (N,) of a column t, in seconds, or t_ns, as int64 nanoseconds, rounded only there.
@@ -124,58 +127,56 @@ class Columns:
         Raises DataError where there are both or neither, one is no time, or they are not in seconds.
         """
         self.require(f"{SECONDS}|{NANOSECONDS}")
-        if SECONDS in self.values and NANOSECONDS in self.values:
+        if SECONDS in self and NANOSECONDS in self:
             raise DataError(f"{self.what}: has the columns {SECONDS} and {NANOSECONDS}; leave one out")
-        if NANOSECONDS in self.values:
+        if NANOSECONDS in self:
             t_ns = self.whole(NANOSECONDS)
             unit = probable_unit_of_ns(t_ns)
             if unit is not None:
                 raise DataError(f"{self.what}: {NANOSECONDS} must be in nanoseconds, but the stamps look like {unit}")
             return t_ns
-        values = self.values[SECONDS]
-        if isinstance(values, np.ndarray) and values.dtype.kind in "fiu":
-            return stamps_ns(self.what, SECONDS, values.astype(np.float64))
-        seconds = self._numbers(SECONDS)
+        seconds = self.numbers(SECONDS)[:, 0]
+        if self.given is not None and self.given[SECONDS].dtype.kind in "fiu":
+            return stamps_ns(self.what, SECONDS, seconds)
         unit = probable_unit(seconds[np.isfinite(seconds)])  # what is no number is named with its row below
         if unit is not None:
             raise DataError(f"{self.what}: {SECONDS} must be in seconds, but the stamps look like {unit}")
-        return exact_ns(list(map(str, values)), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
+        return exact_ns(list(map(str, self._cells(SECONDS))), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
 
     def at(self, row: int) -> str:
         """Return how a row is called."""
-        return f"{self.row} {row if self.numbers_of_rows is None else self.numbers_of_rows[row]}"
+        return f"row {row}" if self.numbers_of_rows is None else f"line {self.numbers_of_rows[row]}"
 
-    def _numbers(self, name: str) -> Array:
-        given = self.values[name]
-        values: npt.NDArray[Any] = np.empty(0) if isinstance(given, tuple) else np.asarray(given)
+    def _cells(self, name: str) -> Sequence[Any]:
+        """Return the texts, or a program's values, in a column."""
+        if self.given is None:
+            at = self.names.index(name)
+            return [row[at] for row in self.rows()]
+        values = self.given[name]
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
         if values.dtype.kind == "c":
             raise DataError(f"{self.what}: column {name} holds complex numbers; give their real parts")
-        try:
-            if isinstance(given, tuple) and "_" not in "".join(given):  # Python takes 1_0 for ten
-                return np.fromiter(map(float, given), dtype=np.float64, count=len(given))
-            if isinstance(given, tuple) or (values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any()):
-                raise ValueError
-            return values.astype(np.float64)
-        except (TypeError, ValueError):
-            bad, value = next((i, value) for i, value in enumerate(given) if not is_number(value))
-            shown = printable(str(value).strip())[:50] or "empty"
-            point = " with a decimal point" if "," in shown else ""
-            raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}") from None
+        cells: list[Any] = values.tolist()
+        return cells
 
-    def _whole(self, name: str, row: int, value: Any) -> int:
-        try:
-            exact = Decimal(value.replace("_", "?")) if isinstance(value, str) else value
-            too_large = bool(abs(exact) > _LARGEST)
-            number = None if too_large else int(exact)
-        except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
-            exact, number, too_large = value, None, False
-        if number is None or number != exact:
-            shown = printable(str(value).strip())[:50] or "empty"
-            most = f" of at most {_LARGEST}" if too_large else ""
-            raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number{most}")
-        return number
+    def _numbers(self, name: str, empty: str) -> Array:
+        cells = self._cells(name)
+        cells = [cell.strip() or empty if isinstance(cell, str) else cell for cell in cells]
+        bad = next((row for row, cell in enumerate(cells) if not is_number(cell)), None)
+        if bad is not None:
+            shown = printable(str(cells[bad]))[:50] or "empty"
+            point = " with a decimal point" if "," in shown else ""
+            raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}")
+        return np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
+
+    def _whole(self, name: str, row: int, cell: Any) -> int:
+        with suppress(TypeError, ValueError, InvalidOperation):
+            exact = Decimal(cell.replace("_", "?") if isinstance(cell, str) else cell)
+            if abs(exact) <= _LARGEST and exact == int(exact):
+                return int(exact)
+        shown = printable(str(cell).strip())[:50] or "empty"
+        raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number of 64 bits")
 
 
 def is_number(value: Any) -> bool:
@@ -191,37 +192,25 @@ def columns_of_file(path: Path) -> Columns:
     """Read a CSV, plain or gzipped, whose first line names its columns; comments and units after names are left out.
 
     Cells stand between commas, semicolons or tabs, in quotes or not. Raises DataError where the file cannot be read,
-    has no names or no rows, a column twice, or a row of another length.
+    has no names or no rows, or a row of another length.
     """
     text = read_unzipped(path).removeprefix(codecs.BOM_UTF8).decode(errors="replace")
     if "\0" in text:
         raise DataError(f"{path}: not a text file; write a CSV, one row a line, with names in the first")
-    heading, lines = _heading(path, text)
+    heading, numbers, lines = _heading(path, text)
     separator = max(_SEPARATORS, key=heading.count)
     if separator not in heading and len(heading.split()) > 1:
         raise DataError(f"{path}: its columns are separated by blanks; separate them by commas, semicolons or tabs")
-    names = _canonical(_cells(heading, separator))
-    kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
-    if len(set(kept)) < len(kept):
-        raise DataError(f"{path}: a column name is there twice in {printable(heading)[:200]}; rename or remove one")
-    if not lines:
-        raise DataError(f"{path}: holds no rows; its first line names the columns, the others hold them")
-    values = dict(zip(kept, _split(path, lines, separator, len(names)), strict=False))
-    return Columns(path, values, "line", tuple(number for number, _ in lines))
-
-
-def _split(path: Path, lines: Sequence[tuple[int, str]], separator: str, width: int) -> Iterator[tuple[str, ...]]:
-    """Return the columns of lines; raises DataError, naming the line, where one has another number of cells."""
-    whole = separator.join(line for _, line in lines)
-    if '"' not in whole and {line.count(separator) for _, line in lines} == {width - 1}:
-        cells = whole.split(separator)
-        return (tuple(cells[column::width]) for column in range(width))
-    rows = [_cells(line, separator) for _, line in lines]
-    rows = [row[:-1] if len(row) == width + 1 and not row[-1].strip() else row for row in rows]
-    for (number, _), row in zip(lines, rows, strict=True):
-        if len(row) != width:
-            raise DataError(f"{path}: line {number} has {len(row)} columns, expected {width}")
-    return zip(*rows, strict=True)
+    names = tuple(_canonical(_cells(heading, separator)))
+    if '"' not in text and {line.count(separator) for line in lines} == {len(names) - 1}:
+        rows = cache(lambda: [line.split(separator) for line in lines])
+        return Columns(path, names, None, rows, (lines, separator), numbers)
+    cells = [_cells(line, separator) for line in lines]
+    cells = [row[:-1] if len(row) == len(names) + 1 and not row[-1].strip() else row for row in cells]
+    for number, row in zip(numbers, cells, strict=True):
+        if len(row) != len(names):
+            raise DataError(f"{path}: line {number} has {len(row)} columns, expected {len(names)}")
+    return Columns(path, names, None, lambda: cells, None, numbers)
 
 
 def _canonical(heading: Sequence[str]) -> list[str]:
@@ -240,17 +229,26 @@ def _plain(heading: str) -> str:
     return heading.strip().lstrip("#").partition("[")[0].strip()
 
 
-def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
-    """Return the line that names the columns, and the others with their numbers, without comments and empty ones."""
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
-    before = [line for number, line in lines if not rows or number < rows[0][0]]
-    if rows and not any(is_number(_cells(rows[0][1], separator)[0]) for separator in _SEPARATORS):
-        return rows[0][1], rows[1:]
-    if not before:
-        what = "holds numbers and no names" if rows else "holds no rows"
-        raise DataError(f"{path}: {what}; its first line names the columns, the others hold them")
-    return before[-1], rows
+def _heading(path: Path, text: str) -> tuple[str, list[int], list[str]]:
+    """Return the line that names the columns, and the numbers and texts of the rows: no comments and empty ones.
+
+    The names may be a comment; of several it is the last that has as many as there are cells in the first row.
+    """
+    lines = text.splitlines()
+    numbers = [number for number, line in enumerate(lines, 1) if (begin := line.lstrip()) and begin[0] != "#"]
+    rows = [lines[number - 1] for number in numbers]
+    before = [line for line in lines[: numbers[0] - 1] if line.strip()] if rows else []
+    how = "its first line names the columns, the others hold them"
+    if rows and not any(is_number(_cells(rows[0], separator)[0]) for separator in _SEPARATORS):
+        heading, *rows = rows
+    elif before:
+        alike = (one for one in reversed(before) if all(one.count(s) == rows[0].count(s) for s in _SEPARATORS))
+        heading = next(alike, before[-1])
+    elif rows:
+        raise DataError(f"{path}: holds numbers and no names; {how}")
+    if not rows:
+        raise DataError(f"{path}: holds no rows; {how}")
+    return heading, numbers[-len(rows) :], rows
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -279,4 +277,4 @@ def columns_given(what: str, given: Any) -> Columns:
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise DataError(f"{what}: its columns differ in length: {counts}")
-    return Columns(Path(what), values)
+    return Columns(Path(what), tuple(values), values)
