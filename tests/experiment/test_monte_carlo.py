@@ -11,13 +11,13 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, in_order
-from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means
+from toolkit.experiment.statistics import mean_nees, quantiles_of_all, ratio_of_means
 from toolkit.experiment.units import Outcome
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
-from toolkit.report.messages import note_lines, paired_lines
+from toolkit.report.messages import note_lines
 from toolkit.report.scores import Seeds, seeds_document
 
 Document = dict[str, Any]
@@ -72,45 +72,6 @@ def test_runs_that_ended_badly_are_reported_beside_the_means(over, document):
     assert broken["metrics"]["ate_none_m"]["quantiles_all"]["median"] is None
     words = "\n".join(note_lines(over))
     assert "honest final 4.50 m (100 % ok); astray causal 5.50 m (75 % ok); broken final none, 4 of 4 runs" in words
-
-
-def test_the_paired_difference_is_that_of_the_seeds_both_have():
-    found = paired([1.0, 2.0, None, 5.0, 9.0], [0.5, 1.0, 7.0, None, 6.0])
-    assert (found.n, found.mean) == (3, 1.5)
-    assert found.error == pytest.approx(np.std([0.5, 1.0, 3.0], ddof=1) / np.sqrt(3))
-    assert paired([1.0, None], [None, 2.0]) is paired([1.0], [2.0]) is None
-    assert paired([1.0, 2.0], [1.0, 2.0]).seeds_needed == np.inf
-
-
-def test_a_difference_that_is_no_number_is_not_significant():
-    assert not Paired(3, -np.inf, np.nan).is_significant
-
-
-def test_equal_estimators_are_distinguished_at_5_percent_and_others_by_the_seeds_reported_to_be_needed():
-    rng, half = np.random.default_rng(5), 0.5  # of the standard deviation of a difference
-    needed = round(Paired(100, half, 1.0 / np.sqrt(100)).seeds_needed)
-    assert needed == 42
-    for effect, share in ((0.0, 0.05), (half, 0.9)):
-        draws = effect + rng.standard_normal((2000, needed))
-        reported = np.mean([paired(draw, np.zeros(needed)).is_significant for draw in draws])
-        # Four standard errors of the share, and one percent by which Student's test needs more than the normal one.
-        assert reported == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
-
-
-def test_under_the_table_stands_who_differs_from_the_best(over):
-    honest, astray = over.rows[0].outcomes, over.rows[2].outcomes
-    worse = [_with_ate(one, 0.3 + 0.01 * one.seed) for one in astray]
-    lines = list(paired_lines(replace(over, outcomes=(*honest, *worse))))
-    # Under the seeds 3, 5 and 6, in which both are ok, it has 2.67, 4.65 and 5.64 m less than the other's 3, 5 and 6 m.
-    assert lines == ["honest causal: ATE none +4.32 ± 0.87 m against astray, paired over 3 seeds"]
-    near = [_with_ate(one, one.seed + (0.1 if one.seed % 2 else -0.11)) for one in astray]
-    (line,) = paired_lines(replace(over, outcomes=(*honest, *near)))
-    assert re.search(r"paired over 3 seeds: may be chance; \d+ more seeds? would show a difference as large", line)
-    assert "Which estimators differ from the best?" in report_text(over, {})
-
-
-def _with_ate(outcome: Outcome, ate_m: float) -> Outcome:
-    return _with_values(outcome, {"ate_none_m": ate_m})
 
 
 def _with_values(outcome: Outcome, values: dict[str, float | None]) -> Outcome:

@@ -151,8 +151,8 @@ def test_without_a_truth_the_error_is_that_of_withheld_tracks_and_called_so() ->
 @pytest.mark.parametrize(
     ("names", "low", "said"),
     [
-        (("riekf", "ekf-slam", "ekf"), 1.1, "Why: vislam explain with --from ekf --to riekf."),
-        (("riekf", "ekf", "dead-reckoning"), 1.1, "Why: vislam explain with --from ekf --to riekf."),
+        (("riekf", "ekf-slam", "ekf"), 1.1, "Why: vislam explain 'my drive' --from ekf --to riekf"),
+        (("riekf", "ekf", "dead-reckoning"), 1.1, "Why: vislam explain 'my drive' --from ekf --to riekf"),
         (("riekf", "ekf"), 0.9, ""),
         (("dead-reckoning", "ekf"), 1.1, ""),
     ],
@@ -162,7 +162,7 @@ def test_a_verdict_points_to_the_explanation_of_what_is_no_chance(
 ) -> None:
     rows = tuple(Row("causal", (Outcome(0, name, "ok"),)) for name in names)
     advantages = tuple(Advantage(1.5, low, 2.0, 8, "seeds") for _ in names[1:])
-    assert why_sentence(Contest("accuracy in the end", "ate_yaw_m", rows, advantages)) == said
+    assert why_sentence(Contest("accuracy in the end", "ate_yaw_m", rows, advantages), "my drive", 1) == said
 
 
 def test_the_page_lists_the_ingredients_that_estimators_declare() -> None:

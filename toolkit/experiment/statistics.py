@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtr, stdtrit
+from scipy.special import stdtr, stdtrit
 
 from toolkit.geometry import Array, IntArray
 from toolkit.jackknife import STRETCHES, jackknife_error
@@ -57,8 +57,8 @@ class QuantilesOfAll:
         return f"{self.bad} of {self.n} runs did not end well, and each counts as infinitely bad" if lacking else ""
 
 
-# Level of the test (false alarms for equal estimators), and power to be reached with enough seeds.
-LEVEL, _POWER = 0.05, 0.9
+# Level of the test: false alarms for equal estimators.
+LEVEL = 0.05
 
 
 @dataclass(frozen=True)
@@ -81,29 +81,6 @@ class Paired:
         if self.error == 0.0:
             return float(self.mean == 0.0)
         return 2.0 * float(stdtr(self.n - 1, -abs(self.mean) / self.error))
-
-    @property
-    def is_significant(self) -> bool:
-        """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
-        _, low, high = self.interval
-        return low > 0.0 or high < 0.0
-
-    @property
-    def seeds_needed(self) -> float:
-        """Return how many seeds tell a difference as large as this apart with 90 % chance; infinite for none."""
-        if self.mean == 0.0:
-            return math.inf
-        quantiles = float(ndtri(1.0 - LEVEL / 2.0) + ndtri(_POWER))
-        return self.n * (quantiles * self.error / self.mean) ** 2
-
-
-def paired(one: Iterable[float | None], other: Iterable[float | None]) -> Paired | None:
-    """Return how much more the first has than the second, both seed by seed; None with fewer than two common seeds."""
-    differences = [a - b for a, b in zip(one, other, strict=True) if a is not None and b is not None]
-    if len(differences) < 2:
-        return None
-    given = np.array(differences)
-    return Paired(given.size, float(given.mean()), float(standard_error(given)))
 
 
 def holm(p_values: Array) -> Array:

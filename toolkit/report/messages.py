@@ -6,6 +6,7 @@ test supports is called a difference (:mod:`toolkit.experiment.contests`).
 
 import math
 import re
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated
@@ -18,10 +19,10 @@ from toolkit.audit import Finding, faults
 from toolkit.experiment.comparison import NEES, Comparison, Row
 from toolkit.experiment.contests import CONFIDENCE, COST, HELD_OUT, Contest, Question, cheaper_near
 from toolkit.experiment.disagreement import too_far
-from toolkit.experiment.statistics import Paired, paired, ratio_of_means
-from toolkit.experiment.units import OUTPUTS, Scored
+from toolkit.experiment.statistics import ratio_of_means
+from toolkit.experiment.units import Scored
 from toolkit.files.documents import rounded
-from toolkit.metrics import Metric, is_on_request, metrics_called, unavailable
+from toolkit.metrics import is_on_request, metrics_called, unavailable
 from toolkit.metrics.innovations import ACCEPTED, refuses_much
 from toolkit.metrics.reprojection import RATIO
 from toolkit.registry import discover
@@ -42,9 +43,6 @@ _REMEDY = {
     "heavy-tailed": "look for mismatched tracks",
     "timid": "its covariance, or the stated noise, is too large",
 }
-
-# Estimators whose difference takes more seeds than these to find count as equal.
-_MOST_SEEDS = 10_000
 
 # Remarks on these are notes, the others stand at the end of the report only.
 _AGAINST_TRUTH = "ate_"
@@ -242,35 +240,6 @@ def _stated_over_true(row: Row) -> str:
     return "" if found is None else f"; it states {found.mean:.2f} ± {found.error:.2f} of its true variance"
 
 
-def paired_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield, over seeds, how each estimator differs from the best of its kind of output in the table's first metric."""
-    metric = next((metric for metric in shown_metrics(comparison) if metric.best in ("least", "most")), None)
-    if metric is None or not comparison.over_seeds:
-        return
-    for output in OUTPUTS:
-        rows = [row for row in comparison.lines if row.output == output and row.value(metric.key) is not None]
-        sign = -1.0 if metric.best == "most" else 1.0
-        rows.sort(key=lambda row: sign * (row.value(metric.key) or 0.0))
-        for row in rows[1:]:
-            found = paired(row.good_values(metric.key), rows[0].good_values(metric.key))
-            if found is not None:
-                yield f"{_name_of(row)}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
-
-
-def _difference(found: Paired, metric: Metric, best: str) -> str:
-    if found.mean == found.error == 0.0:
-        return f"equal to that of {best} under all {found.n} seeds"
-    decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else 2
-    figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
-    said = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
-    if found.is_significant:
-        return said
-    if found.seeds_needed > _MOST_SEEDS:
-        return f"{said}: practically equal, {_MOST_SEEDS} seeds would not distinguish them"
-    more = max(1, math.ceil(found.seeds_needed) - found.n)
-    return f"{said}: may be chance; {more} more seed{'s' if more > 1 else ''} would show a difference as large as this"
-
-
 def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
     """Yield, for each reason, the metrics of the table without a value for it, and whose where not everybody's.
 
@@ -361,7 +330,7 @@ def verdict(comparison: Comparison) -> str:
     limits = "Withheld tracks show errors over a few frames, not the distance from the true path."
     sentences = (
         *(best, limits if contest.metric == HELD_OUT else ""),
-        *(_trust(comparison), _cost(contest), why_sentence(contest)),
+        *(_trust(comparison), _cost(contest), why_sentence(contest, comparison.source, len(comparison.seeds))),
     )
     return " ".join(filter(None, sentences))
 
@@ -426,14 +395,18 @@ def contest_text(contest: ContestRecord, runs: str, mark: str) -> str:
     return f"{text}; {next_one.estimator} ({value_of(next_one)}) {does} {factor} as much."
 
 
-def why_sentence(contest: Contest) -> str:
-    """Name the command that says why the first is better than the worst of the others; nothing where none can."""
+def why_sentence(contest: Contest, source: str, seeds: int) -> str:
+    """Return the command that says why the first is better than the worst of the others; nothing where none can.
+
+    It can be pasted, and so has no full stop behind it.
+    """
     explained = {name for name, entry in discover().items() if entry.ingredients()}  # that say what they have
     rows = (contest.rows[0], *(row for row, _ in contest.worse))
     able = [row.estimator for row in rows if row.estimator in explained]
     if len(able) < 2 or able[0] != contest.rows[0].estimator:
         return ""
-    return f"Why: vislam explain with --from {able[-1]} --to {able[0]}."
+    repeated = ["--seeds", str(seeds)] if seeds > 1 else []
+    return f"Why: {shlex.join(['vislam', 'explain', source, '--from', able[-1], '--to', able[0], *repeated])}"
 
 
 def _trust(comparison: Comparison) -> str:

@@ -48,7 +48,6 @@ from toolkit.report.messages import (
     contest_record,
     note_lines,
     outcome,
-    paired_lines,
     remark_lines,
     verdict,
 )
@@ -260,7 +259,6 @@ class SeedsMessages(Struct, frozen=True, kw_only=True):
 
     sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
     verdict: VerdictText = UNSET
-    pairs: Annotated[tuple[str, ...] | UnsetType, Meta(description="how each differs from the best")] = UNSET
     notes: tuple[str, ...]
     verdicts: Annotated[tuple[str, ...], Meta(description="which estimators are overconfident")]
     start: str
@@ -329,7 +327,6 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
         words=SeedsMessages(
             sequence="; ".join(header_lines(over)),
             verdict=verdict(over),
-            pairs=tuple(paired_lines(over)),
             notes=tuple(note_lines(over)),
             verdicts=tuple(consistency_lines(over)),
             start=over.prior.source,

@@ -9,11 +9,10 @@ const STATUS_WORDS = {
 
 /** What the case says in words: trouble first, then notes, the audit, the recording, how to repeat it. */
 function wordsOf(one) {
-  const { notes, remarks = [], pairs = [], audit, undecided = {}, facts = [], start } = one.words;
+  const { notes, remarks = [], audit, undecided = {}, facts = [], start } = one.words;
   return [
     el("div", { class: "words" },
       listCard("Notes", notes, "Nothing out of the ordinary."),
-      pairs.length ? listCard("Which estimators differ from the best?", pairs) : null,
       audit ? auditCard(audit, undecided) : listCard("Is the stated uncertainty consistent?", one.words.verdicts),
       listCard("The recording", [`Every estimator started from: ${start}`, ...facts]),
       one.card?.length ? listCard("Its tracks", one.card) : null,
