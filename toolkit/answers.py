@@ -59,7 +59,6 @@ class Run:
     log: tuple[str, ...] = ()
 
     def trajectory(self, output: Output) -> Trajectory | None:
-        """Return the trajectory of one kind of output."""
         return self.causal if output == "causal" else self.final
 
     @property

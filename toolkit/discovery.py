@@ -48,7 +48,6 @@ class FoundModule:
 
     @property
     def name(self) -> str:
-        """Return the name a user reads."""
         return shown_name(self.module)
 
     def tree(self) -> ast.Module:

@@ -57,8 +57,6 @@ class Trajectory:
         return self.T_world_imu[:, :3, 3]
 
     def states(self) -> "list[Estimate]":
-        """Return each state by itself."""
-
         def parts(stacked: Array | None) -> list[Array | None]:
             return [None] * len(self) if stacked is None else list(stacked)
 
@@ -106,7 +104,6 @@ class Landmarks:
 
     @classmethod
     def none(cls) -> "Landmarks":
-        """Return a map without landmarks."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
 

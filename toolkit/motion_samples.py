@@ -106,12 +106,10 @@ _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = 
 
 
 def kind_of(samples: MotionSamples) -> MotionKind:
-    """Return the kind of motion samples."""
     return next(kind for one, _, kind in _KINDS if isinstance(samples, one))
 
 
 def are_of_one_kind(samples: MotionSamples, noise: MotionNoise) -> bool:
-    """Say whether a noise is that of samples of its kind."""
     return any(isinstance(samples, one) and isinstance(noise, other) for one, other, _ in _KINDS)
 
 

@@ -30,5 +30,4 @@ ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 
 @contextmanager
 def silent(_label: str) -> Iterator[Progress]:
-    """Begin a piece of work without a display."""
     yield SILENT

@@ -147,17 +147,14 @@ class Sequence:
 
     @property
     def motion_kind(self) -> MotionKind:
-        """Return the kind of motion samples the sequence has."""
         return kind_of(self.motion)
 
     @property
     def frame_count(self) -> int:
-        """Return the number of frames K."""
         return self.frames_t_ns.size
 
     @property
     def duration_s(self) -> float:
-        """Return the seconds from the first frame to the last."""
         return float(self.frames_t_ns[-1] - self.frames_t_ns[0]) / NS_PER_S if self.frame_count else 0.0
 
     @property

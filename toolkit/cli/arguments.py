@@ -92,7 +92,6 @@ class ShowVersion(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        """Print and leave."""
         from importlib.metadata import version
 
         print(f"vislam {version('vislam-toolkit')}")
@@ -106,7 +105,6 @@ class Argument(NamedTuple):
     how: dict[str, Any]
 
     def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add it to a parser or to a group of one."""
         parser.add_argument(self.name, **self.how)
 
 
@@ -117,7 +115,6 @@ class Group(NamedTuple):
     title: str = ""
 
     def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add them as a group."""
         group = parser.add_argument_group(self.title) if self.title else parser.add_mutually_exclusive_group()
         for one in self.arguments:
             one.add_to(group)
@@ -142,7 +139,6 @@ def choice(usage: str, choices: Sequence[str], help: str, **how: Any) -> Argumen
 
 
 def flag(name: str, help: str, **how: Any) -> Argument:
-    """Return an option without a value."""
     return Argument(name, {"action": "store_true", "help": help, **how})
 
 
@@ -175,7 +171,6 @@ def command(
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Parse names separated by commas; each counts once."""
     found = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     if not found:
         raise argparse.ArgumentTypeError("expected names separated by commas")
@@ -183,7 +178,6 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def named_file(text: str) -> tuple[str, str]:
-    """Parse NAME=FILE."""
     name, equals, file = text.partition("=")
     if not (equals and name.strip() and file):
         raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
@@ -197,7 +191,6 @@ def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
 
 
 def number_within(what: str, least: float, most: float) -> Callable[[str], float]:
-    """Return a parser of numbers from ``least`` to ``most``, told as ``what``."""
     return _read(float, lambda value: least <= value <= most, f"{what} from {least:g} to {most:g}")
 
 

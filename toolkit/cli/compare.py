@@ -216,7 +216,6 @@ def explain(options: argparse.Namespace) -> int:
 
 
 def over(text: str) -> tuple[str, tuple[str, ...]]:
-    """Parse NAME=V1,V2,..., a setting or a fault and its values."""
     name, equals, values = text.partition("=")
     given = tuple(value.strip() for value in values.split(",") if value.strip())
     if not (equals and name.strip() and given):

@@ -22,7 +22,6 @@ _LOG_FORMAT_BEFORE = "{desc} {percentage:.0f} % [{elapsed}]"
 
 
 def of_this_process() -> ProgressFor:
-    """Return a display of progress on standard error."""
     return on_stream(sys.stderr)
 
 
@@ -54,7 +53,6 @@ class _Bar:
         self._bar = tqdm(desc=label, total=0, file=stream, leave=False, dynamic_ncols=True, bar_format=_FORMAT)
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Show that ``done`` of ``total`` steps are taken."""
         if total != self._bar.total or done < self._bar.n:
             self._bar.reset(total)
         if stage != self._stage:
@@ -63,7 +61,6 @@ class _Bar:
         self._bar.update(done - self._bar.n)  # by none as well: the time is drawn anew
 
     def close(self) -> None:
-        """Take the line away."""
         self._bar.close()
 
 

@@ -54,7 +54,6 @@ class Consistency:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the verdict on the stated uncertainty by the mean."""
         if self.mean > self.high:
             return "contradicted" if self.metric == TREND else "overconfident"
         if self.mean >= self.low:
@@ -92,7 +91,6 @@ def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
 
 
 def _known(scored: Iterable[Scored], key: str) -> list[float]:
-    """Return the values of a metric that runs have."""
     return [value for one in scored if (value := one.scores.values.get(key)) is not None]
 
 
@@ -105,7 +103,6 @@ class Row:
 
     @property
     def estimator(self) -> str:
-        """Return the estimator's name."""
         return self.outcomes[0].estimator
 
     @property
@@ -149,7 +146,6 @@ class Row:
 
     @property
     def counts(self) -> dict[Status, int]:
-        """Return how many seeds ended each way."""
         counted = Counter(outcome.status for outcome in self.outcomes)
         return {status: counted[status] for status in ("ok", "diverged", "failed")}
 
@@ -210,7 +206,6 @@ class Row:
 
     @cached_property
     def mean_nees(self) -> MeanNees | None:
-        """The NEES averaged over the runs that are ok, or None where no run has one."""
         known = [scored.nees_pose for scored in self.good if np.isfinite(scored.nees_pose).any()]
         return mean_nees(np.array(known)) if known else None
 
@@ -264,12 +259,10 @@ class Comparison:
 
     @property
     def over_seeds(self) -> bool:
-        """Say whether the comparison was repeated over seeds."""
         return len(self.seeds) > 1
 
     @property
     def name(self) -> str:
-        """Return the sequence's name."""
         return self.sequence.name
 
     @cached_property
@@ -299,7 +292,6 @@ class Comparison:
 
     @property
     def all_ok(self) -> bool:
-        """Say whether every run under every seed ended well."""
         return all(outcome.status == "ok" for outcome in self.outcomes)
 
     @property

@@ -70,7 +70,6 @@ class Grid:
     outcomes: Mapping[Trial, tuple[Outcome, ...]]
 
     def row(self, trial: Trial, output: Output) -> Row:
-        """Return one kind of output of a trial over the seeds."""
         return Row(output, self.outcomes[trial])
 
 

@@ -79,7 +79,6 @@ class Plan:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Return the seeds of simulated sequences."""
         return tuple(range(self.settings.first_seed, self.settings.first_seed + self.settings.seeds))
 
     def recording(self, source: str | Recorded, seed: int, faults: Doses | None = None) -> Recording:

@@ -120,12 +120,10 @@ class Prepared:
 
     @property
     def name(self) -> str:
-        """Return the sequence's name."""
         return self.sequence.name
 
     @property
     def source(self) -> str | Sequence:
-        """Return what it was loaded from."""
         return self.recording.source
 
 

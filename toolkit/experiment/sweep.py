@@ -87,7 +87,6 @@ class Axis:
 
     @property
     def is_fault(self) -> bool:
-        """Say whether a fault is planted."""
         return self.name.startswith(FAULT)
 
     @property
@@ -161,7 +160,6 @@ class Sweep:
 
     @cached_property
     def effects(self) -> Mapping[tuple[str, Point], Effect]:
-        """What every point does to every estimator."""
         return {(name, point): self._effect(name, point) for point in self.points for name in self.estimators}
 
     @cached_property

@@ -122,7 +122,6 @@ def run_unit(unit: Unit, progress: Progress) -> Outcome:
 
 
 def prepared_of(unit: Unit) -> Prepared:
-    """Return a unit's recording, prepared."""
     return unit.recording if isinstance(unit.recording, Prepared) else prepare_once(unit.recording)
 
 
@@ -132,7 +131,6 @@ def recording_to_prepare(unit: Unit) -> Recording | None:
 
 
 def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
-    """Run a unit's estimator over its prepared recording."""
     build = unit.build or (unit.entry or find(unit.estimator)).load()
     return runner.run(unit.estimator, build, prepared.sequence, prepared.prior, progress, unit.settings)
 

@@ -229,7 +229,6 @@ class _HandingOut(Generic[R]):
             threading.Thread(target=self._serve, args=(process,), name="vislam-workers", daemon=True).start()
 
     def stop(self) -> None:
-        """Hand out nothing more."""
         with self._lock:
             self._waiting.clear()
 
@@ -300,7 +299,6 @@ class _Board:
         self._under_way = np.ones(count, dtype=bool)
 
     def finish(self, place: int) -> None:
-        """Count a unit as done."""
         self._under_way[place] = False
 
     def progress(self) -> tuple[int, int, str]:

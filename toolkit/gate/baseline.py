@@ -131,7 +131,6 @@ class SeriesRecord(Struct, frozen=True, kw_only=True):
 
     @property
     def outputs(self) -> dict[Output, dict[str, Values]]:
-        """Return the metrics by kind of output."""
         given: dict[Output, dict[str, Values] | UnsetType] = {"causal": self.causal, "final": self.final}
         return {output: metrics for output, metrics in given.items() if metrics is not UNSET}
 
@@ -168,7 +167,6 @@ class Baseline:
 
 
 def installed_releases() -> dict[str, str]:
-    """Return the releases that results depend on, as they are installed."""
     return {name: version(name) for name in _DIGITS_THAT_MATTER}
 
 
@@ -290,7 +288,6 @@ def to_text(baseline: Baseline) -> str:
 
 
 def from_document(record: BaselineRecord) -> Baseline:
-    """Return the baseline of a record."""
     return Baseline(
         record.releases,
         tuple(_case(case) for case in record.sequences),

@@ -50,7 +50,6 @@ class CaseVerdicts:
     notes: list[str] = field(default_factory=list)
 
     def add(self, other: "CaseVerdicts") -> None:
-        """Append those of another case."""
         self.verdicts += other.verdicts
         self.tests += other.tests
         self.notes += other.notes

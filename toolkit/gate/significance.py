@@ -61,12 +61,10 @@ class Pairs(Compared):
 
     @property
     def runs(self) -> str:
-        """Return what was compared, in words."""
         return f"over {self.before.size} seeds"
 
     @property
     def change(self) -> float:
-        """Return the mean change, as a log ratio."""
         return float(self.differences.mean())
 
     @property
@@ -103,7 +101,6 @@ class Repeats(Compared):
 
     @property
     def runs(self) -> str:
-        """Return what was compared, in words."""
         return f"over {self.before.size} runs before, {self.after.size} now"
 
     @property
@@ -167,7 +164,6 @@ class Everywhere(Repeats):
 
     @property
     def runs(self) -> str:
-        """Return what was compared, in words."""
         before, after = (sum(side.size for side in sides) for sides in _sides(self.parts))
         return f"over {before} runs before, {after} now"
 

@@ -36,7 +36,6 @@ class Timer:
         return {"toolkit": sys.modules["toolkit"].__file__, "files": files}
 
     def prepare(self, requested: Json) -> Json:
-        """Make a recording ready."""
         from toolkit.experiment.recording import Recording, prepare
         from toolkit.settings.reading import settings_of
 

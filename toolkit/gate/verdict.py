@@ -39,7 +39,6 @@ class Verdict:
 
     @property
     def fails(self) -> bool:
-        """Say whether the check fails for this."""
         return self.finding in FAILURES
 
 
@@ -62,12 +61,10 @@ class Check:
 
     @property
     def failures(self) -> tuple[Verdict, ...]:
-        """Return what the check fails for."""
         return tuple(verdict for verdict in self.verdicts if verdict.fails)
 
     @property
     def passed(self) -> bool:
-        """Say whether nothing fails the check."""
         return not self.failures
 
 

@@ -185,7 +185,6 @@ class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
     )
 
     def requested(self) -> tuple[str, ...]:
-        """Return the names of those that are asked for."""
         return tuple(name for name in self.__struct_fields__ if getattr(self, name))
 
 
@@ -237,7 +236,6 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     estimators: dict[str, dict[str, Scalar]] = {}
 
     def options_of(self, estimator: str) -> Mapping[str, Scalar]:
-        """Return the options set for one estimator alone."""
         return self.estimators.get(estimator, {})
 
 
@@ -252,7 +250,6 @@ def outlier_summary(outliers: Outliers) -> str:
 
 
 def as_values(settings: Settings) -> dict[str, Any]:
-    """Return the whole record as nested values, for a manifest."""
     values: dict[str, Any] = msgspec.to_builtins(settings)
     return values
 
