@@ -45,7 +45,7 @@ from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kin
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
-from toolkit.settings.records import Outliers
+from toolkit.settings import Outliers
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence at the end: Huber, Cauchy, cut"

@@ -43,7 +43,7 @@ from toolkit.measurements import Packet, StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, FrameGate
 from toolkit.models.state import Belief
-from toolkit.settings.records import Scalar
+from toolkit.settings import Scalar
 
 CITES = ("smith1990estimating", "huang2010observability")
 RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth"

@@ -8,7 +8,7 @@ from filters.kalman.coordinates import CloneAnchoredBelief
 from filters.kalman.joint import AtFirstEstimates, JointBelief, linearisation
 from toolkit.estimator import Estimator, Setup
 from toolkit.models.state import Belief
-from toolkit.settings.records import Scalar
+from toolkit.settings import Scalar
 
 CITES = ("mourikis2007msckf", "li2013high")
 RUNG, CHANGE = 80, "+ long-lived landmarks in the state, in metres"

@@ -25,7 +25,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, se3_inverse, se3_right_jacobian, skew, transform
 from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, kind_of, linear_factor, ordering_of
-from toolkit.settings.records import Scalar
+from toolkit.settings import Scalar
 
 CITES = ("sibley2010sliding", "bell1993iterated", "gtsam")
 RUNG, CHANGE = 95, "what left the window linearised anew, a frame iterated to convergence"

@@ -9,7 +9,7 @@ from toolkit.geometry import Array
 from toolkit.measurements import MotionKind, MotionNoise, Packet, Prior, StereoRig
 from toolkit.models.state import Predictor
 from toolkit.progress import SILENT, Progress
-from toolkit.settings.records import DEFAULTS, Scalar, Settings
+from toolkit.settings import DEFAULTS, Scalar, Settings
 
 Part = TypeVar("Part")
 

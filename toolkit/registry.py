@@ -30,8 +30,7 @@ from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimator import Build
 from toolkit.files.reading import read_input
 from toolkit.measurements import MOTION_KINDS, MotionKind
-from toolkit.settings import Settings
-from toolkit.settings.records import Scalar
+from toolkit.settings import Scalar, Settings
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.

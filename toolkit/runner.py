@@ -28,8 +28,7 @@ from toolkit.measurements import Prior, TwistChangeNoise
 from toolkit.models.motion import motion_model
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, Settings
-from toolkit.settings.records import Scalar
+from toolkit.settings import DEFAULTS, Scalar, Settings
 from toolkit.threads import on_one_thread
 
 # Biases that are fixed keep this share of the standard deviations of their start and walk: none of it matters, and with

@@ -23,7 +23,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.measurements import Motion, StereoFrame
 from toolkit.models.state import POSE, Belief, Increment, Prediction, Predictor
-from toolkit.settings.records import Scalar
+from toolkit.settings import Scalar
 
 # At least this share of each variance is assumed independent of all other errors. A smaller share is lost in rounding,
 # and without it the covariance of two clones of one pose, equal to sixteen digits, has no Cholesky root.

@@ -21,7 +21,7 @@ from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX, MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.settings.records import Outliers
+from toolkit.settings import Outliers
 
 # One sighting may be rejected as a mismatch and another by chance; three in a row that agree on another point are not
 # chance.

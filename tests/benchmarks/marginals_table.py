@@ -19,8 +19,7 @@ from toolkit.answers import Run
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.registry import find
 from toolkit.sequence import Sequence
-from toolkit.settings import Settings
-from toolkit.settings.records import POLICIES, Window
+from toolkit.settings import POLICIES, Settings, Window
 from toolkit.simulation import SCENARIOS, simulate
 
 REFERENCE = "invariant"

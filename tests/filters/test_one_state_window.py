@@ -13,8 +13,7 @@ from filters import fixed_lag, iekf, sliding_window
 from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded, short
 from toolkit import runner
 from toolkit.errors import EstimatorError
-from toolkit.settings import Settings
-from toolkit.settings.records import POLICIES, Window
+from toolkit.settings import POLICIES, Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 SCENARIOS = [linear(DRIVE, 2.0, tracks=20), linear(FLIGHT, 0.8, tracks=20)]

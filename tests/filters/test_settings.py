@@ -10,8 +10,7 @@ from toolkit import runner
 from toolkit.answers import Run
 from toolkit.registry import find, ladder
 from toolkit.sequence import Sequence
-from toolkit.settings import Outliers, Settings, Window
-from toolkit.settings.records import Noise
+from toolkit.settings import Noise, Outliers, Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "sliding-window", "smart"}

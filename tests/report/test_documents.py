@@ -28,8 +28,7 @@ from toolkit.report.messages import note_lines
 from toolkit.report.records import RECORDS, read_card, read_check, read_manifest, schema_files
 from toolkit.report.report_json import report_document
 from toolkit.report.scores import MetricsDocument, metrics_document
-from toolkit.settings import Settings
-from toolkit.settings.records import Noise
+from toolkit.settings import Noise, Settings
 
 Document = dict[str, Any]
 

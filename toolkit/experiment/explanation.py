@@ -38,9 +38,8 @@ from toolkit.geometry import Array
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.progress import ProgressFor, silent
 from toolkit.registry import EstimatorEntry, defaults, find, find_all
-from toolkit.settings import Scalar, Settings, as_values
+from toolkit.settings import Metrics, Scalar, Settings, as_values
 from toolkit.settings.reading import value_at
-from toolkit.settings.records import Metrics
 
 Key = TypeVar("Key")
 EXCESS = "excess_pose"

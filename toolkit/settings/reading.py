@@ -1,6 +1,6 @@
 """Converts settings in files and on the command line to the record, checked key by key; describes each for the docs.
 
-They are given in TOML, in a manifest or as ``KEY=VALUE``. Descriptions are read from the records themselves.
+They are given in TOML, in a manifest or as ``KEY=VALUE``. Descriptions are read from the record itself.
 """
 
 import math
@@ -17,7 +17,7 @@ from msgspec import Meta, Struct
 from toolkit.errors import DataError, did_you_mean, no_such, type_of
 from toolkit.files.documents import readable
 from toolkit.files.reading import read_text_input
-from toolkit.settings.records import POLICIES, Settings, SettingsError
+from toolkit.settings import POLICIES, Settings, SettingsError
 
 _POLICY = "outliers.policy"
 _MEASURED = "the noise of tracks is measured once for all estimators; noise.track_weight sets it"
