@@ -9,15 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.arrays import rows_of
-from toolkit.audit.intervals import interval_means
-from toolkit.audit.robust import Scalar, slope
+from toolkit.audit.fault import Evidence
+from toolkit.audit.robust import Scalar
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import is_left_only
-from toolkit.models.camera_motion import camera_motion, neighbours
+from toolkit.models.camera_motion import neighbours
 from toolkit.models.gating import LEAST_DISPARITY_PX, MAD_TO_SIGMA
 from toolkit.models.stereo import CHANNELS, disparity_px
-from toolkit.motion_samples import TwistSamples
 from toolkit.noise.correlation import FEWEST_SIGHTINGS, TrackWeight
 from toolkit.noise.measurement import adjusted_stretches, measured_noise
 from toolkit.noise.stretches import Adjusted
@@ -30,9 +29,8 @@ LAGS = 8
 _TAIL, _ODDS = 4.0, 4.0
 # A lag with fewer pairs has no statistic; with fewer residuals there is no card.
 _FEWEST_PAIRS, _FEWEST_RESIDUALS = 30, 300
-# Intervals with fewer common tracks are not used for the scale; a scale from fewer intervals, or with a larger standard
-# error, is not given.
-_FEWEST_COMMON, _FEWEST_INTERVALS, _SCALE_ERROR = 8, 30, 0.05
+# A scale with a larger standard error is not given.
+_SCALE_ERROR = 0.05
 QUANTILES = (0.1, 0.5, 0.9)
 
 
@@ -103,7 +101,7 @@ def card_of(sequence: Sequence) -> Card:
         left_right=_left_right(of_sound.px),
         tails=float((np.abs(here.px) > _TAIL * spread_px).mean()),
         at_odds=1.0 - float(sound.mean()),
-        scale=_scale(sequence, common >= _FEWEST_COMMON),
+        scale=_scale(replace(sequence, observations=seen, track_budget=None)),
     )
 
 
@@ -143,20 +141,9 @@ def _left_right(px: Array) -> float:
     return float((left_px * right_px).mean() / np.sqrt((left_px**2).mean() * (right_px**2).mean()))
 
 
-def _scale(sequence: Sequence, known: BoolArray) -> Scalar | None:
-    """Return the ratio of vision's velocities to the measured ones, with neighbouring intervals as instruments."""
-    motion = sequence.motion
-    if not isinstance(motion, TwistSamples):
+def _scale(sequence: Sequence) -> Scalar | None:
+    """Return the audit's ratio of vision's translations to odometry's, whose error allows slip that lasts."""
+    found = Evidence(sequence).velocity_fit
+    if found is None or not found.scale.error < _SCALE_ERROR:
         return None
-    moved = camera_motion(replace(sequence, observations=sequence.visible, track_budget=None))
-    known = known & moved.known
-    seen_mps = moved.of_imu(sequence.rig.T_imu_cam)[:, 3:]
-    measured_mps = interval_means(motion.t_ns, motion.values, sequence.frames_t_ns)[:, :3]
-    middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:])
-    if middle.size < _FEWEST_INTERVALS:
-        return None
-    around_mps = 0.5 * (seen_mps[middle - 1] + seen_mps[middle + 1])
-    # Only along the axis of most motion: across it there is only noise, which is correlated in neighbouring intervals.
-    along = np.linalg.eigh(around_mps.T @ around_mps)[1][:, -1:]
-    scale = slope(around_mps @ along, measured_mps[middle] @ along, seen_mps[middle] @ along)
-    return scale if scale.error < _SCALE_ERROR else None
+    return Scalar(1.0 + found.scale.value, found.scale.error)
