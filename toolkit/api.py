@@ -15,13 +15,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypedDict, Unpack, get_args
 
 import numpy as np
 from msgspec import Meta
 
 from toolkit.answers import Output, Run
-from toolkit.errors import VislamError, did_you_mean, no_such, type_of
+from toolkit.errors import VislamError, no_such, type_of
 from toolkit.estimator import Build
 from toolkit.experiment.comparison import Comparison, Record
 from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
@@ -29,6 +29,7 @@ from toolkit.experiment.explanation import Explanation, default_ends, run_explan
 from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.pipeline import run as run_plan
 from toolkit.experiment.sweep import Sweep, run_sweep
+from toolkit.metrics import describe
 from toolkit.progress import silent
 from toolkit.registry import discover, find_all
 from toolkit.report.comparison_table import Columns, comparison_table, requested_columns
@@ -101,17 +102,8 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for an argument or a setting that does not exist or has a wrong value,
     ClusterError for a cluster that cannot be used, OutputError where what is to be kept cannot be written.
     """
-    given: dict[str, Any] = {"truth": truth, "trajectories": trajectories, "max_frames": max_frames, "from_s": from_s}
-    given |= {
-        "to_s": to_s,
-        "cov_convention": cov_convention,
-        "every": every,
-        "keep": keep,
-        "own": own,
-        "settings": settings,
-    }
-    given |= {"seed": seed, "seeds": seeds, "workers": workers, "scheduler": scheduler, "resume": resume}
-    plan, kept = _planned(source, estimators, given)
+    given = locals()
+    plan, kept = _planned(**given)
     if kept is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if kept is None else (kept,))[0])
@@ -153,7 +145,7 @@ def sweep(
     """
     if strange := sorted(options.keys() - SweepOptions.__annotations__.keys()):
         raise SettingsError(no_such("argument", strange[0], SweepOptions.__annotations__))
-    plan, kept = _planned(source, estimators, options)
+    plan, kept = _planned(source, estimators, **options)
     return SweepResult(run_sweep(plan, over, crossed=not each, directory=kept))
 
 
@@ -177,11 +169,11 @@ def explain(
             "own has functions, which cannot say what they have; give the path of a file with INGREDIENTS"
         )
     usual = default_ends() if None in (start, goal) else ("", "")
-    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, options)
+    plan, kept = _planned(source, tuple(discover()) if estimators is None else estimators, **options)
     return ExplainResult(run_explanation(plan, str(start or usual[0]), str(goal or usual[1]), kept))
 
 
-def _planned(source: Source, estimators: Names | None, options: Mapping[str, Any]) -> tuple[Plan, Path | None]:
+def _planned(source: Source, estimators: Names | None, **options: Any) -> tuple[Plan, Path | None]:
     """Return the plan of a function's arguments, and the directory its outcomes are kept in, if any."""
     if not isinstance(source, str | Path | Sequence):
         raise SettingsError(f"source is {type_of(source)}; give one recording: a path, a built-in name, a Sequence")
@@ -256,24 +248,16 @@ class Result:
 
     @cached_property
     def figures(self) -> Mapping[str, "Figure"]:
-        """Every figure there is data for, by the names of docs/figures.md; each is drawn when first asked for.
+        """Every figure there is data for, by the names of docs/figures.md."""
+        from toolkit.report.figures import drawn
 
-        To ask which there are draws them all.
-        """
-        return _Figures(self.comparison)
+        return _ByName({one.name: one.figure for one in drawn(self.comparison)})
 
     @cached_property
     def metrics(self) -> Mapping[tuple[str, Output], Mapping[str, float | None]]:
         """Every metric by estimator and output: the value of the run, or the mean over the seeds whose runs are ok."""
-        from toolkit.metrics import describe
-
-        keys = describe()
-        return _Metrics(
-            {
-                (row.estimator, row.output): _Values((key, row.value(key)) for key in keys)
-                for row in self.comparison.rows
-            }
-        )
+        rows, keys = self.comparison.rows, describe()
+        return _ByName({(row.estimator, row.output): _ByName({key: row.value(key) for key in keys}) for row in rows})
 
     @property
     def runs(self) -> Mapping[str, Run]:
@@ -426,44 +410,8 @@ class _NotThereError(VislamError, KeyError):
     __str__ = Exception.__str__  # a KeyError's would put it in quotes
 
 
-class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):
-    """Metrics by estimator and output; a line that is not there is answered with those that are."""
+class _ByName(dict[Any, Any]):
+    """What a result has by name; a name that it does not have is answered with those that it has."""
 
-    def __missing__(self, key: object) -> Mapping[str, float | None]:
-        raise _NotThereError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")
-
-
-class _Values(dict[str, float | None]):
-    """The metrics of one line by key; one that is not there is answered with the nearest."""
-
-    def __missing__(self, key: object) -> float | None:
-        raise _NotThereError(f"no metric is called {key}{did_you_mean(str(key), list(self))}")
-
-
-class _Figures(Mapping[str, "Figure"]):
-    """The figures of a comparison by name, drawn in their order as far as one is asked for."""
-
-    def __init__(self, comparison: Comparison) -> None:
-        from toolkit.report.figures import drawn
-
-        self._coming = drawn(comparison)
-        self._drawn: dict[str, Figure] = {}
-
-    def __getitem__(self, name: str) -> "Figure":
-        while name not in self._drawn:
-            figure = next(self._coming, None)
-            if figure is None:
-                raise _NotThereError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
-            self._drawn[figure.name] = figure.figure
-        return self._drawn[name]
-
-    def __iter__(self) -> Iterator[str]:
-        for figure in self._coming:
-            self._drawn[figure.name] = figure.figure
-        return iter(self._drawn)
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
-
-    def __repr__(self) -> str:
-        return f"<figures: {', '.join(self)}>"
+    def __missing__(self, key: object) -> NoReturn:
+        raise _NotThereError(no_such("entry", str(key), map(str, self)))

@@ -124,21 +124,3 @@ def test_what_is_no_duration_is_refused(capsys):
         with pytest.raises(SystemExit):
             parser().parse_args(["simulate", "drive", "--out", "s", f"--duration={text}"])
         assert "argument --duration: expected seconds" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("settings", "why"),
-    [
-        (None, "manifest.json: holds no settings"),
-        ({"window": {"imu_clones": 3}}, "there is no setting window.imu_clones"),
-        ({"noise": {"pixel_sigma_px": 1e-5}}, "noise.pixel_sigma_px: expected number >= 0.001"),
-    ],
-)
-def test_a_manifest_of_another_version_is_refused_with_its_command(vislam, one_line, settings, why):
-    command = "vislam compare drive --out old"
-    given = {"schema": "vislam.manifest/1", "command": command} | ({} if settings is None else {"settings": settings})
-    Path("manifest.json").write_text(json.dumps(given))
-    assert vislam("compare", "--config", "manifest.json") == 2
-    message = one_line()
-    assert why in message
-    assert message.endswith(f"; where another version wrote it, give its command: {command}\n")

@@ -26,7 +26,7 @@ def found(run: str) -> dict[str, Any]:
     return {key: value for key, value in document.items() if key != "made"}
 
 
-def test_a_sweep_that_was_stopped_goes_on_and_its_page_shows_it(vislam, one_line, monkeypatch):
+def test_a_sweep_that_was_stopped_goes_on_and_its_page_shows_it(vislam, one_line, monkeypatch, capsys):
     ran: list[object] = []
 
     def stopped(unit: Unit, progress: Progress) -> Outcome:
@@ -51,7 +51,8 @@ def test_a_sweep_that_was_stopped_goes_on_and_its_page_shows_it(vislam, one_line
     assert "<td>fault:dropped_frames" in page
     assert vislam("diff", "run", "other") == 3
     assert "run is of a sweep or an explanation" in one_line()
-    assert vislam(*WORDS, "--quiet", "--out", "run") == 0  # in the place of all of it
+    assert vislam(*WORDS, "--max-frames", "9", "--quiet", "--out", "run") == 0  # in the place of all of it
+    assert "8 outcomes of other data, noise or repairs" in capsys.readouterr().err
 
 
 def test_a_file_says_what_is_swept(vislam, capsys):

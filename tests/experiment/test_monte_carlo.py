@@ -112,6 +112,7 @@ def test_seeds_json_obeys_its_contract(over, document):
         (lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(), "metrics.ate_none_m.values"),
         (lambda d: d["runs"][0]["counts"].update(ok=9), "counts does not count status"),
         (lambda d: d["runs"][3]["notes"].clear(), "has no value, and notes does not say why"),
+        (lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(std=None), "n, mean and std are not those of 4 values"),
         (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed, or status of a run"),
     ],
 )

@@ -1,6 +1,5 @@
 """Kept outcomes: found again to the bit, for what they depend on and nothing else, whatever a kill leaves behind."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -262,19 +261,6 @@ def test_a_line_that_was_edited_is_refused(store, tmp_path, was, becomes):
     path.write_bytes(first + second.replace(was, becomes, 1))
     with pytest.raises(DataError, match=r"line 2: was changed since it was written.*delete the line"):
         OutcomeStore(tmp_path, Conditions("hash"))
-
-
-def test_a_line_of_an_earlier_version_is_read_and_never_found(store, tmp_path):
-    """It has no checksum, and is of other code in any case."""
-    store.keep(UNIT, OUTCOME)
-    store.close()
-    path = tmp_path / OUTCOMES
-    line = re.sub(rb',"sha256":"\w+"', b"", path.read_bytes()).replace(b"vislam.outcome/2", b"vislam.outcome/1")
-    path.write_bytes(line)
-    again = OutcomeStore(tmp_path, Conditions("hash"))
-    assert again.unusable == 1
-    assert again.find(UNIT) is None
-    again.close()
 
 
 @pytest.mark.parametrize("name", ["../notes.txt", "notes.txt", "/etc/hosts", "trajectories/../notes.txt"])

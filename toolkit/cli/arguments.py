@@ -31,10 +31,6 @@ class UsageError(VislamError):
     exit_status: ClassVar[int] = 2
 
 
-# Options of earlier versions, and what holds now.
-_GONE = {"--no-fast": "each part of an estimator exists once, the MSCKFs' tracks compiled and all else in NumPy"}
-
-
 class Parser(argparse.ArgumentParser):
     """A parser that keeps the layout of its epilog, takes no abbreviations and reports an error in one line."""
 
@@ -58,8 +54,6 @@ class Parser(argparse.ArgumentParser):
     def _why_left(self, word: str, given: list[str]) -> str:
         if word.startswith("-"):
             option = word.partition("=")[0]
-            if option in _GONE:
-                return f"there is no option {option} any more: {_GONE[option]}"
             known = list(self._option_string_actions)
             begun = next((name for name in known if name.startswith(option)), "")
             return f"there is no option {option}{f'; did you mean {begun}?' if begun else did_you_mean(option, known)}"
@@ -267,7 +261,7 @@ COV_CONVENTION = arg(
 )
 FORMAT = choice("--format", ("text", "markdown", "csv", "latex"), "of what is printed", default="text")
 FIGURES = (
-    choice("--figures", ("few", "all", "none"), "figures to draw with --out (see docs/figures.md)", default="few"),
+    choice("--figures", ("few", "all", "none"), "figures to draw (see docs/figures.md)", default="few"),
     choice("--figure-format", ("png", "pdf", "svg"), "format of the figures", default="png"),
 )
 REPAIR = Group(

@@ -60,7 +60,7 @@ _HOW = (
     *SETTINGS,
 )
 _SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host:8786 (see docs/scaling.md)")
-_TRUTH = arg("--truth FILE.tum", "ground truth; with exactly one SEQUENCE")
+_TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
 _OUT = arg(
     "--out DIR",
     "run directory (default: runs/<date and time>); runs are kept there as they end (of compare with --seeds), and the "
@@ -130,9 +130,7 @@ def compare(options: argparse.Namespace) -> int:
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
         for directory, store in stores.items():
             open_files.callback(store.close)
-            if store.unusable:
-                what = f"{store.unusable} outcomes of other data, noise or repairs, or of another version"
-                print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
+            _tell_unusable(store.unusable, directory)
         open_files.enter_context(_kept_where(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
@@ -211,6 +209,7 @@ def explain(options: argparse.Namespace) -> int:
         found = run_explanation(plan, *ends, target, progress_for)
     with progress_for(f"{found.grid.case.name}: figure"):
         document = write_explanation(found, target, shlex.join(options.command_line))
+    _tell_unusable(found.grid.unusable, target)
     _print(document, EXPLANATIONS.text(document, width_of_output()), target, options)
     return 0
 
@@ -275,8 +274,15 @@ def sweep(options: argparse.Namespace) -> int:
         found = run_sweep(plan, axes or requested.over, crossed=crossed, directory=target, progress_for=progress_for)
     with progress_for(f"{found.grid.case.name}: figures"):
         document = write_sweep(found, target, shlex.join(options.command_line), list(draw_sweep(found)))
+    _tell_unusable(found.grid.unusable, target)
     _print(document, SWEEPS.text(document), target, options)
     return 0
+
+
+def _tell_unusable(count: int, directory: Path) -> None:
+    if count:
+        what = f"{count} outcomes of other data, noise or repairs, or of another version"
+        print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
 
 
 def _print(document: Struct, text: str, target: Path, options: argparse.Namespace) -> None:

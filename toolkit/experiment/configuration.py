@@ -134,20 +134,5 @@ def _manifest(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: is not JSON ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("settings"), dict):
-        raise SettingsError(
-            f"{path}: holds no settings; "
-            f"{_by_its_command(document) or 'name the manifest.json of a comparison, or a TOML file'}"
-        )
-    settings = without_removed(document["settings"])
-    try:
-        settings_of(settings, str(path))
-    except SettingsError as error:
-        command = _by_its_command(document)
-        raise SettingsError(f"{error}; {command}" if command else str(error)) from error
-    return {**settings, COMPARE: document.get(COMPARE, {})}
-
-
-def _by_its_command(document: object) -> str:
-    """Return what to do about the manifest of a version with other settings, "" where it has no command."""
-    command = document.get("command") if isinstance(document, dict) else None
-    return f"where another version wrote it, give its command: {command}" if isinstance(command, str) else ""
+        raise SettingsError(f"{path}: holds no settings; name the manifest.json of a comparison, or a TOML file")
+    return {**without_removed(document["settings"]), COMPARE: document.get(COMPARE, {})}

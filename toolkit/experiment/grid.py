@@ -63,11 +63,15 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The outcomes of every trial, in the order of the plan's seeds; ``case`` is the recording under the first one."""
+    """The outcomes of every trial, in the order of the plan's seeds; ``case`` is the recording under the first one.
+
+    ``unusable`` counts the outcomes in the directory that no such trial can use.
+    """
 
     plan: Plan
     case: Prepared
     outcomes: Mapping[Trial, tuple[Outcome, ...]]
+    unusable: int = 0
 
     def row(self, trial: Trial, output: Output) -> Row:
         return Row(output, self.outcomes[trial])
@@ -108,8 +112,8 @@ def run_grid(
                 of_trial[trial].append(_all_that_it_depends_on(unit))
                 jobs.setdefault(of_trial[trial][-1], Job(unit, store))
             found = dict(outcomes_of(list(jobs.values()), workers, case.name, progress_for))
-    outcomes = {job: found[place] for place, job in enumerate(jobs)}
-    return Grid(plan, case, {trial: tuple(outcomes[job] for job in of) for trial, of in of_trial.items()})
+    outcomes, unusable = {job: found[place] for place, job in enumerate(jobs)}, 0 if store is None else store.unusable
+    return Grid(plan, case, {trial: tuple(outcomes[job] for job in of) for trial, of in of_trial.items()}, unusable)
 
 
 def _all_that_it_depends_on(unit: Unit) -> Hashable:

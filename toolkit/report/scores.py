@@ -170,6 +170,10 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"metrics.{key}.values does not have an entry a seed")
             if metric.n == 0 and not self.notes.get(key):
                 raise ValueError(f"metrics.{key} has no value, and notes does not say why")
+            given = zip(self.status, metric.values, strict=True)
+            known = sum(status == "ok" and value is not None for status, value in given)
+            if (metric.n, metric.mean is None, metric.std is None) != (known, known == 0, known < 2):
+                raise ValueError(f"metrics.{key}: n, mean and std are not those of {known} values")
 
 
 class LogEntry(Struct, frozen=True, kw_only=True):

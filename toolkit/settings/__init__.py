@@ -241,6 +241,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     estimators: dict[str, dict[str, Scalar]] = {}
 
     def options_of(self, estimator: str) -> Mapping[str, Scalar]:
+        """Return the options set for one estimator alone."""
         return self.estimators.get(estimator, {})
 
 
