@@ -1,12 +1,18 @@
-"""Whoever does what a refusal of a recording says has one that is read, or is told something else (5 s)."""
+"""What is wrong with a recording is told in one line, and whoever does what it says is not told the same again (10 s).
 
+One table of recordings that are wrong in one thing each; folders of images have one of their own beside it
+(tests/frontend/test_folders.py).
+"""
+
+import gzip
+import json
 import os
 import re
 import shutil
 import warnings
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +20,10 @@ import cv2
 import numpy as np
 import pytest
 import scipy.io
-from rosbags.typesys import get_types_from_msg
 
 import toolkit
 from tests.advice import TOOLKIT, advice_in, is_followed, unknown_beginnings
 from tests.datasets.conftest import edit as replace_in
-from tests.datasets.test_broken_files import K, many
 from tests.datasets.test_course_npy import T_REGULAR_OPTICAL
 from tests.datasets.test_kitti_raw import DRIVE, packet
 from tests.datasets.test_kitti_raw import drive as day_and_drive
@@ -39,16 +43,22 @@ from toolkit.sequence import Sequence, check_runnable
 __all__ = ["day_and_drive"]
 
 
+Writer = Callable[[Path, dict[str, Any]], object]
+
+
 @dataclass
 class Case:
     """A recording that steps change: files, or the content of one file; the sound one; what is typed or called."""
 
     at: Path
     sound: Any
-    write: Callable[[Path, dict[str, Any]], object] | None = None
+    writer: Writer | None = None
     content: dict[str, Any] = field(default_factory=dict)
     typed: tuple[str, ...] | Callable[[Path], object] = ()
     usual: tuple[str, ...] = ("check-data", "@")
+
+    def __post_init__(self) -> None:
+        self.write = self.writer
 
     def outcome(self, capsys: pytest.CaptureFixture[str]) -> str:
         """Return the refusal, empty where there is none; of what is typed, @ is the recording, @/.. where it is."""
@@ -91,7 +101,7 @@ def gone(*names: str) -> Step:
 
 def sound(case: Case) -> None:
     """Put in what is asked for: the recording is as it was, and so is what is typed."""
-    case.typed = ()
+    case.typed, case.write = (), case.writer
     if isinstance(case.sound, dict):
         case.content = dict(case.sound)
     else:
@@ -172,6 +182,51 @@ def write(of: Callable[..., object]) -> Step:
     return lambda case: setattr(case, "write", of)
 
 
+def cut(share: float) -> Step:
+    """Return what leaves a share of a file."""
+
+    def shorten(case: Case) -> None:
+        assert case.writer is not None
+        case.writer(case.at, case.content)
+        content = case.at.read_bytes()
+        case.write = lambda path, _: path.write_bytes(content[: int(share * len(content))])
+
+    return shorten
+
+
+def document(name: str, change: Callable[[dict[str, Any]], object]) -> Step:
+    """Return what changes a JSON document of a folder."""
+
+    def apply(case: Case) -> None:
+        values = json.loads((case.at / name).read_text())
+        change(values)
+        (case.at / name).write_text(json.dumps(values))
+
+    return apply
+
+
+def arrays(change: Callable[[dict[str, Any]], object]) -> Step:
+    """Return what changes the arrays of a recording of the toolkit's own."""
+
+    def apply(case: Case) -> None:
+        with np.load(case.at / "recording.npz") as archive:
+            values = dict(archive)
+        change(values)
+        np.savez_compressed(case.at / "recording.npz", **values)
+
+    return apply
+
+
+def cell(row: int, column: int, value: str) -> Step:
+    """Return what exchanges a cell of tracks.csv."""
+
+    def exchanged(table: list[str]) -> list[str]:
+        cells = table[row].rstrip().split(",")
+        return [*table[:row], ",".join([*cells[:column], value, *cells[column + 1 :]]) + "\n", *table[row + 1 :]]
+
+    return lines("tracks.csv", exchanged)
+
+
 def both(*steps: Step) -> Step:
     return lambda case: [step(case) for step in steps]
 
@@ -187,6 +242,21 @@ IMAGES = ["mav0/cam0/data", "mav0/cam1/data"]
 NOISE = "".join(f"{s}_noise_density: 2.0e-3\n{s}_random_walk: 2.0e-4\n" for s in ("gyroscope", "accelerometer"))
 
 
+def many(*corners_px: float, struck: float = 1.0) -> np.ndarray:
+    """Return features of eight tracks in all five frames, a share of them scattered about one place, the rest sound."""
+    tracks = np.arange(8) < round(8 * struck)
+    places = np.where(tracks, np.array(corners_px)[:, None], np.array([400.0, 200.0, 380.0, 200.0])[:, None])
+    return places[..., None] + np.random.default_rng(0).normal(0.0, 0.5, (4, 8, 5))
+
+
+def K(**entries: float) -> np.ndarray:
+    """Return a camera matrix with entries such as ``m01`` exchanged."""
+    matrix = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
+    for name, value in entries.items():
+        matrix[int(name[1]), int(name[2])] = value
+    return matrix
+
+
 def save_npz(path: Path, arrays: dict[str, Any]) -> None:
     np.savez(path, **arrays)
 
@@ -197,6 +267,25 @@ def save_twice(path: Path, arrays: dict[str, Any]) -> None:
     with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         archive.writestr(archive.namelist()[0], archive.read(archive.namelist()[0]))
+
+
+def save_short(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an archive whose features end before their header says."""
+    np.savez(path, **{key: array for key, array in arrays.items() if key != "features"})
+    with zipfile.ZipFile(path, "a") as archive, archive.open("features.npy", "w") as stream:
+        header = {"descr": "<f8", "fortran_order": False, "shape": arrays["features"].shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(arrays["features"].tobytes()[:-20])
+
+
+def save_struck(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an archive with ten bytes of its compressed features lost."""
+    np.savez_compressed(path, **arrays)
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        at = archive.getinfo("features.npy").header_offset + 60
+    content[at : at + 10] = bytes(10)
+    path.write_bytes(bytes(content))
 
 
 def save_npy(path: Path, content: dict[str, Any]) -> None:
@@ -251,8 +340,8 @@ def given(kind: str, request: pytest.FixtureRequest, tmp_path: Path, film: Path)
         content = messages(film / "asl", bare=kind == "bare") if content is None else content
         if kind == "bag":
             beside(Case(at, None))
-        writers = {"npz": save_npz, "mat": scipy.io.savemat, "npy": save_npy, "bag": write_bag, "bare": write_bag}
-        return Case(at, dict(content), writers[kind], content)
+        writers: dict[str, Writer] = {"npz": save_npz, "mat": scipy.io.savemat, "npy": save_npy}
+        return Case(at, dict(content), writers.get(kind, write_bag), content)
     if kind in ("own", "twist"):
         written(recorded("imu" if kind == "own" else kind), kept)
     elif kind == "saved":
@@ -341,14 +430,17 @@ def wheels(name: str, speed_mps: float, kind: str = "nav_msgs/msg/Odometry") -> 
     return made
 
 
-UNKNOWN = "uint64 timestamp\nfloat32[3] gyro_rad\nfloat32[3] accelerometer_m_s2\n"
+def in_frame(one: Item, frame: str) -> Item:
+    return one._replace(value=replace(one.value, header=replace(one.value.header, frame_id=frame)))
 
 
-def foreign(kind: str, definition: str, *values: Any) -> Item:
-    """Return a message of a type that is not ROS's own."""
-    if kind not in ROS.store.types:
-        ROS.store.register(get_types_from_msg(definition, kind))
-    return Item(START_NS, "/other", kind, ROS.store.types[kind](*values))
+def of_one_frame(all_: Items) -> Items:
+    return [in_frame(one, "0") if one.topic in ("/imu0", "/cam0/image_rect") else one for one in all_]
+
+
+def elsewhere() -> list[Item]:
+    """Return the messages of another IMU, twice as many, on a body that nothing joins to the camera."""
+    return [in_frame(one, "base_link") for one in (*imu("/base/imu"), *imu("/base/imu", 2_000_000))]
 
 
 def chain(first: str = "T_cam_imu", second: str = "cam1") -> Step:
@@ -405,6 +497,10 @@ INTO, TOPICS = say(*IMPORT, "made"), lambda words: check("--topics", words)
 CHECKED = call(lambda at: check_runnable(load_sequence(str(at))))
 NAN = f"nan{6 * ',nan'}\n"
 OBJECTS = np.array([{}, []], dtype=object)
+SPECKLED = np.random.default_rng(0).integers(0, 255, (200, 320), dtype=np.uint8)
+P = "250 0 160 0 0 250 100 0 0 0 1 0"
+# Nine lists of ten, each of the one before it: 600 characters that stand for a billion values.
+BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
 DAY = Path(DRIVE).name
 RAW = both(topic("image_rect", "image_raw"), without("info", "tf_static"))
 TILTED = [T_REGULAR_OPTICAL @ T for T in PLACES]
@@ -422,10 +518,26 @@ def yaml_of(place: Any, of_right: Any) -> Step:
     return both(text(YAMLS[0], camera_yaml(CAMERA, place)), text(YAMLS[1], camera_yaml(CAMERA, of_right)))
 
 
-# By kind: what spoils it, the advice, and what somebody does who follows it: puts in what is asked for, where nothing
+# By kind: what spoils it, what is told, and what somebody does who follows it: puts in what is asked for, where nothing
 # else is named.
 ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     "npz": [
+        (gone("K", "angular_velocity"), "missing angular_velocity or rotational_velocity, K; it has"),
+        (put(features=np.zeros((4, 3, 6))), "features has shape (4, 3, 6), expected (4, any, 5)"),
+        (put(time_stamps=np.zeros((2, 5))), "time_stamps has shape (2, 5)"),
+        (put(time_stamps=np.zeros((1, 0))), "0 frame(s)"),
+        (put(b=np.array(0.0)), "b is 0, expected a positive number"),
+        (put(b=np.array(np.nan)), "b is nan, expected a finite number"),
+        (put(b=np.array([0.5, 0.5])), "b has 2 values, expected one finite number"),
+        (put(imu_T_cam=2.0 * np.eye(4)), "imu_T_cam is not a rotation"),
+        (put(K=np.full((3, 3), "x")), "K holds text, expected real numbers"),
+        (put(K=np.full((3, 3), np.nan)), "K is not finite"),
+        (put(features=many(400.0, 200.0, 380.0, 212.0, struck=0.375)), "in 38% of 40 sightings vL - vR is"),
+        (put(features=many(200.0, 400.0, 200.0, 380.0, struck=0.375)), "u and v look exchanged"),
+        (cut(0.1), "damaged or truncated npz"),
+        (cut(0.99), "damaged or truncated npz"),
+        (write(save_struck), "damaged or truncated npz"),
+        (write(save_short), "features ends after 57 of 60 values"),
         (both(put(Feature=1.0), gone("features")), "missing features (rename Feature?)"),
         (both(put(Feature=1.0), gone("features")), "without image features leave Feature out", gone("Feature")),
         (put(features=OBJECTS), "never unpickled; save it as plain numbers"),
@@ -440,7 +552,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (put(K=K(m22=0.0)), "write fx, 0, cx; 0, fy, cy; 0, 0, 1"),
         (put(K=K(m01=50.0)), "a rectified pair has none; rectify the images"),
         (put(K=K(m00=-500.0)), "expected a positive number; correct K"),
-        (put(features=many(400.0, 200.0, 380.0, 212.0)), "rectify the images, or correct the rows"),
+        (put(features=many(400.0, 200.0, 380.0, 197.0)), "rectify the images, or correct the rows"),
         (
             put(features=many(200.0, 400.0, 200.0, 380.0)),
             "u and v look exchanged: exchange them",
@@ -448,12 +560,22 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (put(imu_T_cam=TILTED[1].T), "expected 0, 0, 0, 1; transpose it?", put(imu_T_cam=TILTED[1])),
         (put(cam_T_imu=np.eye(4)), "delete the one that is wrong", gone("cam_T_imu")),
-        (write(save_twice), "save it with one array of that name", write(save_npz)),
+        (write(save_twice), "save it with one array of that name"),
         (check("--tracks", "images"), "its format has tracks and no images; leave --tracks images out"),
         (check("--topics", "imu=/imu0"), "a bag has; leave --topics out, or compare it by itself"),
         (say("tracks", "@", "--out", "x"), "a folder as EuRoC's or KITTI's", say("tracks", "@/../none", "--out", "x")),
     ],
     "npy": [
+        (gone("w_t", "timestamps"), "missing w_t, timestamps"),
+        (write(lambda path, _: np.save(path, np.zeros(3))), "one array of shape (3,), expected a dict"),
+        (put(extra=1j), "only plain numbers"),
+        (put(v_t=np.array(["2026"], dtype="M8[Y]")), "an array holds datetime64"),
+        (put(cam_imgs_L=[]), "cam_imgs_L has 0 images and drive.npy 5 timestamps"),
+        (put(cam_imgs_R=None), "cam_imgs_R is missing or no list of images"),
+        (
+            put(cam_imgs_L=[SPECKLED] * FRAMES, cam_imgs_R=[SPECKLED] * FRAMES),
+            "left and right images are the same ones",
+        ),
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
         (say("check-data", "@/../drive_imgs.npy"), "name the file beside it without _imgs"),
         (put(extR_T_imu=T_REGULAR_OPTICAL @ se3_exp(0.3 * np.ones(6))), "is not; rectify the recording"),
@@ -462,18 +584,32 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             write(lambda path, _: np.save(path, np.array([1, "x"], dtype=object), allow_pickle=True)),
             "save the recording as one with numpy.save",
-            write(save_npy),
         ),
     ],
     "mat": [
+        (gone("theta_vk_i", "b"), "missing theta_vk_i, b; it has C_c_v"),
+        (put(v_vk_vk_i=np.ones((3, 3))), "v_vk_vk_i has 3 columns for 4 stamps"),
+        (put(C_c_v=np.ones((3, 3))), "C_c_v is not a rotation"),
+        (cut(0.1), "not a whole Matlab file"),
+        (cut(0.95), "not a whole Matlab file"),
         (
             write(lambda path, _: path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(64))),
             "save it with -v7",
-            write(scipy.io.savemat),
         ),
         (put(r_i_vk_i=np.full((3, 6), np.nan)), "cut the recording to its truth"),
     ],
     "export": [
+        (gone("calib.json", "imu.csv"), "missing calib.json, imu.csv"),
+        (document("calib.json", lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
+        (document("calib.json", lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds text"),
+        (text("calib.json", '{"cam0": '), "not valid JSON"),
+        (text("calib.json", '["cam0"]'), "holds a JSON list"),
+        (edit("features.csv", "uL,vL", "u,v"), "missing column uL (rename u?), vL"),
+        (edit("features.csv", "300", "many"), "features.csv: line 2: uL is many, expected a number"),
+        (edit("imu.csv", "0.1,0.2,0.3,1,2,9.8\n", "0.1\n"), "imu.csv: line 2 has 2 columns, expected 7"),
+        (text("imu.csv", gzip.compress(bytes(99))[:20]), "damaged or truncated gzip"),
+        (lines("imu.csv", lambda table: table[:1]), "imu.csv: holds no rows"),
+        (edit("truth_cam.csv", ",1,1,0", ",1,0,0"), "line 3 has a quaternion"),
         (edit("calib.json", '"k1": 0', '"k1": 0.1'), "export rectified features"),
         (
             edit("features.csv", ",7,", ",nan,"),
@@ -487,6 +623,28 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
     ],
     "own": [
+        (gone("imu.csv"), "missing imu.csv or twist.csv"),
+        (cell(4, 1, "1.5"), "line 5: track_id is 1.5, expected a whole number"),
+        (cell(6, 2, ""), "line 7: uL is empty, expected a number"),
+        (cell(6, 2, "1_0"), "line 7: uL is 1_0, expected a number"),
+        (cell(3, 0, "1" * 30), f"line 4: t_ns is {'1' * 30}, expected a whole number"),
+        (
+            lines("tracks.csv", lambda table: [line.replace(",", ";").replace(".", ",") for line in table]),
+            "expected a number with a decimal point",
+        ),
+        (lines("tracks.csv", lambda table: table[1:]), "holds numbers and no names; its first line names the columns"),
+        (lines("tracks.csv", lambda table: ["# a drive\n\n", table[0], "x,x,x,x,x,x\n"]), "line 4: t_ns is x"),
+        (edit("rig.toml", "fx_px = ", "fx_px = -"), "expected a positive number"),
+        (edit("rig.toml", "fx_px = ", "f_px = "), "there is no f_px; did you mean fx_px"),
+        (edit("rig.toml", "fx_px = ", f"fx_px = 1{400 * '0'} #"), "fx_px is inf, expected a finite number"),
+        (edit("rig.toml", "T_imu_cam = [[", "T_imu_cam = [[{}], ["), "T_imu_cam holds text, expected real numbers"),
+        (edit("rig.toml", "T_imu_cam = [[", "T_imu_cam = [[1, 2, 3, 4], ["), "T_imu_cam has shape (5, 4)"),
+        (edit("rig.toml", "cy_px = ", "cy_px = '"), "is not TOML"),
+        (edit("rig.toml", "gyro_random_walk", "#"), "missing noise.gyro_random_walk; an IMU's data sheet has them"),
+        (kept(tracks=OWN["tracks"] | {"uL": [1.0]}), "tracks: its columns differ in length: t_ns", kept()),
+        (kept(motion={"t_ns": [1], "vx": [0.0], "gx": [0.0]}), "motion: missing column ax, ay, az, gx, gy", kept()),
+        (edit("rig.toml", "fx_px", "#"), "missing fx_px; it has T_imu_cam"),
+        (kept(truth={"t": [1.0]}), "truth: missing column x, y", kept()),
         (edit("tracks.csv", "track_id", "trackid"), "(rename trackid?)", edit("tracks.csv", "trackid", "track_id")),
         (edit("tracks.csv", "t_ns,", "t,"), "nanoseconds: divide by 1e9", lines("tracks.csv", of_rows(in_seconds))),
         (
@@ -583,10 +741,40 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say("card", "@", "--json", "/dev/null"), "name a regular file", say("card", "@", "--json", "@/c.json")),
     ],
     "saved": [
+        (gone("recording.npz"), "No such file"),
+        (text("recording.json", '{"schema": "vislam'), "cannot be read as JSON"),
+        (document("recording.json", lambda t: t.pop("rig")), "lacks rig"),
+        (document("recording.json", lambda t: t["rig"].update(fx_px=10**400)), "does not fit"),
+        (document("recording.json", lambda t: t["rig"].update(T_imu_cam=np.eye(3).tolist())), "T_imu_cam"),
+        (document("recording.json", lambda t: t["motion"].update(kind="gps")), "gps"),
+        (document("recording.json", lambda t: t["motion"].update(pairing="middle")), "middle"),
+        (
+            document("recording.json", lambda t: t["provenance"].update(facts=[3])),
+            "provenance.facts[0]: expected string",
+        ),
+        (text("recording.npz", b"PK"), "damaged"),
+        (arrays(lambda a: a.pop("frames_t_ns")), "frames_t_ns is missing"),
+        (arrays(lambda a: a.update(motion_values=a["motion_values"][:, :5])), "motion_values has shape"),
+        (arrays(lambda a: a.update(motion_values=a["motion_values"] * 1j)), "holds complex128"),
+        (arrays(lambda a: a.update(observations_track_id=a["observations_track_id"][1:])), "differ in length"),
+        (arrays(lambda a: a.update(frames_t_ns=a["frames_t_ns"][:-1])), "copy both files again"),
+        (arrays(lambda a: a["observations_frame"].put(-1, 99)), "is of frame 99"),
+        (arrays(lambda a: a.update(observations_frame=a["observations_frame"][::-1])), "not sorted"),
+        (arrays(lambda a: a.update(prior_cov=-a["prior_cov"])), "not positive definite"),
         (edit("recording.json", "recording/1", "recording/9"), "copy or save the recording again"),
         (edit("recording.json", '"fx_px": ', '"fx_px": -'), "expected a positive number; correct the recording"),
     ],
     "odometry": [
+        (edit("calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
+        (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "missing P0"),
+        (text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 5 images"),
+        (text("times.txt", "0\n0.1\nx\n"), "times.txt: line 3 is not numeric"),
+        (text("times.txt", "".join(f"{k}00000000\n" for k in range(FRAMES))), "look like nanoseconds: divide by 1e9"),
+        (text("times.txt", ""), "times.txt has one number a line, in seconds"),
+        (both(text("x", b""), say("check-data", "@/x")), "the file is empty"),
+        (both(text("x", b"hello"), say("check-data", "@/x")), "of no known format; there are"),
+        (both(text("x", b"PK\x03\x04"), say("check-data", "@/x")), "of no known format"),
+        (both(text("x", b"\x28\xb5\x2f\xfd" + bytes(9)), say("check-data", "@/x")), "is packed, unpack it with unzstd"),
         (edit("calib.txt", "-100.0", "0"), "so there is no baseline; give each its own"),
         (
             edit("calib.txt", "-100.0", "100.0"),
@@ -644,6 +832,14 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say("tracks", "@", "--out", "@/calib.txt/x"), "choose another directory with --out"),
     ],
     "day": [
+        (edit("calib_imu_to_velo.txt", "T: 0 0 0", "T: 0 O 0"), "calib_imu_to_velo.txt: missing T; it has R"),
+        (gone(f"{DAY}/image_00/timestamps.txt"), "timestamps.txt: cannot be read"),
+        (text(f"{DAY}/image_00/timestamps.txt", "\n\n"), "holds no stamps"),
+        (text(f"{DAY}/oxts/data/0000000003.txt", "1 2 3"), "0000000003.txt: 3 numbers"),
+        (
+            lines(f"{DAY}/oxts/timestamps.txt", lambda all_: [row.replace("09-26", "09-30") for row in all_]),
+            "in the time of the oxts packets",
+        ),
         (gone("calib_cam_to_cam.txt"), "into the folder of the day or of the drive"),
         (pixels("*/image_*/data/*.png", lambda image: image[::2, ::2]), "day, or images that were not scaled or cut"),
         (text(f"{DAY}/oxts/data/0000000003.txt", packet(0.3, yaw=30.0)), "and no radians; convert degrees"),
@@ -654,6 +850,12 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
     ],
     "asl": [
+        (gone(TABLES[0], *IMAGES), "cam0/data.csv: cannot be read"),
+        (edit("mav0/imu0/data.csv", "w_RS_S_y", "rate_y"), "imu0/data.csv: missing column w_RS_S_y"),
+        (edit(YAMLS[0], "100.0]", "100.0"), "line 11: expected "),
+        (text(YAMLS[0], BOMB), "values, with those that aliases (*name) repeat"),
+        (edit(YAMLS[0], "rate_hz", "sensor_type"), "gives sensor_type a second time"),
+        (edit(YAMLS[0], "data: [1", "data: [2"), "T_BS is not a rotation"),
         (gone("mav0/imu0/data.csv"), "lay them out as KITTI's image_0, image_1 and calib.txt", as_kitti),
         (bag_inside, "no measurements but those of a bag: name bag in it", say("check-data", "@/bag")),
         (edit(YAMLS[0], "distortion_model: none\n", ""), "lacks distortion_model or intrinsics of a camera; add them"),
@@ -683,7 +885,12 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "where only the cameras' clocks differ, correct the stamps of cam1",
             lines(TABLES[1], restamped(lambda t: t - 20_000_000)),
         ),
-        (gone(YAMLS[1]), "write the calibration as docs/images.md describes", chain()),
+        (
+            both(gone(YAMLS[1]), text("orb.yaml", "Camera1.fx: 50.0")),
+            "missing cam1/sensor.yaml, and there is no *camchain*.yaml of Kalibr's that states it; "
+            "orb.yaml is not read; write the calibration as docs/images.md describes",
+            chain(),
+        ),
         (chain(second="cam2"), "calibrate cam0 and cam1 together", chain()),
         (chain(first="T_imu_body"), "take the camchain that Kalibr writes when it calibrates cameras and IMU", chain()),
         (yaml_of(PLACES[0], PLACES[0]), "so there is no baseline; give each its own pose"),
@@ -699,6 +906,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (text("camchain.yaml", "a: 1\n" * 1_000_000), "characters are no calibration; name another file"),
     ],
     "bag": [
+        (TOPICS("left=/cam0/image"), "no topic is called /cam0/image (did you mean /cam0/image_raw"),
+        (TOPICS("imu=/cam0/image_raw"), "cannot be imu, which is sensor_msgs/Imu"),
+        (TOPICS("left=/cam0/image_raw,right=/cam0/image_raw"), "a pair has a topic each"),
+        (without("cam1"), "holds images of one camera, /cam0/image_raw"),
+        (both(without("imu0"), more(*imu("/a", gyro=0.0))), "/a measures no angular velocity"),
         (
             both(topic("cam0", "port"), topic("cam1", "starboard")),
             "name them with --topics left=TOPIC,right=TOPIC",
@@ -719,7 +931,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "two clocks; stamp both by one, or name another topic with --topics imu=TOPIC",
             TOPICS("imu=/imu0"),
         ),
-        (without("imu0"), "so nothing measures the motion; record one with the images"),
+        (
+            without("imu0"),
+            "nothing measures the motion; record one with the images, or convert what measures it to "
+            "sensor_msgs/Imu (m/s^2, rad/s); there are /cam0",
+        ),
         (
             both(without("imu0"), more(*wheels("/wheels", 0.5, "geometry_msgs/msg/TwistStamped"))),
             "name one with --topics twist=TOPIC (/wheels)",
@@ -741,12 +957,8 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (compressed(lambda one: (one.t_ns, b"RIFF....WEBP")), "republish them as one of these, or as raw images"),
         (
-            both(without("imu0"), more(foreign("px4_msgs/msg/Combined", UNKNOWN, 0, *np.zeros((2, 3), "f4")))),
-            "convert it to sensor_msgs/Imu (m/s^2",
-        ),
-        (
-            both(without("cam"), more(foreign("ffmpeg_msgs/msg/FFMPEGPacket", "uint8[] data", np.zeros(3, "u1")))),
-            "write them as sensor_msgs/Image with image_transport republish",
+            without("cam"),
+            "holds no images that can be read, and the tracks are made of them; write them as sensor_msgs/Image",
         ),
         (
             lambda case: [write_bag(case.at.with_stem("other"), case.content), say("check-data", "@/..")(case)],
@@ -754,6 +966,8 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
     ],
     "bare": [
+        (items(of_one_frame), "no /tf_static connects the frames '0' and '0'"),
+        (more(*elsewhere()), "or name another Imu with --topics imu=TOPIC (/imu0)", TOPICS("imu=/imu0")),
         (without("camera_info"), "an ASL folder's cam0/sensor.yaml beside the bag", beside),
         (
             topic("camera_info", "lens"),

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 
 import toolkit
-from tests.datasets.conftest import assert_refused
 from toolkit.cli import main
 from toolkit.datasets import own_tables
 from toolkit.datasets.io.tables import columns_given
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.headings import imu_columns
-from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.measurements import is_left_only
 from toolkit.sequence import Sequence
@@ -116,35 +114,24 @@ def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("write", "pattern"),
+    "write",
     [
-        (lambda text: text.replace(",", ";"), None),
-        (lambda text: text.replace(",", "\t"), None),
-        (lambda text: text.replace("\n", "\r\n"), None),
-        (lambda text: "\ufeff" + text, None),
-        (lambda text: "".join('"' + line.replace(",", '","') + '"\n' for line in text.splitlines()), None),
-        (lambda text: "# a drive\n\n# of today\n" + text.replace("\n", "\n# next\n\n"), None),
-        (lambda text: "# a drive\n#" + text.replace("\n", "\n# of today\n", 1), None),
-        (lambda text: text.replace("\n", ",,\n").replace("vR,,", "vR,of,of", 1), None),
-        (lambda text: "".join(line + ",\n" for line in text.splitlines()), None),
-        (lambda text: text.replace(",", " "), "its columns are separated by blanks; separate them by commas"),
-        (lambda text: text.replace(",", ";").replace(".", ","), r"line 2: .* is \d+,\d+, .* with a decimal point"),
-        (lambda text: text.partition("\n")[2], "holds numbers and no names; its first line names the columns"),
-        (lambda text: text.replace("000000,", ","), "t_ns must be in nanoseconds, but the stamps look like"),
-        (lambda text: text.replace(".", "_"), r"line 2: .* is .*_.*, expected a number"),
-        (lambda text: "# a drive\n\n" + text.replace(".", "x"), r"line 4: .* is .*x.*, expected a number"),
+        lambda text: text.replace(",", ";"),
+        lambda text: text.replace(",", "\t"),
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: "\ufeff" + text,
+        lambda text: "".join('"' + line.replace(",", '","') + '"\n' for line in text.splitlines()),
+        lambda text: "# a drive\n\n# of today\n" + text.replace("\n", "\n# next\n\n"),
+        lambda text: "# a drive\n#" + text.replace("\n", "\n# of today\n", 1),
+        lambda text: "".join(line + ",\n" for line in text.splitlines()),
+        lambda text: text.replace("\n", ",,\n").replace("vR,,", "vR,of,of", 1),
     ],
 )
-def test_tables_as_spreadsheets_write_them_are_read_or_reported(
-    tmp_path: Path, write: Callable[[str], str], pattern: str | None
-) -> None:
+def test_tables_as_spreadsheets_write_them_are_read(tmp_path: Path, write: Callable[[str], str]) -> None:
     folder = written(recorded("twist"), tmp_path / "own")
     path, expected = folder / "tracks.csv", toolkit.load_sequence(str(folder)).content_hash()
     path.write_text(write(path.read_text()), encoding="utf-8")
-    if pattern is None:
-        assert toolkit.load_sequence(str(folder)).content_hash() == expected
-    else:
-        assert_refused(lambda: toolkit.load_sequence(str(folder)), path, pattern)
+    assert toolkit.load_sequence(str(folder)).content_hash() == expected
 
 
 def test_without_a_stated_noise_a_twist_has_that_of_its_scatter(tmp_path: Path) -> None:
@@ -152,27 +139,6 @@ def test_without_a_stated_noise_a_twist_has_that_of_its_scatter(tmp_path: Path) 
     del rig["noise"]
     read = own_tables.read("own", **tables_of(recorded("twist")), rig=rig).sequence
     assert all((np.asarray(value) > 0.0).all() for value in vars(read.noise).values())
-
-
-def test_values_given_in_python_are_named_too(tmp_path: Path) -> None:
-    sequence = recorded("twist")
-    given = {**tables_of(sequence), "rig": rig_of(sequence)}
-    shorter = {**given["tracks"], "uL": given["tracks"]["uL"][:-1]}
-    for wrong, pattern in (
-        ({"tracks": shorter}, "tracks: its columns differ in length: t_ns"),
-        ({"tracks": np.zeros((3, 4))}, "tracks: is no mapping of column names to values"),
-        ({"motion": {"t_ns": [1]}}, "motion: missing column ax, ay, az, gx, gy, gz of an IMU, or vx, .* of a twist"),
-        (
-            {"motion": {"t_ns": [1], **{name: [0.0] for name in ("vx", "vy", "vz", "gx", "gy", "gz")}}},
-            "motion: missing column ax, .* of an IMU, or vx, .* of a twist; it has t_ns, vx",
-        ),
-        ({"rig": {}}, "rig: missing fx_px, fy_px"),
-        ({"truth": {"t": [1.0]}}, "truth: missing column x, y"),
-        ({"tracks": {**given["tracks"], "uL": given["tracks"]["uL"] + 0j}}, "tracks: column uL holds complex numbers"),
-    ):
-        with pytest.raises(DataError, match=pattern):
-            toolkit.save(tmp_path / "own", **(given | wrong))
-    assert not (tmp_path / "own").exists()
 
 
 def test_a_folder_named_by_a_dot_has_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ import pytest
 import scipy.io
 
 from toolkit.datasets import load_sequence, utias_mat
-from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, transform
 from toolkit.measurements import NS_PER_S, TwistNoise
 from toolkit.models.stereo import project, triangulate
@@ -81,12 +80,3 @@ def test_measured_variances_become_densities_over_the_median_step(utias: dict[st
     # stamps near 1.3e9 s are doubles good to 0.24 microseconds, 2.4e-6 of a step
     np.testing.assert_allclose(sequence.noise.velocity_noise_density, 0.2 * np.sqrt(0.1), rtol=3e-6)
     np.testing.assert_array_equal(sequence.rig.cov_uv_px2, np.diag([1.0, 3.0, 3.0]))
-
-
-@pytest.mark.parametrize("share", [0.1, 0.95])
-def test_a_truncated_file_is_refused(utias: dict[str, Any], tmp_path: Path, share: float) -> None:
-    path = written(tmp_path, utias)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError):
-        load_sequence(str(path))

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -66,18 +65,6 @@ def test_the_remedy_is_that_of_the_reason(number: int, remedy: str, monkeypatch:
     monkeypatch.setattr(Path, "open", refused)
     with pytest.raises(DataError, match=f"{os.strerror(number)}.*{remedy}"):
         read_input(Path(__file__))
-
-
-@pytest.mark.filterwarnings("ignore:Duplicate name")  # zipfile's, of the archive that is made here
-def test_an_archive_with_two_arrays_of_one_name_is_refused_instead_of_taking_either(tmp_path: Path) -> None:
-    import zipfile
-
-    shutil.copy(Path(__file__).parents[2] / "data/drive_small/recording.npz", tmp_path / "two.npz")
-    with zipfile.ZipFile(tmp_path / "two.npz", "a") as archive:
-        name = archive.namelist()[0]
-        archive.writestr(name, archive.read(name))
-    with pytest.raises(DataError, match=f"{name.removesuffix('.npy')} is in the archive twice"):
-        _archive(tmp_path / "two.npz")
 
 
 def test_a_header_that_asks_for_more_than_the_file_holds_takes_no_memory(tmp_path: Path) -> None:

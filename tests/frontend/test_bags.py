@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit.cli import main
 from toolkit.cli.arguments import TOPIC_ROLES
-from toolkit.datasets import bags, load_images, load_sequence
+from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.bags import ROLES
 from toolkit.datasets.io import bag_reader
 from toolkit.errors import DataError
@@ -296,53 +296,8 @@ def test_a_truth_keeps_the_poses_it_has_or_is_of_positions_alone_or_left_out(asl
     assert any(alone in fact for fact in prism.provenance.facts)
 
 
-def test_topics_are_those_stated(asl: Path, tmp_path: Path) -> None:
-    ros = Ros.of("sqlite")
-    film = [
-        item._replace(topic=item.topic.replace("/cam0/", "/port/").replace("/cam1/", "/starboard/"))
-        for item in film_of(asl, ros)
-    ]
-    path = written(asl, "sqlite", tmp_path / "bag", film)
-    with pytest.raises(DataError, match=r"no two topics of images are a stereo pair.*--topics left=TOPIC,right=TOPIC"):
-        load_sequence(str(path))
-    frontend = Frontend(topics="left=/port/image_raw, right=/starboard/image_raw")
-    assert load_sequence(str(path), 0, frontend).content_hash() == load_sequence(str(asl)).content_hash()
-    assert len(load_images(str(path), frontend).pairs) == 10
-    for wrong, pattern in (
-        ("left=/prot/image_raw", r"no topic is called /prot/image_raw \(did you mean /port/image_raw"),
-        ("imu=/chatter", r"/chatter \(std_msgs/String\) cannot be imu, which is sensor_msgs/Imu"),
-        ("ears=/imu0", "no role is called ears; there are left, right"),
-        (
-            "left=/port/image_raw,right=/port/image_raw",
-            "names /port/image_raw as left and right; a pair has a topic each",
-        ),
-    ):
-        with pytest.raises(DataError, match=pattern):
-            load_sequence(str(path), 0, Frontend(topics=wrong))
-
-
 def test_the_roles_offered_are_those_there_are() -> None:
     assert tuple(ROLES) == TOPIC_ROLES
-
-
-@pytest.mark.parametrize(
-    ("left_out", "pattern"),
-    [
-        ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
-        ("image_raw", "holds no images that can be read.*; there are /cam0/camera_info"),
-        ("", "holds no images that can be read.*; there are no topics"),
-    ],
-)
-def test_what_is_missing_is_reported_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:
-    ros = Ros.of("sqlite")
-    film = film_of(asl, ros)
-    film = [item for item in [*film, *calibration_of(asl, ros, film[0].t_ns)] if not item.topic.endswith(left_out)]
-    with pytest.raises(DataError, match=pattern) as raised:
-        load_sequence(str(ros.write(tmp_path / "bare", film)))
-    assert "\n" not in str(raised.value)
-
-
-Edited = Callable[[Ros, list[Item]], list[Item]]
 
 
 def bare(ros: Ros, asl: Path, infos: tuple[float, float] | None = None) -> list[Item]:
@@ -380,11 +335,6 @@ def test_a_gyro_and_an_accelerometer_apart_are_joined(asl: Path, tmp_path: Path)
     whole = load_sequence(str(asl)).motion
     np.testing.assert_array_equal(motion.gyro_radps, whole.gyro_radps[1:])
     np.testing.assert_allclose(motion.accel_mps2[:, 2], 1e-9 * (motion.t_ns % 10**9) - 0.002, atol=1e-9)
-    with pytest.raises(DataError, match=r"/camera/accel/sample measures no angular velocity .*--topics imu=TOPIC"):
-        load_sequence(str(path), 0, Frontend(topics="imu=/camera/accel/sample"))
-    alone = ros.write(tmp_path / "alone.bag", [item for item in apart if item.topic != "/camera/accel/sample"])
-    with pytest.raises(DataError, match=r"/camera/gyro/sample measures no acceleration .*--topics accel=TOPIC"):
-        load_sequence(str(alone))
 
 
 def test_the_baseline_is_between_both_projections_or_that_of_the_transforms(asl: Path, tmp_path: Path) -> None:
@@ -439,48 +389,6 @@ def test_images_that_are_rectified_already_are_found_by_their_rows(plain: Any, a
     assert any(fact.startswith("the images are rectified already") for fact in bag.provenance.facts)
 
 
-def late(_ros: Ros, film: list[Item]) -> list[Item]:
-    for item in film:
-        if item.topic == "/cam1/image_raw":
-            item.value.header.stamp.nanosec += 3_000_000
-    return film
-
-
-def of_one_frame(_ros: Ros, film: list[Item]) -> list[Item]:
-    for item in film:
-        if item.topic in ("/imu0", "/cam0/image_raw"):
-            item.value.header.frame_id = "0"
-    return film
-
-
-def with_a_second_imu(ros: Ros, film: list[Item]) -> list[Item]:
-    elsewhere = []
-    for item in film:
-        if item.topic == "/imu0":
-            for shift_ns in (0, 1_000_000):
-                value = ros.imu(item.t_ns + shift_ns, [0.1] * 3, [1.0] * 3)
-                value.value.header.frame_id = "base_link"
-                elsewhere.append(value._replace(topic="/base/imu"))
-    return [*film, *elsewhere]
-
-
-@pytest.mark.parametrize(
-    ("edit", "pattern"),
-    [
-        (late, r"no image of /cam0/image_raw has one of /cam1/image_raw within 1 ms \(10 left ones\)"),
-        (of_one_frame, "no /tf_static connects the frames '0' and '0'"),
-        (with_a_second_imu, r"'base_link' and 'cam0'.*or name another Imu with --topics imu=TOPIC \(/imu0\)"),
-    ],
-)
-def test_what_does_not_belong_together_is_reported_in_one_line(
-    asl: Path, tmp_path: Path, edit: Edited, pattern: str
-) -> None:
-    ros = Ros.of("ros1")
-    with pytest.raises(DataError, match=pattern) as raised:
-        load_sequence(str(ros.write(tmp_path / "film.bag", edit(ros, bare(ros, asl)))))
-    assert "\n" not in str(raised.value)
-
-
 def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("mcap")
     path = ros.write(tmp_path / "drive", bare(ros, asl))
@@ -531,15 +439,6 @@ def test_a_type_that_is_not_ros_own_is_not_read(asl: Path, tmp_path: Path) -> No
         load_sequence(str(path))
     with bag_reader.opened(path) as bag:
         assert any("of another definition than ROS's" in str(topic) for topic in bag.topics)
-
-
-def test_an_imu_that_published_nothing_is_not_one_to_convert(asl: Path, tmp_path: Path) -> None:
-    path = written(asl, "ros1", tmp_path / "bag", [*images_of(asl, raw(Ros.of("ros1")))])
-    with bag_reader.opened(path) as bag:
-        topics = (*bag.topics, bag_reader.Topic("/imu0", bag_reader.IMU, 0))
-        source = bags.recorded(bag, bags.choose(path, topics, None))
-    with pytest.raises(DataError, match="so nothing measures the motion; record one with the images"):
-        bags._motion_of(source)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

@@ -1,6 +1,5 @@
 """ASL folders with images, from end to end: the choice of tracks, what is left out and named, what is refused."""
 
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -365,24 +364,6 @@ def test_what_a_calibration_states_and_nobody_uses_is_named(asl: Path) -> None:
     ]
     (asl / "imu0.yaml").unlink()
     assert any("that of a MEMS unit in motion is assumed" in fact for fact in load_sequence(str(asl)).provenance.facts)
-
-
-OTHERS = {
-    "calibration.json": ('{"value0": {"T_imu_cam": []}}', "calibration.json of Basalt is not read"),
-    "stereo.yaml": ("body_T_cam0: 1", "stereo.yaml of VINS is not read"),
-    "orb.yaml": ("Camera1.fx: 50.0", "orb.yaml of ORB-SLAM3 is not read"),
-    "notes.yaml": ("author: me", "notes.yaml is not read"),
-}
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_calibration_of_another_system_is_named_beside_what_is_read(asl: Path, name: str) -> None:
-    for sensor in ("cam0", "cam1", "imu0"):
-        (asl / "mav0" / sensor / "sensor.yaml").unlink()
-    content, words = OTHERS[name]
-    (asl / name).write_text(content)
-    with pytest.raises(DataError, match=rf"missing cam0/sensor.yaml, .*\*camchain\*.yaml.*; {re.escape(words)}; write"):
-        load_sequence(str(asl))
 
 
 @pytest.mark.parametrize(

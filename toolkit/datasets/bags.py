@@ -52,6 +52,7 @@ from toolkit.settings import DEFAULTS, Frontend
 HAS_TOPICS = True
 # Images are rectified already where this many times as many corners meet their row as once the calibration is applied.
 _CLEARLY = 2
+_RECORD_ONE = "record one with the images, or convert what measures it to sensor_msgs/Imu (m/s^2, rad/s)"
 _NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 
 uses_images = images_only
@@ -213,17 +214,15 @@ def _twists(source: Recorded) -> TwistSamples:
     path, topic = source.path, source.chosen.get("twist")
     if topic is None:
         others = ", ".join(one.name for one in _usable(source.chosen.topics, ROLES["twist"]))
-        missing = "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion"
-        topics = source.chosen.topics
-        like_imus = [one for one in topics if one.is_like(_LIKE_IMU) or (one.type == ros.IMU and one.unreadable)]
-        if like_imus and not others:
-            raise DataError(
-                f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read; "
-                f"{', '.join(map(str, like_imus))} may measure the motion: convert it to sensor_msgs/Imu (m/s^2, "
-                "rad/s; its axes, PX4's x forward, y right, z down, are those that the camera stands on)"
-            )
-        remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one with the images"
-        raise DataError(f"{path}: {missing}; {remedy}")
+        remedy = (
+            f"name one with --topics twist=TOPIC ({others})"
+            if others
+            else f"{_RECORD_ONE}; {_there_are(source.chosen.topics)}"
+        )
+        raise DataError(
+            f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read, so nothing measures the motion; "
+            f"{remedy}"[:_LONGEST]
+        )
     messages = _messages_of(source, topic)
     values = [message.value for message in messages]
     linear, angular = (ros.columns(values, part) for part in ros.VECTORS[topic.type])
@@ -288,9 +287,6 @@ _STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
 # Of a message that lists the topics of a bag, which may be hundreds.
 _LONGEST = 900
 _COMPRESSED_SUFFIX = "/compressed"
-# What names and definitions of other types have that measure motion, or hold images.
-_LIKE_IMU = re.compile(r"gyro|accelerometer|angular_velocity|(^|[^a-z])imu", re.IGNORECASE)
-_LIKE_IMAGES = re.compile(r"ffmpeg|image|video|theora|h264|h265", re.IGNORECASE)
 # The topics asked for by role, None of a truth that is left out.
 Given = dict[str, Topic | None]
 
@@ -393,18 +389,17 @@ def _stereo(path: Path, topics: Sequence[Topic], given: Given) -> tuple[Topic, T
 
 
 def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
-    there = ", ".join(map(str, topics)) or "no topics"
     if not images:
-        why = "holds no images that can be read, and the tracks are made of them"
-        packed = [str(topic) for topic in topics if topic.is_like(_LIKE_IMAGES)]
-        if packed:
-            may = f"{' and '.join(packed)} may hold some"
-            why += f"; {may}: write them as sensor_msgs/Image with image_transport republish"
+        why = "holds no images that can be read, and the tracks are made of them; write them as sensor_msgs/Image"
     elif len(images) == 1:
         why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
     else:
         why = "no two topics of images are a stereo pair by their names; name them with --topics left=TOPIC,right=TOPIC"
-    return f"{path}: {why}; there are {there}"[:_LONGEST]
+    return f"{path}: {why}; {_there_are(topics)}"[:_LONGEST]
+
+
+def _there_are(topics: Sequence[Topic]) -> str:
+    return f"there are {', '.join(map(str, topics)) or 'no topics'}"
 
 
 def _alone(word: str) -> str:

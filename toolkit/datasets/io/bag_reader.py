@@ -56,35 +56,16 @@ POINT = "geometry_msgs/msg/PointStamped"
 KNOWN_TYPES = frozenset(
     {IMAGE, COMPRESSED, CAMERA_INFO, IMU, *TRANSFORMS, ODOMETRY, TWIST, TWIST_COV, POSE, POSE_COV, TRANSFORM, POINT}
 )
-# Types that neither measure motion nor hold images.
-_OF_ROS = (
-    "rcl_interfaces/",
-    "rosgraph_msgs/",
-    "diagnostic_msgs/",
-    "tf2_msgs/",
-    "std_msgs/",
-    "nav_msgs/",
-    "geometry_msgs/",
-)
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its name, the type of its messages, how many there are, and why they cannot be read.
-
-    ``fields`` is the definition of a type that is not read, as far as the bag has it.
-    """
+    """A topic of a bag: its name, the type of its messages, how many there are, and why they cannot be read."""
 
     name: str
     type: str
     count: int
     unreadable: str = ""
-    fields: str = ""
-
-    def is_like(self, words: re.Pattern[str]) -> bool:
-        """Say whether a topic of a type that is not read is called, or holds, something that words are about."""
-        is_other = self.type not in KNOWN_TYPES and not self.type.startswith(_OF_ROS)
-        return is_other and any(words.search(text) for text in (self.name, self.type, self.fields))
 
     def __str__(self) -> str:
         why = f", {self.unreadable}" if self.unreadable else ""
@@ -162,9 +143,8 @@ class Bag:
     def _topic(self, name: str, connections: Sequence[Any]) -> Topic:
         types = sorted({connection.msgtype for connection in connections})
         count = sum(connection.msgcount or 0 for connection in connections)
-        if types[0] not in KNOWN_TYPES:
-            return Topic(name, " and ".join(types), count, fields=str(connections[0].msgdef.data))
-        return Topic(name, " and ".join(types), count, next(filter(None, map(self._why_not, connections)), ""))
+        why_not = next(filter(None, map(self._why_not, connections)), "") if types[0] in KNOWN_TYPES else ""
+        return Topic(name, " and ".join(types), count, why_not)
 
     def _why_not(self, connection: Any) -> str:
         """Return why messages of a known type cannot be read, nothing where they can."""
