@@ -66,7 +66,6 @@ DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return Batch(setup, DecoupledEkf(setup, as_uncertain_as_stated))
 
 
@@ -196,7 +195,6 @@ def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:
 
 
 def seen_ids(frames: list[StereoFrame]) -> list[int]:
-    """Return the ids of all tracks in some frames, ascending."""
     return [int(i) for i in np.unique(np.concatenate([frame.track_ids for frame in frames]))]
 
 

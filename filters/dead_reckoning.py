@@ -12,7 +12,6 @@ DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return OnlineOutput(DeadReckoning(setup))
 
 
@@ -24,10 +23,8 @@ class DeadReckoning(Filter):
         self._belief = self._motion.initial_belief(setup.prior)
 
     def step(self, packet: Packet) -> Estimate:
-        """Integrate the motion up to the packet's frame."""
         self._belief = predicted(self._belief, self._motion, packet.motion)
         return self._belief.estimate(packet.frame.t_ns)
 
     def landmarks(self) -> Landmarks:
-        """Return no landmarks."""
         return Landmarks.none()

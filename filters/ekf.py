@@ -35,7 +35,6 @@ WITHOUT = {"biases": {"noise.biases": "fixed"}, "landmark uncertainty": {"landma
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     known = setup.choice("landmark_uncertainty", {True: as_uncertain_as_stated, False: as_exact})
     return OnlineOutput(DecoupledEkf(setup, known))
 
@@ -53,7 +52,6 @@ class DecoupledEkf(Filter):
         self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         if packet.motion is not None:
             increment = self._motion.integrate(packet.motion, self._belief.bias)
             self._belief = self._belief.predicted(increment.predict(self._belief))
@@ -69,12 +67,10 @@ class DecoupledEkf(Filter):
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark the filter ever had, as it last knew it."""
         return self._map.landmarks()
 
 
 def as_uncertain_as_stated(landmarks: LandmarkMap) -> LandmarkMap:
-    """Return the landmarks with their covariances."""
     return landmarks
 
 

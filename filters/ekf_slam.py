@@ -67,12 +67,10 @@ MOST_MOVED = 0.3
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return OnlineOutput(joint_ekf(setup))
 
 
 def joint_ekf(setup: Setup) -> "JointEkf":
-    """Return the filter that the options ask for."""
     first = AtFirstEstimates(MOST_MOVED) if setup.motion_kind == "imu" else AtFirstEstimates()
     at = linearisation(setup, first)
     in_inverse_depth = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam, at=at)
@@ -105,11 +103,9 @@ class JointEkf:
 
     @property
     def joint(self) -> JointBelief:
-        """Return the present joint belief."""
         return self._joint
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone()
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._rig.track_weight)
@@ -121,7 +117,6 @@ class JointEkf:
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark of the run."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
@@ -133,8 +128,8 @@ class JointEkf:
         new = new.select(near & (rig.fx_px * rig.baseline_m > LEAST_DEPTH_M * stereo.disparity_px(new.uvs_px)))
         if len(new.track_ids):
             points = stereo.triangulate_world(new.uvs_px, joint.clones[-1], rig)
-            there = joint_landmarks.linearised_images(points, self._at.clones(joint), rig)
-            d_point_d_uv = np.linalg.inv(there.d_uv_d_point[:, 0])
-            by_pose = -d_point_d_uv @ there.d_uv_d_pose[:, 0]
+            there = stereo.predict(points, self._at.clones(joint)[-1], rig)
+            d_point_d_uv = np.linalg.inv(there.d_uv_d_point)
+            by_pose = -d_point_d_uv @ there.d_uv_d_pose
             covs = d_point_d_uv @ (rig.cov_uv_px2 / rig.track_weight) @ np.swapaxes(d_point_d_uv, 1, 2)
             joint.add_landmarks(new.track_ids, points, by_pose.reshape(-1, 6), covs)

@@ -59,7 +59,6 @@ class LagWindow(Protocol):
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     lag_s = setup.settings.window.seconds(setup.motion_kind)
     return Thinned(setup, FixedLag(setup, lag_s))
 
@@ -81,7 +80,6 @@ class FixedLag:
         self._frame = 0
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         self._frame, t_ns = packet.index, packet.frame.t_ns
         # Before the packet's sightings are chosen: to read a covariance may cost landmarks.
         self._states += [self._state(k) for k in self._window() if self._stamps_ns[k] < t_ns - self._lag_ns]
@@ -95,13 +93,11 @@ class FixedLag:
         return newest
 
     def finish(self) -> Finished:
-        """Return each state as it left the window, and every landmark as last known."""
         states = [*self._states, *map(self._state, self._window())]
         landmarks = Landmarks.of(self._points | self._in_window)
         return Finished(Trajectory.of(states), landmarks, log=tuple(self._log))
 
     def _window(self) -> range:
-        """Return the numbers of the states in the window."""
         return range(len(self._states), len(self._stamps_ns))
 
     def _state(self, k: int) -> Estimate:
@@ -141,7 +137,6 @@ class FixedLag:
             self._in_window.pop(i, None)
 
     def _forget(self, landmark_ids: set[int]) -> None:
-        """Forget landmarks that are no longer in the window."""
         self._builder.forget(landmark_ids)
         for i in landmark_ids:
             self._last_seen_ns.pop(i, None)

@@ -54,7 +54,6 @@ MOST_STEPS, MOST_HALVINGS = 10, 6
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
     return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct))
 
@@ -137,7 +136,7 @@ class Measurement:
 
     def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks with non-zero weight, stacked."""
-        return joint_landmarks.stacked(self.prediction, seen).weighed(self.weights)
+        return joint_landmarks.stacked(self.prediction, seen, self.weights)
 
 
 def most_probable(measurement: Measurement) -> IterationResult:

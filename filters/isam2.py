@@ -53,7 +53,6 @@ _LAST_STOPPING = Stopping(enough=1e-4)
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return Isam2(setup)
 
 
@@ -67,7 +66,6 @@ class Isam2:
         self._stamps_ns, self._log = list[int](), list[str]()
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         self._note(packet, self._tree.see(landmark_keys(packet.frame.track_ids.tolist())))
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)

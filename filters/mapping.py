@@ -14,7 +14,6 @@ CITES = ("kang_vislam",)
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return OnlineOutput(Mapping(setup))
 
 
@@ -27,11 +26,9 @@ class Mapping(Filter):
         self._map = KnownPoseMapper(setup.rig, setup.settings.outliers.gate_probability)
 
     def step(self, packet: Packet) -> Estimate:
-        """Integrate the motion, then map from the pose it leads to."""
         self._belief = predicted(self._belief, self._motion, packet.motion)
         self._map.add(packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns)
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()

@@ -35,6 +35,5 @@ WITHOUT = {"biases": {"noise.biases": "fixed"}}
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
     return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief))

@@ -36,7 +36,6 @@ WITHOUT = {"biases": {"noise.biases": "fixed"}, "the future": {"output": "causal
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return Rts(setup, ekf_slam.joint_ekf(setup))
 
 
@@ -44,7 +43,6 @@ class Rts(Batch):
     """Steps the filter, and smooths what it answered at the end."""
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the filter's state at its frame."""
         super().step(packet)
         return self._estimates[-1]
 

@@ -31,7 +31,6 @@ INGREDIENTS = ("long-lived landmarks",)
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return OnlineOutput(SeedEkf(setup))
 
 
@@ -63,7 +62,6 @@ class SeedEkf(Filter):
         self._belief = informed(self._belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1))
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()
 
 

@@ -46,7 +46,6 @@ _ENDING = Ending()
 
 
 def build(setup: Setup) -> Estimator:
-    """Return the estimator for one sequence."""
     return Thinned(setup, Smart(setup, setup.settings.window.seconds(setup.motion_kind)))
 
 
@@ -67,7 +66,6 @@ class Smart:
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         try:
             self._solution = solve_window(self._extended(packet), self._camera, _ENDING)
         except EstimatorError as refusal:
@@ -80,12 +78,10 @@ class Smart:
         return self._states[-1]
 
     def finish(self) -> Finished:
-        """Return each state as it left the window, and every landmark as last known."""
         self._complete_all()
         return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
 
     def _extended(self, packet: Packet) -> StereoWindow:
-        """Return the window with the packet's predicted state and its sightings."""
         if packet.motion is None:
             return self._started(packet)
         increment = self._motion.integrate(packet.motion, self._belief.bias)

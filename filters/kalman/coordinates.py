@@ -43,13 +43,11 @@ class LandmarkAnchors(JointBelief):
         self.anchors: Array = np.empty((0, 4, 4))
 
     def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, covs: Array) -> None:
-        """Add N landmarks as :meth:`JointBelief.add_landmarks` does, anchored in the newest clone."""
         super().add_landmarks(track_ids, points, jacobian, covs)
         anchor = self.clones[-1] @ self._T_imu_cam
         self.anchors = np.concatenate([self.anchors, np.tile(anchor, (len(track_ids), 1, 1))])
 
     def forget_landmarks(self, which: BoolArray) -> None:
-        """Marginalise landmarks (L,)."""
         super().forget_landmarks(which)
         self.anchors = self.anchors[~which]
 
@@ -96,12 +94,10 @@ class CloneAnchoredBelief(JointBelief):
         self.anchors: IntArray = np.empty(0, dtype=np.int64)
 
     def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, covs: Array) -> None:
-        """Add N landmarks as :meth:`JointBelief.add_landmarks` does, anchored in the newest clone."""
         super().add_landmarks(track_ids, points, jacobian, covs)
         self.anchors = np.append(self.anchors, np.full(len(track_ids), len(self.clones) - 1))
 
     def forget_landmarks(self, which: BoolArray) -> None:
-        """Marginalise landmarks (L,)."""
         super().forget_landmarks(which)
         self.anchors = self.anchors[~which]
 

@@ -64,13 +64,11 @@ class JointBelief:
 
     @property
     def landmark_columns(self) -> slice:
-        """Return the columns of the landmarks in the error state."""
         d = self._core.layout.size
         return slice(d, d + 3 * len(self.points))
 
     @property
     def clone_columns(self) -> slice:
-        """Return the columns of the clones in the error state."""
         return slice(self.landmark_columns.stop, self._cov.shape[0])
 
     def propagate(self, prediction: Prediction, transition: Array) -> None:
@@ -193,39 +191,23 @@ class JointBelief:
         return H_pose @ se3_right_jacobian(newest), H_point
 
 
-class Linearisation(Protocol):
-    """Chooses the linearisation points of Jacobians."""
-
-    def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
-        """Return the transition (d, d) of a prediction from the joint belief."""
-
-    def clones(self, joint: JointBelief) -> Array:
-        """Return the poses (C, 4, 4) of the clones."""
-
-    def points(self, joint: JointBelief) -> Array:
-        """Return the landmarks (L, 3) m."""
-
-    def outdated(self, joint: JointBelief) -> BoolArray:
-        """Say which landmarks (L,) are too far from the linearisation points of their Jacobians."""
-
-
 class AtLatestEstimates:
-    """Linearises at the latest estimates: the standard EKF."""
+    """Where Jacobians are evaluated: at the latest estimates, as in the standard EKF.
+
+    ``transition`` (d, d) is that of a prediction, ``clones`` (C, 4, 4) and ``points`` (L, 3) m are where sightings are
+    linearised, and ``outdated`` (L,) says which landmarks are too far from there.
+    """
 
     def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
-        """Return the transition (d, d) of the prediction."""
         return prediction.transition
 
     def clones(self, joint: JointBelief) -> Array:
-        """Return the present estimates (C, 4, 4) of the clones."""
         return joint.clones
 
     def points(self, joint: JointBelief) -> Array:
-        """Return the present estimates (L, 3) m of the landmarks."""
         return joint.points
 
     def outdated(self, joint: JointBelief) -> BoolArray:
-        """Return False for each (L,): the linearisation points are the estimates."""
         return np.zeros(len(joint.points), dtype=bool)
 
 
@@ -240,11 +222,9 @@ class AtFirstEstimates:
         return increment.transition_between(joint.first_core, prediction)
 
     def clones(self, joint: JointBelief) -> Array:
-        """Return the first estimates (C, 4, 4) of the clones."""
         return joint.first_clones
 
     def points(self, joint: JointBelief) -> Array:
-        """Return the first estimates (L, 3) m of the landmarks."""
         return joint.first_points
 
     def outdated(self, joint: JointBelief) -> BoolArray:
@@ -252,6 +232,9 @@ class AtFirstEstimates:
         moved_m = np.linalg.norm(joint.points - joint.first_points, axis=1)
         distance_m = np.linalg.norm(joint.points - joint.clones[-1, :3, 3], axis=1)
         return np.asarray(moved_m > self._most_moved * distance_m)
+
+
+Linearisation = AtLatestEstimates | AtFirstEstimates
 
 
 def linearisation(setup: Setup, first: AtFirstEstimates) -> Linearisation:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from filters.kalman.joint import JointBelief, Linearisation
-from toolkit.geometry import Array, IntArray, se3_inverse
+from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.gating import FrameGate, mahalanobis_squared
@@ -29,27 +29,6 @@ class LandmarkSightings(NamedTuple):
     dof: int | IntArray
 
 
-class StackedSightings(NamedTuple):
-    """Whitened residuals (L, 3) of the state's landmarks, and their Jacobians to the k errors of landmarks and clones.
-
-    A sighting depends on nine of these errors: ``blocks`` (L, 3, 9) are its Jacobians to its landmark and to the newest
-    clone, and ``own`` (L, 9) are the indices of these errors among all k.
-    """
-
-    residuals: Array
-    blocks: Array
-    own: IntArray
-    k: int
-
-    def weighed(self, weights: Array) -> tuple[csr_array, Array]:
-        """Return the stacked Jacobian (m, k) and residuals (m,) of the landmarks whose weight (L,) is not zero."""
-        rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])
-        values = roots[:, None, None] * self.blocks[rows]
-        places = np.repeat(self.own[rows], 3, axis=0)
-        H = csr_array((values.ravel(), places.ravel(), np.arange(0, values.size + 1, 9)), (3 * len(rows), self.k))
-        return H, (roots[:, None] * self.residuals[rows]).reshape(-1)
-
-
 def correct(
     joint: JointBelief,
     frame: StereoFrame,
@@ -63,7 +42,7 @@ def correct(
     seen = linearise_sightings(joint, frame, at, rig)
     weights = weighed(joint, seen, gate)
     if weights.any():
-        H, residuals = stacked(joint, seen).weighed(weights)
+        H, residuals = stacked(joint, seen, weights)
         joint.update(H, residuals, columns(joint))
 
 
@@ -71,26 +50,30 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     """Linearise the frame's sightings of all landmarks of the state; the frame must show every one of them."""
     order = np.argsort(frame.track_ids)
     uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
-    predicted_px, depth_m = images(joint.points, joint.clones[-1:], rig)
-    there = linearised_images(at.points(joint), at.clones(joint)[-1:], rig)
+    predicted_px, depth_m = stereo.images(transform(se3_inverse(joint.clones[-1]), joint.points), rig)
+    there = stereo.predict(at.points(joint), at.clones(joint)[-1], rig)
     whitener = stereo.whitener(uvs_px, rig)
-    residuals = stereo.whitened_residuals(uvs_px, predicted_px[:, 0], rig)
-    H_pose, H_point = whitener @ there.d_uv_d_pose[:, 0], whitener @ there.d_uv_d_point[:, 0]
-    return LandmarkSightings(residuals, H_pose, H_point, depth_m[:, 0], stereo.degrees_of_freedom(uvs_px))
+    residuals = stereo.whitened_residuals(uvs_px, predicted_px, rig)
+    H_pose, H_point = whitener @ there.d_uv_d_pose, whitener @ there.d_uv_d_point
+    return LandmarkSightings(residuals, H_pose, H_point, depth_m, stereo.degrees_of_freedom(uvs_px))
 
 
-def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:
-    """Expand the Jacobians to each landmark and the newest clone to the columns of all landmarks and clones."""
-    count, k = len(seen.H_pose), 3 * len(seen.H_pose) + 6 * len(joint.clones)
-    own = np.empty((count, 9), dtype=np.int64)
-    own[:, :3] = np.arange(3 * count).reshape(count, 3)
-    own[:, 3:] = np.arange(k - 6, k)
-    blocks = np.concatenate([seen.H_point, seen.H_pose], axis=2)
-    return StackedSightings(seen.residuals, blocks, own, k)
+def stacked(joint: JointBelief, seen: LandmarkSightings, weights: Array) -> tuple[csr_array, Array]:
+    """Return Jacobian (m, k) and residuals (m,) of the landmarks whose weight (L,) is not zero, stacked.
+
+    The columns are the k errors of landmarks and clones, of which a sighting depends on its landmark's and on those of
+    the newest clone.
+    """
+    rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])[:, None, None]
+    k = 3 * len(weights) + 6 * len(joint.clones)
+    own = np.concatenate([3 * rows[:, None] + np.arange(3), np.tile(np.arange(k - 6, k), (len(rows), 1))], axis=1)
+    blocks = roots * np.concatenate([seen.H_point[rows], seen.H_pose[rows]], axis=2)
+    places, ends = np.repeat(own, 3, axis=0).ravel(), np.arange(0, blocks.size + 1, 9)
+    return csr_array((blocks.ravel(), places, ends), (3 * len(rows), k)), (roots[..., 0] * seen.residuals[rows]).ravel()
 
 
 def columns(joint: JointBelief) -> slice:
-    """Return the columns of the error state that :class:`StackedSightings` has."""
+    """Return the columns of the error state that :func:`stacked` has: those of landmarks and clones."""
     return slice(joint.landmark_columns.start, joint.cov.shape[0])
 
 
@@ -111,20 +94,3 @@ def _pose_and_landmark_cov(joint: JointBelief) -> Array:
     own = np.arange(joint.landmark_columns.start, joint.landmark_columns.stop).reshape(-1, 3)
     rows = np.concatenate([np.tile(newest, (len(own), 1)), own], axis=1)
     return np.asarray(joint.cov[rows[:, :, None], rows[:, None, :]])
-
-
-def _in_imu(points: Array, poses: Array) -> Array:
-    """Return points (F, 3) of the world in the IMU frame of each pose (W, 4, 4), (F, W, 3)."""
-    T_imu_world = se3_inverse(poses)
-    rotated = points @ np.swapaxes(T_imu_world[:, :3, :3], 1, 2)
-    return np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
-
-
-def linearised_images(points: Array, poses: Array, rig: StereoRig) -> stereo.StereoPrediction:
-    """Predict the images of points (F, 3) from poses (W, 4, 4), with Jacobians: the leading axes are (F, W)."""
-    return stereo.linearise(_in_imu(points, poses), poses[:, :3, :3], rig)
-
-
-def images(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Predict the images (F, W, 3) px of points (F, 3) from poses (W, 4, 4), and their depths (F, W) m."""
-    return stereo.images(_in_imu(points, poses), rig)

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from toolkit.arrays import is_among
+from toolkit.arrays import is_among, rows_of
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, IntArray, transposed
 from toolkit.measurements import StereoFrame, StereoRig
@@ -29,7 +29,6 @@ class LandmarkMap:
 
     @classmethod
     def empty(cls) -> Self:
-        """Return a map without landmarks."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __len__(self) -> int:
@@ -37,11 +36,8 @@ class LandmarkMap:
 
     def match(self, track_ids: IntArray) -> tuple[IntArray, IntArray]:
         """Return the rows of the map and of the ids (N,) that match."""
-        if not len(self) or not track_ids.size:
-            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-        slots = np.minimum(np.searchsorted(self.track_ids, track_ids), len(self) - 1)
-        rows = np.flatnonzero(self.track_ids[slots] == track_ids)
-        return slots[rows], rows
+        slots, known = rows_of(track_ids, self.track_ids)
+        return slots[known], np.flatnonzero(known)
 
     def select(self, slots: IntArray | BoolArray) -> "LandmarkMap":
         """Return the landmarks of some rows (m,), or of a mask (M,); the ids must stay ascending."""
@@ -101,8 +97,6 @@ def residuals_with_jacobians(
 ) -> SightingResiduals:
     """Return the residuals of sightings (N, 3) px from a pose (4, 4), with Jacobians; zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
-    if not stereo.any_missing(uvs_px):
-        return SightingResiduals(uvs_px - predicted.uv_px, *predicted[1:])
     return SightingResiduals(
         stereo.residuals_px(uvs_px, predicted.uv_px),
         stereo.seen_rows(uvs_px, predicted.d_uv_d_pose),
@@ -188,7 +182,6 @@ class TrackedMap:
         self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig))
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark of the run."""
         parts = [*self._left, self._in_view]
         ids = np.concatenate([p.track_ids for p in parts])
         points, covs = np.concatenate([p.points for p in parts]), np.concatenate([p.covs for p in parts])
@@ -211,5 +204,4 @@ class KnownPoseMapper:
         self._map.keep(seen, frame, T_world_imu)
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark of the run."""
         return self._map.landmarks()

@@ -26,12 +26,10 @@ class OnlineOutput:
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Pass the packet on and keep the estimate."""
         self._estimates.append(self._filter.step(packet))
         return self._estimates[-1]
 
     def finish(self) -> Finished:
-        """Return the estimates of every frame and the last estimates of the landmarks."""
         return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._log)
 
 
@@ -42,9 +40,7 @@ class LandmarkMemory:
     points: dict[int, Array] = field(default_factory=dict)
 
     def remember(self, track_ids: IntArray, points: Array) -> None:
-        """Store landmarks (N,) at points (N, 3)."""
         self.points.update(zip(track_ids.tolist(), points, strict=True))
 
     def landmarks(self) -> Landmarks:
-        """Return the last estimate of every landmark."""
         return Landmarks.of(self.points)

@@ -30,7 +30,6 @@ class Thinned:
         self._newest: Estimate | None = None
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and return the state at its frame."""
         t_ns = packet.frame.t_ns
         self._since = _concatenated(self._since, packet.motion)
         interval = self._window.interval(t_ns - (self._kept_ns or [t_ns])[0], self._motion_kind)

@@ -39,7 +39,6 @@ def cheaper_order(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame])
 
 
 def by_colamd(graph: gtsam.NonlinearFactorGraph, _frames: list[StereoFrame]) -> gtsam.Ordering:
-    """Return COLAMD's order."""
     return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
 
 
@@ -84,7 +83,6 @@ def _landmarks(frames: list[StereoFrame]) -> list[tuple[int, int, int]]:
 
 
 def _symbolic(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.SymbolicFactorGraph:
-    """Return the symbolic graph: which variables share a factor."""
     graph = gtsam.SymbolicFactorGraph()
     for keys in (motion.at(i).keys() for i in range(motion.size())):
         for tied in combinations(keys, 2) if len(keys) > 1 else [keys]:

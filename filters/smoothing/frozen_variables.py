@@ -50,7 +50,6 @@ class FrozenVariables:
         self.keys = key_list(key for key in self.keys if key not in keys)
 
     def come_back(self, keys: Collection[int]) -> None:
-        """Return keys to the list."""
         self.keys = key_list([*self.keys, *keys])
 
     def add_frame(self, keys: Iterable[int]) -> None:
@@ -100,11 +99,9 @@ class RetiredVariables:
         return factors
 
     def with_values(self, of_tree: gtsam.Values) -> gtsam.Values:
-        """Return a tree's values, and the last values of the variables that left it."""
         return _joined(of_tree, self._latest)
 
     def with_linearisation_points(self, of_tree: gtsam.Values) -> gtsam.Values:
-        """Return the linearisation points of a tree's variables and of those that left it."""
         return _joined(of_tree, self._linearised_at)
 
 

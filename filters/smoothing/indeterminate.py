@@ -127,7 +127,6 @@ def with_the_last_tied(
 
 
 def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of a graph that may have empty slots, without these slots."""
     compact = gtsam.NonlinearFactorGraph()
     for slot in range(factors.size()):
         if factors.exists(slot):

@@ -77,14 +77,12 @@ class CachedLinearisation:
         return tuple(self.factor.keys())
 
     def container(self) -> gtsam.LinearContainerFactor:
-        """Return the linearisation as a factor."""
         return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
 
 
 def with_linearisations(
     factors: gtsam.NonlinearFactorGraph, cached: dict[int, CachedLinearisation]
 ) -> gtsam.NonlinearFactorGraph:
-    """Return a copy of the graph with factors replaced by their linearisations."""
     graph = gtsam.NonlinearFactorGraph(factors)
     for place, factor in cached.items():
         graph.replace(place, factor.container())
@@ -141,7 +139,6 @@ class Isam2Tree:
         return without_gaps(factors)
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of all variables except the dummy."""
         values = self._retired.with_values(self.isam.calculateBestEstimate())
         values.erase(LAST)
         return values
@@ -184,11 +181,9 @@ class Isam2Tree:
         return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
 
     def has(self, key: int) -> bool:
-        """Say whether a variable is in the tree."""
         return bool(self.isam.valueExists(key))
 
     def landmarks(self) -> list[int]:
-        """Return the keys of the landmarks in the tree."""
         return list(self._sightings)
 
     def read(self, keys: list[int]) -> gtsam.Values:

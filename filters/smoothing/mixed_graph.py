@@ -35,7 +35,6 @@ class MixedGraph:
                 self._single.append(factor)
 
     def linear(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """Return the graph linearised at some values."""
         linear = self._native.linearize(values)
         if self._twists is not None:
             for factor in self._twists.linear(values):
@@ -66,7 +65,6 @@ class TwistFactors:
 
     @classmethod
     def of(cls, increments: Mapping[int, TwistIncrement]) -> Self:
-        """Return the steps to states by their indices."""
         steps = [increment.step for increment in increments.values()]
         return cls(
             np.array(list(increments), dtype=np.int64),
@@ -86,7 +84,6 @@ class TwistFactors:
         return self._whitened(se3_log(self._errors(values)[1]))
 
     def linear(self, values: gtsam.Values) -> Iterator[gtsam.JacobianFactor]:
-        """Yield the factors, linearised at some values."""
         step_now, error_pose = self._errors(values)
         error = se3_log(error_pose)
         by_end = self.whitening @ np.linalg.inv(se3_right_jacobian(error))

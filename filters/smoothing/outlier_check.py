@@ -51,11 +51,9 @@ class KnownLandmarks:
         self._sightings = Counter[int]()
 
     def __contains__(self, track_id: int) -> bool:
-        """Say whether a track has a landmark."""
         return track_id in self._points
 
     def among(self, track_ids: Iterable[int]) -> BoolArray:
-        """Say which of the tracks (N,) have a landmark."""
         return np.array([i in self._points for i in track_ids], dtype=bool)
 
     def see(self, frame: StereoFrame, placed: Mapping[int, Array], T_world_imu: Array) -> None:
@@ -72,11 +70,9 @@ class KnownLandmarks:
         self._information.update({i: self._information.get(i, 0.0) + one for i, one in information})
 
     def move(self, points: Mapping[int, Array]) -> None:
-        """Update the points of landmarks."""
         self._points.update({i: point for i, point in points.items() if i in self._points})
 
     def keep(self, points: Mapping[int, Array]) -> None:
-        """Update the points of landmarks, and drop all others."""
         self.forget([i for i in self._points if i not in points])
         self.move(points)
 

@@ -210,7 +210,6 @@ def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
 
 
 def is_on_request(reason: str) -> bool:
-    """Say whether a value is missing because it was not requested."""
     return reason.startswith(_ON_REQUEST)
 
 

@@ -59,7 +59,6 @@ _ON_A_LINE = "the positions lie on a line or in a point, so the rotation about i
 
 
 def score(evaluation: AgainstTruth) -> Scores:
-    """Score the four position errors and the rotation error."""
     scores = evaluate(
         {
             "ate_none_m": lambda: rmse(_distances(evaluation.compared, evaluation.placed)),

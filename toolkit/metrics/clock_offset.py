@@ -89,7 +89,6 @@ class _Linearised(NamedTuple):
 
 
 def score(evaluation: AgainstTruth) -> Scores:
-    """Score the offset of the estimate's clock, and how well it is known."""
     try:
         fit = _fit(evaluation.compared, with_rate=False)
     except Unavailable as reason:

@@ -29,7 +29,6 @@ METRICS = (
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score coverage and count the matched pairs."""
     return evaluate(
         {"coverage_percent": lambda: _coverage_percent(evaluation), "pairs": lambda: len(evaluation.matched)}
     )

@@ -17,7 +17,6 @@ METRICS = (
 
 
 def score(evaluation: AgainstTruth) -> Scores:
-    """Score the drift at the last matched pair."""
     matched = evaluation.compared
     length_m = float(matched.path_m[-1] - matched.path_m[0])
     if length_m == 0.0:

@@ -40,7 +40,6 @@ METRICS = (
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score the innovations that a causal output reports, and the gate over all of its steps."""
     return evaluate(
         {"nis_mean": lambda: nis_over_time(evaluation).mean, ACCEPTED: lambda: _accepted_percent(evaluation)}
     )

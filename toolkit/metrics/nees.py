@@ -80,7 +80,6 @@ OF_POSE = tuple(metric.key for metric in _OF_POSE)
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score the stated covariances against the truth."""
     return Scores.attempt(_OF_POSE, lambda: of_stated(stated_errors(evaluation))) | Scores.attempt(
         _OF_STATE, lambda: _of_state(evaluation)
     )
@@ -104,7 +103,6 @@ def of_stated(stated: StatedErrors) -> Scores:
 
 
 def _of_state(evaluation: Evaluation) -> Scores:
-    """Score the stated covariances of velocity and biases against the truth."""
     stated = stated_errors(evaluation)
     layout = layout_of(stated)
 

@@ -81,7 +81,6 @@ METRICS = (*_IN_SAMPLE, *_HELD_OUT, *_OVER_MOTION)
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score the reprojection errors, each kind where it can be computed."""
     visible, held_out = evaluation.sequence.visible, evaluation.sequence.held_out
     unknown = "lack a landmark, a second sighting or a pose of their frame"
     few = f"belong to frames without a pose or to tracks with fewer than {FEWEST_VIEWS} posed views"

@@ -63,7 +63,6 @@ class _Intervals(NamedTuple):
 
 
 def score(evaluation: AgainstTruth) -> Scores:
-    """Score drift over one second and over 100 m, and KITTI's."""
     errors_of_a_second = cache(lambda: relative_errors(evaluation.oriented, *_one_second(evaluation.oriented)))
     rpe = evaluate(
         {

@@ -47,7 +47,6 @@ METRICS = (
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score the stated distributions against the truth."""
     return of_stated(stated_errors(evaluation))
 
 

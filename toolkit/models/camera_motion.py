@@ -57,7 +57,6 @@ class CameraMotion(NamedTuple):
         return np.asarray(T_imu_cam @ steps @ se3_inverse(T_imu_cam))
 
     def first(self, intervals: int) -> "CameraMotion":
-        """Return the motion over the first ``intervals`` intervals."""
         return CameraMotion(self.w_radps[:intervals], self.v_mps[:intervals], self.known[:intervals])
 
 
@@ -72,7 +71,6 @@ class Neighbours(NamedTuple):
     interval: IntArray
 
     def select(self, rows: BoolArray) -> "Neighbours":
-        """Return the pairs of a mask (P,)."""
         return Neighbours(self.before[rows], self.after[rows], self.interval[rows])
 
 

@@ -32,7 +32,6 @@ def constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:
 
 
 def landmark_keys(track_ids: Iterable[int]) -> list[int]:
-    """Return the keys L(track id) of landmarks."""
     return [_FIRST_LANDMARK + track_id for track_id in track_ids]
 
 

@@ -153,7 +153,6 @@ class FrameGate:
         return np.where(accepted, self.track_weight * huber_weights(nis, _thresholds(self.huber, _bits(dof))[dof]), 0.0)
 
     def info(self) -> dict[str, float]:
-        """Return the counts and sums under the keys of an Estimate's info."""
         return {
             "nis": self.nis,
             "nis_dof": self.dof,

@@ -40,7 +40,6 @@ class MotionModel(ABC):
         return Prediction(*(np.stack(part) for part in zip(*each, strict=True)))
 
     def initial_belief(self, prior: Prior) -> Belief:
-        """Return the belief at the first frame: the prior, reduced to the blocks of the layout."""
         return Belief.of_prior(prior, self.layout)
 
     @cached_property
@@ -54,7 +53,6 @@ class MotionModel(ABC):
         return [gtsam.symbol(kind, k) for kind in self.variable_sizes]
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
-        """Add state k at an estimate."""
         assert estimate.bias is not None
         values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
         if self.layout.velocity is not None:

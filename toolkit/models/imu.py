@@ -110,15 +110,12 @@ class ImuIncrement:
     gravity_world: Array
 
     def predict(self, start: Belief) -> Prediction:
-        """Predict a state over the interval."""
         return predict(self.preintegration, start.T_world_imu, start.v_world, start.bias)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``."""
         return transition_over(self.dt_s, self.gravity_world, start, end)
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the preintegrated factor between two states."""
         graph = gtsam.NonlinearFactorGraph()
         states = X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k)
         graph.add(gtsam.CombinedImuFactor(*states, self.preintegration))
@@ -135,7 +132,6 @@ class ImuModel(MotionModel):
         self._params = preintegration_params(noise, gravity_world)
 
     def integrate(self, motion: Motion, bias: Array) -> ImuIncrement:
-        """Preintegrate the samples between two frames about a bias (6,)."""
         assert isinstance(motion, ImuMotion)
         preintegration = preintegrate(motion, bias, self._params_over(motion))
         return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)

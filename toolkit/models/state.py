@@ -28,7 +28,6 @@ class Layout:
 
     @property
     def biases(self) -> slice:
-        """Return the slice of all biases."""
         return slice((self.accel_bias or self.gyro_bias).start, self.size)
 
 
@@ -82,7 +81,6 @@ class Belief:
         return cls(layout, prior.T_world_imu, prior.v_world, prior.bias, prior.cov[np.ix_(kept, kept)])
 
     def __getitem__(self, rows: int | IntArray | slice) -> "Belief":
-        """Return some of stacked beliefs."""
         return Belief(self.layout, self.T_world_imu[rows], self.v_world[rows], self.bias[rows], self.cov[rows])
 
     def moved(self, delta: Array, cov: Array) -> "Belief":

@@ -116,11 +116,6 @@ def disparity_px(uvs_px: Array) -> Array:
     return disparity
 
 
-def any_missing(uvs_px: Array) -> bool:
-    """Say whether any of the sightings (..., 3) px lacks the right image."""
-    return bool(is_left_only(uvs_px).any())
-
-
 def degrees_of_freedom(uvs_px: Array) -> int | IntArray:
     """Return how many coordinates sightings (..., 3) px have: 3 if all are complete, else 2 or 3 for each (...)."""
     missing = is_left_only(uvs_px)

@@ -225,7 +225,6 @@ class StereoWindow:
 
     @classmethod
     def empty(cls) -> "StereoWindow":
-        """Return a window without states."""
         none, values = np.empty(0, dtype=np.int64), gtsam.Values()
         prior = MarginalPrior(np.zeros((0, 0)), np.zeros(0), values)
         return cls((), values, (), prior, Sightings(none, none, np.empty((0, 3))), np.empty((0, 3)), none)
@@ -284,7 +283,6 @@ class StereoWindow:
         )
 
     def points_by_id(self) -> dict[int, Array]:
-        """Return the point (3,) m of every track."""
         return dict(zip(self.track_ids.tolist(), self.points, strict=True))
 
     def newest(self, frame: StereoFrame) -> StereoFrame:
@@ -347,13 +345,11 @@ class Evaluated:
 
     @cached_property
     def error(self) -> float:
-        """The cost of the window."""
         prior, off = self.window.prior, self.off_prior
         of_prior = float(0.5 * off @ prior.information @ off - prior.vector @ off)
         return of_prior + float(self.motion.error(self.window.values.zeroVectors())) + float(self.vision.losses.sum())
 
     def linearised(self) -> System:
-        """Return the normal equations."""
         window, count, size = self.window, len(self.window.keys), len(self.off_prior)
         d = window.size
         information, vector = self._of_motion(count * d)

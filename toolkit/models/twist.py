@@ -127,7 +127,6 @@ class TwistIncrement:
     noise: TwistNoise
 
     def predict(self, start: Belief) -> Prediction:
-        """Predict a state over the interval, or one over each."""
         size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
         transition, noise = np.zeros((2, *self.step.cov.shape[:-2], size, size))
         transition[..., POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
@@ -138,13 +137,11 @@ class TwistIncrement:
         return Prediction(start.T_world_imu @ self.step.T_start_end, start.v_world, transition, noise)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (9, 9) from the mean of ``start`` to that of ``end``."""
         transition = end.transition.copy()
         transition[POSE, POSE] = se3_adjoint(se3_inverse(end.T_world_imu) @ start.T_world_imu)
         return transition
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors between the poses and the random walk of the gyro bias."""
         graph = gtsam.NonlinearFactorGraph()
         graph.add(twist_factor(self.step, self.gyro_bias, k))
         graph.add(gyro_bias_walk_factor(self.noise, self.step.dt_s, k))
@@ -227,13 +224,11 @@ class SmoothIncrement:
         return Prediction(T_world_imu, v_world, transition, 0.5 * (noise + noise.T))
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (12, 12) from the mean of ``start`` to that of ``end``."""
         T_start_end = se3_inverse(start.T_world_imu) @ end.T_world_imu
         v_body = start.T_world_imu[:3, :3].T @ start.v_world, end.T_world_imu[:3, :3].T @ end.v_world
         return _transition(T_start_end, se3_right_jacobian(se3_log(T_start_end)), v_body, self.dt_s)
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factor between pose, velocity and turn rate of two states."""
         graph = gtsam.NonlinearFactorGraph()
         graph.add(smooth_factor(self.dt_s, self.noise, k))
         return graph

@@ -92,7 +92,6 @@ def check_filmable(scenario: Scenario, directory: Path) -> None:
 
 
 def pair_count(scenario: Scenario) -> int:
-    """Return the number of image pairs of a scenario."""
     return int(scenario.duration_s * scenario.camera.rate_hz) + 1
 
 
@@ -126,7 +125,6 @@ def film(
 
 
 def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Progress) -> None:
-    """Write all images, several at a time."""
     done = count(1)
 
     def shoot(k: int) -> None:
@@ -197,7 +195,6 @@ class _Crew:
 
 
 def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Path) -> None:
-    """Write all files of a folder except its images."""
     stamps = sequence.frames_t_ns.tolist()
     names = "".join(f"{t},{t}.png\n" for t in stamps)
     for camera, T_imu_cam in zip(_CAMERAS, pair.T_imu_cams, strict=True):
@@ -263,7 +260,6 @@ def _imu_yaml(noise: ImuNoise, rate_hz: float) -> str:
 
 
 def is_simulated(root: Path) -> bool:
-    """Say whether a folder in EuRoC's layout was written here."""
     try:
         return SCHEMA in (root / ABOUT).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

@@ -74,7 +74,6 @@ class Surfaces:
     moving: Callable[[float], tuple[Panel, ...]] | None = None
 
     def at(self, t_s: float) -> tuple[Panel, ...]:
-        """Return all panels at a time."""
         return self.standing if self.moving is None else self.standing + self.moving(t_s)
 
 
@@ -282,7 +281,6 @@ class Eye:
 
     @classmethod
     def of(cls, camera: Camera) -> "Eye":
-        """Return the rays of a camera."""
         import cv2
 
         (width, height), (fx, fy, cx, cy) = camera.size_px, camera.pinhole_px

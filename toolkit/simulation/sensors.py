@@ -63,7 +63,6 @@ class TrackNoise:
         freeze_arrays(self, white_px=(3,), walk_px=(3,), offset_px=(3,))
 
     def scaled(self, factor: float) -> "TrackNoise":
-        """Return the noise with all its standard deviations multiplied."""
         return TrackNoise(factor * self.white_px, factor * self.walk_px, factor * self.offset_px)
 
 
@@ -232,7 +231,6 @@ def with_slips(clean: Observations, share: float, rig: StereoRig, rng: np.random
 
 
 def while_in_image(seen: Observations, size_px: tuple[int, int]) -> Observations:
-    """End every track where it leaves the image."""
     limit_px = np.array([size_px[0], size_px[0], size_px[1]]) - 1
     outside = ((seen.uv_px < 0.0) | (seen.uv_px > limit_px)).any(axis=1)
     track, row = np.unique(seen.track_id, return_inverse=True)

@@ -35,9 +35,7 @@ class Kinematics:
 class SmoothTrajectory(Protocol):
     """A motion with exact derivatives at every instant; not the sampled poses of ``toolkit.estimate.Trajectory``."""
 
-    def at(self, t_s: Array) -> Kinematics:
-        """Return the motion at the instants (N,) s."""
-        ...
+    def at(self, t_s: Array) -> Kinematics: ...
 
 
 @lru_cache
@@ -125,7 +123,6 @@ class FreeTrajectory:
     rotation: RotationSpline
 
     def at(self, t_s: Array) -> Kinematics:
-        """Return the motion at the instants (N,) s."""
         R_world_imu, w_imu = self.rotation.at(t_s)
         pose = se3(R_world_imu, self.position.at(t_s))
         return Kinematics(pose, self.position.at(t_s, 1), self.position.at(t_s, 2), w_imu)

@@ -61,7 +61,6 @@ class Matched:
 
 
 def finite_poses(poses: Array) -> BoolArray:
-    """Say for each pose (N, 4, 4) whether all its entries are finite."""
     return np.asarray(np.isfinite(poses).all(axis=(-2, -1)))
 
 
@@ -260,17 +259,14 @@ class PairsAgainstTruth(AgainstTruth):
 
     @property
     def matched(self) -> Matched:
-        """The pairs."""
         return self.pairs
 
     @property
     def level(self) -> bool:
-        """Whether the vertical is measured."""
         return self.is_level
 
 
 def changes(values: Array) -> bool:
-    """Say whether values (n, ...) change at all."""
     return bool(np.ptp(values, axis=0).max() > 0.0)
 
 
@@ -285,7 +281,6 @@ def relative_errors(matched: Matched, first: IntArray, last: IntArray) -> Array:
 
 
 def lengths(vectors: Array) -> Array:
-    """Return the Euclidean length (...,) of vectors (..., 3)."""
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
@@ -295,5 +290,4 @@ def angles_deg(rotations: Array) -> Array:
 
 
 def rmse(errors: Array) -> float:
-    """Return the root mean square of errors (N,)."""
     return float(np.sqrt(np.mean(errors**2)))

@@ -59,7 +59,6 @@ class BodyErrors:
         return np.asarray(np.linalg.norm(self.T_estimate_truth[:, :3, 3], axis=1))
 
     def select(self, kept: BoolArray) -> "BodyErrors":
-        """Return the errors of a mask (n,)."""
         errors, poses = self.T_estimate_truth[kept], self.T_world_imu[kept]
         return BodyErrors(self.t_ns[kept], self.rows[kept], errors, poses, self.placed)
 
@@ -262,7 +261,6 @@ def nees_over_time(evaluation: Evaluation) -> Nees:
 
 
 def nees_of(stated: StatedErrors) -> Nees:
-    """Return the NEES of errors with their covariances."""
     errors, pose_cov = stated.errors, stated.cov[:, :POSE_DOF, :POSE_DOF]
     xi = se3_log(errors.T_estimate_truth)
     return Nees(

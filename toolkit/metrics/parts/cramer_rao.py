@@ -102,7 +102,6 @@ class _Problem:
 
     @cached_property
     def values(self) -> gtsam.Values:
-        """The states and the landmarks."""
         values = gtsam.Values()
         for k, state in enumerate(self.states):
             self.model.insert(values, state.estimate(0), k)
@@ -316,7 +315,6 @@ def _marginal(information: Array, vector: Array, rows: IntArray) -> tuple[Array,
 
 
 def _final(problem: _Problem) -> Efficient:
-    """Solve the whole graph."""
     linear = gtsam.GaussianFactorGraph()
     for frame in problem.frames:
         linear.push_back(frame)

@@ -35,7 +35,6 @@ class Evaluation(AgainstTruth):
 
     @cached_property
     def estimate(self) -> Trajectory:
-        """The trajectory that is evaluated."""
         trajectory = self.run.trajectory(self.output)
         if trajectory is None:
             raise ValueError(f"{self.run.estimator} has no {self.output} output to score")
@@ -43,14 +42,12 @@ class Evaluation(AgainstTruth):
 
     @cached_property
     def matched(self) -> Matched:
-        """The pairs of true and estimated poses that are scored; there may be none."""
         if self.sequence.truth is None:
             raise Unavailable("the sequence has no ground truth")
         return associate(self.estimate, self.sequence.truth, median_period_ns(self.sequence.frames_t_ns))
 
     @property
     def level(self) -> bool:
-        """Whether the recording has an IMU."""
         return self.sequence.motion_kind == "imu"
 
     @cached_property

@@ -84,7 +84,6 @@ class Views:
         return _Projections(ratio, inverse_depth, depth > 0.0)
 
     def pixels(self, seen: _Projections) -> Array:
-        """Return the pixels (3, N) of projections."""
         return np.asarray(self._focal_px * seen.ratio + self._centre_px)
 
     def predict(self, points: Array) -> PredictedSightings:

@@ -69,7 +69,6 @@ class Scores:
 
     @classmethod
     def none(cls, keys: Iterable[str], reason: str) -> "Scores":
-        """Return no value for any of the keys, for one reason."""
         return cls({}).without(keys, reason)
 
     @classmethod
@@ -81,7 +80,6 @@ class Scores:
             return cls.none((metric.key for metric in metrics), str(why))
 
     def __or__(self, others: "Scores") -> "Scores":
-        """Return these scores and those of other metrics."""
         return Scores(self.values | others.values, self.notes | others.notes)
 
     def without(self, keys: Iterable[str], reason: str) -> "Scores":
