@@ -117,19 +117,16 @@ class OutlierCheck:
         ``expected`` is the predicted state, with the covariance of its motion relative to the map. At the corrected
         state the error of the motion no longer enters the gate.
         """
-        known = _KnownSightings.of(frame, landmarks)
+        known = KnownSightings.of(frame, landmarks)
         there = _aligned(expected, known, self.rig)
-        return there, frame.select(~self._outliers(known, relative_to_its_map(there)))
+        return there, frame.select(~self.outliers(known, relative_to_its_map(there)))
 
-    def outliers(self, frame: StereoFrame, landmarks: KnownLandmarks, expected: Belief) -> BoolArray:
+    def outliers(self, known: "KnownSightings", expected: Belief) -> BoolArray:
         """Say which sightings (N,) of a frame do not fit the landmarks of their tracks.
 
         ``expected`` is the predicted state, with the covariance of its motion relative to the map. A sighting of an
         unknown landmark is no outlier. If most sightings are outliers the state is wrong, and none is returned.
         """
-        return self._outliers(_KnownSightings.of(frame, landmarks), expected)
-
-    def _outliers(self, known: "_KnownSightings", expected: Belief) -> BoolArray:
         if not len(known.points):
             return known.rows
         predicted, uvs_px = stereo.predict(known.points, expected.T_world_imu, self.rig), known.uvs_px
@@ -151,7 +148,7 @@ class OutlierCheck:
         return result
 
 
-class _KnownSightings(NamedTuple):
+class KnownSightings(NamedTuple):
     """The sightings of known landmarks: which (N,) of a frame's they are, (n, 3) px, and the landmarks.
 
     ``confirmed`` (n,) are the landmarks that more than one sighting agrees on, ``points`` (n, 3) are in m, ``covs``
@@ -221,7 +218,7 @@ def _carried(H: Array, cov: Array) -> Array:
     return np.asarray(H @ cov @ np.swapaxes(H, 1, 2))
 
 
-def _aligned(expected: Belief, known: _KnownSightings, rig: StereoRig) -> Belief:
+def _aligned(expected: Belief, known: KnownSightings, rig: StereoRig) -> Belief:
     """Return the belief with its pose corrected by the sightings of known landmarks; its covariance stays."""
     if not len(known.points):
         return expected

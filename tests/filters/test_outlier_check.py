@@ -11,6 +11,7 @@ from filters.isam2 import Isam2
 from filters.smoothing.outlier_check import (
     FEWEST_REFUSED,
     KnownLandmarks,
+    KnownSightings,
     OutlierCheck,
     RefusedTracks,
 )
@@ -27,6 +28,10 @@ RIG, COUNT = DRIVE.rig, 4000
 IDS = np.arange(COUNT)
 AHEAD = np.array([1.0, 0.0, 0.0])
 ROOT = np.linalg.cholesky(RIG.cov_uv_px2)
+
+
+def outliers(frame, landmarks, expected, policy=POLICIES["robust"]):
+    return OutlierCheck(RIG, policy).outliers(KnownSightings.of(frame, landmarks), expected)
 
 
 def landmarks_ahead() -> np.ndarray:
@@ -69,7 +74,9 @@ def test_the_gate_refuses_of_sound_sightings_what_it_says_however_often_a_landma
         landmarks.see(frame, points, pose)
     policy = msgspec.structs.replace(POLICIES["robust"], gate_probability=0.99)
     pose = pose_after(seen_from_m[-1] + way_m)
-    refused = OutlierCheck(RIG, policy).outliers(frame_from(pose, true, 99), landmarks, state_at(pose))
+    refused = OutlierCheck(RIG, policy).outliers(
+        KnownSightings.of(frame_from(pose, true, 99), landmarks), state_at(pose)
+    )
     assert 20 <= refused.sum() <= 62
 
 
@@ -159,7 +166,7 @@ def test_what_moves_by_itself_is_an_outlier_though_the_motion_might_explain_it()
     """Eight tracks are off by twelve pixels, as on a car: within the gate of a motion that is uncertain by as many."""
     frame, points = frame_and_points(np.tile([12.0, 12.0, 0.0], (8, 1)))
     check = OutlierCheck(RIG, POLICIES["robust"])
-    assert not check.outliers(frame, known_from_origin(points), state_at(OFF, 0.02)).any()
+    assert not outliers(frame, known_from_origin(points), state_at(OFF, 0.02)).any()
     there, sound = check.placed(state_at(OFF, 0.02), frame, known_from_origin(points))
     assert moved_px(there.T_world_imu, points) < 0.5
     np.testing.assert_array_equal(sound.track_ids, FORTY[8:])
@@ -183,7 +190,7 @@ def test_landmarks_that_began_with_an_outlier_do_not_put_the_state_in_doubt():
     """A third of the landmarks is wrong, and a third of what is seen of the others: far are more than half."""
     frame, points = frame_and_points(np.tile([40.0, 40.0, -40.0], (13, 1)))
     began_wrong = {i: point + 2.0 if 10 <= i < 23 else point for i, point in points.items()}
-    found = OutlierCheck(RIG, POLICIES["robust"]).outliers(frame, known_from_origin(began_wrong), state_at(np.eye(4)))
+    found = outliers(frame, known_from_origin(began_wrong), state_at(np.eye(4)))
     assert found[:23].mean() > 0.9
     assert found[23:].mean() < 0.1
 
