@@ -41,7 +41,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.measurements import Packet, StereoFrame, StereoRig, is_left_only
 from toolkit.models import stereo
-from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, X, kind_of
+from toolkit.models.factors import CAUCHY, HUBER, L, Loss, StereoFactors, kind_of, poses_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
@@ -221,7 +221,7 @@ def _residuals(
     """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
     ids, sizes = seen_ids(frames), [len(frame.track_ids) for frame in frames]
     points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-    T_imu_world = se3_inverse(_poses(values, len(frames)))
+    T_imu_world = se3_inverse(poses_of(values, np.arange(len(frames))))
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
     seen = points[np.searchsorted(ids, np.concatenate([frame.track_ids for frame in frames]))]
     predicted_px, depth_m = stereo.images(transform(np.repeat(T_imu_world, sizes, axis=0), seen), rig)
@@ -229,10 +229,6 @@ def _residuals(
     distance = mahalanobis_squared(stereo.residuals_px(uvs_px, predicted_px), covs_px2)
     ends = np.cumsum(sizes)[:-1]
     yield from zip(frames, np.split(distance, ends), np.split(depth_m, ends), strict=True)
-
-
-def _poses(values: gtsam.Values, count: int) -> Array:
-    return np.array([values.atPose3(X(k)).matrix() for k in range(count)])
 
 
 def placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import IntArray
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
-from toolkit.models.factors import L, X
+from toolkit.models.factors import L, X, poses_of
 from toolkit.models.stereo import CHANNELS
 
 _FROM_CHANNELS = np.linalg.inv(CHANNELS)
@@ -62,7 +62,7 @@ class FirstImages:
         landmark that is not in front of that camera has no image there, and is moved in metres.
         """
         points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()]).reshape(-1, 3)
-        seen = stereo.predict(points, _poses(values, self.first), self.rig)
+        seen = stereo.predict(points, poses_of(values, self.first), self.rig)
         image = seen.uv_px @ CHANNELS.T
         front = image[:, 1] > 0.0
         image, ids, first = image[front], self.track_ids[front].tolist(), self.first[front]
@@ -75,13 +75,7 @@ class FirstImages:
         moved = image + change
         moved[:, 1] = np.where(farther > 0.0, image[:, 1] * np.exp(-farther), moved[:, 1])
         there = values.retract(step)
-        places = stereo.triangulate_world(moved @ _FROM_CHANNELS.T, _poses(there, first), self.rig)
+        places = stereo.triangulate_world(moved @ _FROM_CHANNELS.T, poses_of(there, first), self.rig)
         for track_id, place in zip(ids, places, strict=True):
             there.update(L(track_id), place)
         return there
-
-
-def _poses(values: gtsam.Values, frames: IntArray) -> Array:
-    """Return the poses (M, 4, 4) of frames (M,), of which many are the same."""
-    unique, row = np.unique(frames, return_inverse=True)
-    return np.array([values.atPose3(X(k)).matrix() for k in unique.tolist()]).reshape(-1, 4, 4)[row]

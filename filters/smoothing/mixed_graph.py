@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian
-from toolkit.models.factors import B, X, linear_factor, python_factors
+from toolkit.models.factors import B, X, linear_factor, poses_of, python_factors
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.twist import TwistIncrement
 
@@ -98,9 +98,7 @@ class TwistFactors:
         bias = np.array([values.atVector(B(k - 1)) for k in self.k.tolist()])
         correction = (self.d_step_d_bias @ (bias - self.gyro_bias)[..., None])[..., 0]
         step_now = self.T_start_end @ se3_exp(correction)
-        start, end = (
-            np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()]) for frames in (self.k - 1, self.k)
-        )
+        start, end = poses_of(values, self.k - 1), poses_of(values, self.k)
         return step_now, se3_inverse(step_now) @ (se3_inverse(start) @ end)
 
     def _whitened(self, residuals: Array) -> Array:

@@ -54,11 +54,11 @@ from toolkit.metrics.parts.consistency import (
     OTHER_WORLD,
     BodyErrors,
     StatedErrors,
-    chi2_quantile,
     nees_of,
     with_covariances,
 )
 from toolkit.metrics.parts.readings import likelier_reading
+from toolkit.models.gating import chi2_bound
 from toolkit.sequence import content_digest
 
 TIME_COVERAGE = "time_coverage_percent"
@@ -425,7 +425,7 @@ def stated_against(
 def _is_in_the_truths_world(stated: StatedErrors) -> bool:
     """Say whether the first error is plausible under its covariance, in each block."""
     first = nees_of(stated)
-    return bool(max(first.orientation[0], first.position[0]) <= chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0)
+    return bool(max(first.orientation[0], first.position[0]) <= chi2_bound(3, 1.0 - OTHER_WORLD) / 3.0)
 
 
 def _nearest(t_ns: IntArray, at_ns: IntArray) -> IntArray:

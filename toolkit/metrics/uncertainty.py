@@ -9,9 +9,10 @@ are those of the NEES, in the tangent space of the estimate.
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.consistency import UNCOUPLED, StatedErrors, chi2_quantile, nees_of, stated_errors
+from toolkit.metrics.parts.consistency import UNCOUPLED, StatedErrors, nees_of, stated_errors
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores
+from toolkit.models.gating import chi2_bound
 
 ORDER = 76
 GROUP = "uncertainty"
@@ -58,7 +59,7 @@ def of_stated(stated: StatedErrors) -> Scores:
         rows = slice(0, 3) if block == "ori" else slice(3, 6) if block == "pos" else slice(0, 6)
         squared = dof * {"pose": nees.pose, "ori": nees.orientation, "pos": nees.position}[block]
         for percent in REGIONS_PERCENT:
-            inside = squared <= chi2_quantile(percent / 100.0, dof)
+            inside = squared <= chi2_bound(dof, percent / 100.0)
             found[f"inside_{percent}_{block}_percent"] = 100.0 * float(inside.mean())
         covs = stated.cov[:, rows, rows]
         log_det = np.linalg.slogdet(covs)[1] if np.isfinite(squared).all() else np.nan

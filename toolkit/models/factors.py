@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 
@@ -59,6 +59,12 @@ def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array
     ascending = sorted(track_ids)
     points = gtsam.utilities.extractPoint3(values.extract(landmark_keys(ascending)))
     return dict(zip(ascending, points, strict=True))
+
+
+def poses_of(values: gtsam.Values, frames: IntArray) -> Array:
+    """Return the poses (N, 4, 4) X(k) of frames (N,), of which many may be the same: each is read once."""
+    unique, row = np.unique(frames, return_inverse=True)
+    return np.array([values.atPose3(X(k)).matrix() for k in unique.tolist()]).reshape(-1, 4, 4)[row]
 
 
 # Makes a loss from its threshold in standard deviations.

@@ -31,7 +31,7 @@ MISMATCHED_TRACK_FACTOR = 2.0
 MOST_MISMATCHED = 0.5
 
 
-def chi2_bound(dof: IntArray | int, probability: float | None) -> Array:
+def chi2_bound(dof: Array | IntArray | float, probability: float | None) -> Array:
     """Return the quantile of chi-square variables with ``dof`` (N,) degrees of freedom at the given probability.
 
     It is infinite where the probability is None: there is no gate.

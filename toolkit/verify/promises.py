@@ -22,7 +22,8 @@ from toolkit.estimate import Estimate, Finished
 from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet
-from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
+from toolkit.metrics.parts.consistency import POSE_DOF
+from toolkit.models.gating import chi2_bound
 from toolkit.registry import cannot_import, discover, find
 from toolkit.sequence import Sequence
 
@@ -340,7 +341,7 @@ def inconsistency(nees_means: list[float]) -> str:
     The band is for poses of a run that share one error, the worst case, and holds 99.9 % of consistent estimators.
     """
     dof = POSE_DOF * len(nees_means)
-    low, high = (chi2_quantile(p, dof) / dof for p in (0.5 * _FALSE_ALARM, 1.0 - 0.5 * _FALSE_ALARM))
+    low, high = (float(chi2_bound(dof, p)) / dof for p in (0.5 * _FALSE_ALARM, 1.0 - 0.5 * _FALSE_ALARM))
     mean = float(np.mean(nees_means))
     if low <= mean <= high:
         return ""

@@ -6,16 +6,15 @@ error is the motion, or the difference, from the estimate to the truth, in the b
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
 from toolkit.metrics.parts.against_truth import finite_poses, median_period_ns, place_first, true_poses_at
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Unavailable
-from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.gating import chi2_bound, mahalanobis_squared
 from toolkit.models.state import IMU_LAYOUT, POSE, TWIST_LAYOUT, Layout
 from toolkit.sequence import Sequence
 
@@ -135,7 +134,7 @@ class Nis:
             usual = float(np.quantile(change, _USUAL_SHARE) / (_USUAL_SIGMAS * np.sqrt(2.0)))
             dof = np.maximum(2.0 * dof / max(usual, 1e-9) ** 2, 1.0)
         tail = (1.0 - BAND_PROBABILITY) / 2.0
-        return chi2_quantile(tail, dof) / dof, chi2_quantile(1.0 - tail, dof) / dof
+        return chi2_bound(dof, tail) / dof, chi2_bound(dof, 1.0 - tail) / dof
 
 
 def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:
@@ -144,7 +143,7 @@ def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:
     The sum of N independent NEES is chi-square with N times their degrees of freedom.
     """
     tail = (1.0 - BAND_PROBABILITY) / 2.0
-    low, high = (chi2_quantile(p, dof * runs) / (dof * runs) for p in (tail, 1.0 - tail))
+    low, high = (float(chi2_bound(dof * runs, p)) / (dof * runs) for p in (tail, 1.0 - tail))
     return low, high
 
 
@@ -165,16 +164,6 @@ def nis_over_time(evaluation: Evaluation) -> Nis:
     if not rows.size:
         raise Unavailable("no step reports an innovation")
     return Nis(rows, nis[rows], dof[rows], expected[rows])
-
-
-@overload
-def chi2_quantile(probability: float, dof: float) -> float: ...
-@overload
-def chi2_quantile(probability: float, dof: Array) -> Array: ...
-def chi2_quantile(probability: float, dof: float | Array) -> float | Array:
-    """Return the value a chi-square variable stays below with the probability, (n,) for degrees of freedom (n,)."""
-    value = 2.0 * gammaincinv(0.5 * np.asarray(dof), probability)
-    return np.asarray(value) if isinstance(dof, np.ndarray) else float(value)
 
 
 def body_errors(evaluation: Evaluation) -> BodyErrors:
@@ -214,7 +203,7 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
     off = float(mahalanobis_squared(error[None], prior.cov[None, :6, :6])[0])
-    return off < chi2_quantile(1.0 - OTHER_WORLD, POSE_DOF)
+    return off < float(chi2_bound(POSE_DOF, 1.0 - OTHER_WORLD))
 
 
 def stated_errors(evaluation: Evaluation) -> StatedErrors:
