@@ -44,14 +44,6 @@ def test_results_go_to_a_new_directory_each_time(vislam):
     assert len(list(Path("runs").iterdir())) == 2
 
 
-def test_the_command_and_a_start_from_the_truth_are_labelled(vislam, capsys):
-    assert vislam("compare", "drive", *QUICK, "--start", "truth", "--out", "with space", "--seed", "2") == 0
-    manifest = json.loads(Path("with space/manifest.json").read_text())
-    assert manifest["command"].endswith("--out 'with space' --seed 2")
-    assert manifest["seeds"] == {"sequence": 2}
-    assert "started from the truth" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("form", ["csv", "latex", "markdown"])
 def test_a_table_is_printed_in_the_form_that_was_asked_for(vislam, capsys, form):
     assert vislam("compare", "drive", *QUICK, "--format", form) == 0

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.experiment import pipeline
-from toolkit.experiment.units import Outcome, Unit, run_unit
-from toolkit.progress import Progress
 from toolkit.report.records import read_manifest
 
 # To read what is compiled takes a process longer than these runs.
@@ -55,6 +52,8 @@ def test_killed_in_the_middle_and_repeated_equals_uninterrupted(vislam, starts_g
     ended = lines("run")
     assert len(ended) == 2
     assert [path.name for path in Path("run").iterdir()] == ["outcomes.jsonl"]
+    assert vislam("report", "run") == 3
+    assert "run is of a comparison that has not ended; repeat its command" in capsys.readouterr().err
     assert vislam(*words, "--out", "run") == 0
     assert f"results: run ({len(ended)} of 6 runs were there)" in capsys.readouterr().out
     assert lines("run")[: len(ended)] == ended
@@ -62,20 +61,6 @@ def test_killed_in_the_middle_and_repeated_equals_uninterrupted(vislam, starts_g
     assert vislam(*words, "--out", "other") == 0
     assert scores("run") == scores("other")
     assert "outcomes.jsonl" in read_manifest(Path("run/manifest.json")).files
-
-
-def test_an_interrupt_says_where_to_go_on(vislam, one_line, monkeypatch):
-    def interrupted(unit: Unit, progress: Progress) -> Outcome:
-        if unit.seed == 1:
-            raise KeyboardInterrupt
-        return run_unit(unit, progress)
-
-    monkeypatch.setattr(pipeline, "run_unit", interrupted)
-    assert vislam(*SWEEP, "--workers", "1", "--out", "run") == 130
-    assert "interrupted; what has ended is kept in run, and the same command with this --out" in one_line()
-    assert len(lines("run")) == 2
-    assert vislam("report", "run") == 3
-    assert "run is of a comparison that has not ended; repeat its command" in one_line()
 
 
 def test_outcomes_stay_whatever_replaces_the_run_and_files_of_others_are_refused(vislam, one_line):

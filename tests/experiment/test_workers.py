@@ -245,20 +245,6 @@ def test_a_stage_before_the_first_frame_is_no_half_of_a_run() -> None:
     assert received == [(0, 100, "compiling"), (25, 100, ""), (50, 100, "solving, iteration 1")]
 
 
-def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(tmp_path, starts_group):
-    words = ("compare", "drive", "--seeds", "50", "--estimators", "ekf", "--workers", "2", "--out", "run")
-    vislam = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"TMPDIR": str(tmp_path)})
-    _wait_until(lambda: any(map(_has_begun, tmp_path.glob("vislam-*/progress"))))
-    time.sleep(0.2)
-    os.killpg(vislam.pid, signal.SIGINT)  # as a terminal does: to every process of the group
-    _, messages = vislam.communicate(timeout=300)
-    assert vislam.returncode == 130
-    assert (messages.startswith("vislam: error: interrupted; what "), messages.count("\n")) == (True, 1)
-    assert (tmp_path / "run").exists() == ("what has ended is kept in run" in messages)
-    assert {path.name for path in tmp_path.rglob("*")} <= {"run", "outcomes.jsonl"}
-    _assert_gone(vislam.pid)
-
-
 def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_path):
     """In a program of its own, because Python's resource tracker starts once a program, with the first process."""
     program = textwrap.dedent("""
@@ -337,11 +323,6 @@ def _assert_gone(group: int) -> None:
         return False
 
     _wait_until(gone)
-
-
-def _has_begun(board: Path) -> bool:
-    """Tell whether the processes have written anything to what their parent reads progress from."""
-    return any(board.read_bytes())
 
 
 def _wait_until(reached: Callable[[], bool]) -> None:

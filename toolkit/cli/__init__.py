@@ -89,7 +89,6 @@ def _run(given: list[str]) -> int:
     try:
         options = parser().parse_args(given)
         options.command_line = ["vislam", *given]
-        _check_current_directory()
         _check_memory()
         status: int = options.command(options)
     except SystemExit:  # argparse leaves this way, after a help text too
@@ -100,22 +99,18 @@ def _run(given: list[str]) -> int:
     return status
 
 
-def _check_current_directory() -> None:
-    """Raise SystemLimitError where the current directory was removed: relative paths and new processes need it."""
-    try:
-        os.getcwd()  # noqa: PTH109
-    except FileNotFoundError as error:
-        raise SystemLimitError("the current directory is no longer there; change to another one") from error
-
-
 def _check_memory() -> None:
     """Raise SystemLimitError where the memory allowed does not even hold the libraries.
 
     OpenBLAS would end the process by itself, or wait forever and for no signal. Its threads take memory of their own:
     where there is a limit it has one.
     """
-    limit = _memory_limit()
-    if limit is None:
+    try:
+        from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit
+    except ImportError:
+        return
+    limit = getrlimit(RLIMIT_AS)[0]
+    if limit == RLIM_INFINITY:
         return
     if limit < _LEAST_MEMORY:
         raise SystemLimitError(
@@ -191,22 +186,10 @@ def _means_behind(error: BaseException | None) -> BaseException | None:
         return error
     while error is not None:
         compiled = isinstance(error, ImportError) and str(error.path).endswith(tuple(EXTENSION_SUFFIXES))
-        if isinstance(error, SystemError) and _memory_limit() is not None:
-            return MemoryError()  # the interpreter makes the one of the other
         if compiled or isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _TOO_FEW):
             return error
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return None
-
-
-def _memory_limit() -> int | None:
-    """Return how many bytes of addresses the caller allows, None without a limit."""
-    try:
-        from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit
-    except ImportError:
-        return None
-    limit = getrlimit(RLIMIT_AS)[0]
-    return None if limit == RLIM_INFINITY else limit
 
 
 def _interrupted() -> int:

@@ -10,15 +10,10 @@ from toolkit.errors import printable
 from toolkit.progress import Progress, ProgressFor
 
 # Seconds before the first line and between two lines where the stream is a file or a pipe. For long work the interval
-# grows to a twentieth of the time so far, and to five minutes at most.
-LOG_EVERY_S = 10.0
-_SELDOM_AFTER_S, _MOST_SELDOM = 200.0, 30.0
+# grows to a share of the time so far, and to five minutes at most.
+LOG_EVERY_S, _LOG_SHARE, _LOG_AT_MOST_S = 10.0, 0.05, 300.0
 _FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
 _LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
-# The first steps include one-time work such as reading and compiling; before this share is done, the time left is a
-# guess.
-_LEAST_SHARE = 0.02
-_LOG_FORMAT_BEFORE = "{desc} {percentage:.0f} % [{elapsed}]"
 
 
 def of_this_process() -> ProgressFor:
@@ -78,14 +73,12 @@ class _Log:
         if total != self._total or done < self._done:
             self._began_s = now_s
         self._done, self._total = done, total
-        times_longer = min(max((now_s - self._first_s) / _SELDOM_AFTER_S, 1.0), _MOST_SELDOM)
-        if now_s - self._shown_s < LOG_EVERY_S * times_longer:
+        if now_s - self._shown_s < max(LOG_EVERY_S, min(_LOG_SHARE * (now_s - self._first_s), _LOG_AT_MOST_S)):
             return
         from tqdm import tqdm
 
         label = f"{self._label}, {stage}" if stage else self._label
-        line = _LOG_FORMAT if done >= _LEAST_SHARE * total else _LOG_FORMAT_BEFORE
-        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=line)
+        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=_LOG_FORMAT)
         self._stream.write(f"{meter}\n")
         self._stream.flush()
         self._shown_s = now_s
