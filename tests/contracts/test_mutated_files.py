@@ -5,7 +5,6 @@ Source of the method: MacIver, Hatfield-Dodds & others, "Hypothesis: A new appro
 """
 
 import io
-import json
 import re
 import shutil
 import tempfile
@@ -14,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +31,7 @@ Files = dict[str, bytes]
 Original = Callable[[str], Files]
 Test = Callable[..., None]
 VALUES = ("nan", "inf", "-inf", "0", "-1", "1e300", "-1e300", "1e-300", "1e19", "99999999999999999999", "", "x", "null")
+VALUES += ("true", "{}", "[[1], 2]", '"\\u001b[2J"', f'"{5000 * "y"}"')
 _DTYPES = ("f4", "i8", "u1", "c16", "U8", "?", "i2")
 _NUMBER = re.compile(rb"-?\d[\d.eE+-]*")
 
@@ -85,8 +84,6 @@ def mutated(files: Files, happened: list[Mutation]) -> Files:
             del changed[name]
         elif mutation.kind in ARRAYS:
             changed[name] = _through_arrays(data, mutation)
-        elif mutation.kind == "key":
-            changed[name] = _through_json(data, mutation)
     return changed
 
 
@@ -159,30 +156,6 @@ def _changed(array: np.ndarray, m: Mutation) -> np.ndarray:
     return changed
 
 
-def _through_json(data: bytes, m: Mutation) -> bytes:
-    """Drop, rename or replace one entry of a JSON document, at any depth."""
-    try:
-        document = json.loads(data)
-    except ValueError:
-        return data
-    places = [(node, key) for node in _nodes(document) for key in node]
-    if not places:
-        return data
-    node, key = places[m.where % len(places)]
-    values: tuple[Any, ...] = (None, "x", [], {}, -1, 0, 1e300, float("nan"), "\x1b[2J", "y" * 5000, [[1], 2], True)
-    if m.value % 8 == 0:
-        del node[key]
-    else:
-        node[key] = values[m.value % len(values)]
-    return json.dumps(document).encode()
-
-
-def _nodes(node: Any) -> list[dict[str, Any]]:
-    if not isinstance(node, dict):
-        return []
-    return [node, *(inner for value in node.values() for inner in _nodes(value))]
-
-
 def write(files: Files, place: Path) -> Path:
     """Write a recording to a place, a folder or a file, and return it."""
     if set(files) == {""}:
@@ -194,7 +167,7 @@ def write(files: Files, place: Path) -> Path:
     return place
 
 
-KINDS = (*RAW, *ARRAYS, "gone", "key")
+KINDS = (*RAW, *ARRAYS, "gone")
 # A message may quote a path and a value; a page of them is none that anybody reads.
 LONGEST_MESSAGE = 1000
 RECORDINGS = ("course", "course npy", "own tables", "utias", "openvins", "lean euroc", "vislam drive", "vislam flight")

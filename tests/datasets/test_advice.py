@@ -24,7 +24,7 @@ import scipy.io
 import toolkit
 from tests.advice import TOOLKIT, advice_in, is_followed, unknown_beginnings
 from tests.datasets.conftest import edit as replace_in
-from tests.datasets.test_course_npy import T_REGULAR_OPTICAL
+from tests.datasets.test_course_npy import T_REGULAR_OPTICAL, as_course, save_npy
 from tests.datasets.test_kitti_raw import DRIVE, packet
 from tests.datasets.test_kitti_raw import drive as day_and_drive
 from tests.datasets.test_own_tables import recorded, rig_of, tables_of, written
@@ -288,13 +288,6 @@ def save_struck(path: Path, arrays: dict[str, Any]) -> None:
     path.write_bytes(bytes(content))
 
 
-def save_npy(path: Path, content: dict[str, Any]) -> None:
-    """Write a recording, and its images beside it."""
-    images = {key: value for key, value in content.items() if key.startswith("cam")}
-    np.save(path.with_stem(f"{path.stem}_imgs"), images, allow_pickle=True)
-    np.save(path, {key: value for key, value in content.items() if key not in images}, allow_pickle=True)
-
-
 @pytest.fixture(scope="session")
 def film(kitti_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of KITTI's odometry, and beside it one of ASL with the same images."""
@@ -317,16 +310,6 @@ def film(kitti_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     poses = ((k, (START_NS + PERIOD_NS * k) / 1e9) for k in range(-1, FRAMES + 1))
     (asl / "truth.tum").write_text("".join(f"{t:.9f} 0 0 {0.05 * k} 0 0 0 1\n" for k, t in poses))
     return odometry.parent
-
-
-def as_course(images: Path) -> dict[str, Any]:
-    """Return a folder of KITTI's odometry as the course pickles a recording and its images."""
-    sides = [sorted((images / f"image_{side}").iterdir()) for side in (0, 1)]
-    left, right = ([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths] for paths in sides)
-    extrinsics = {"extL_T_imu": T_REGULAR_OPTICAL, "extR_T_imu": T_REGULAR_OPTICAL @ T_LEFT_RIGHT}
-    motion = {"v_t": np.tile([1.5, 0.0, 0.0], (FRAMES, 1)), "w_t": np.zeros((FRAMES, 3))}
-    calibration = {"timestamps": 1.7e9 + np.arange(FRAMES) / 30.0, "K_l": CAMERA.K, "K_r": CAMERA.K}
-    return {**motion, **calibration, **extrinsics, "cam_imgs_L": left, "cam_imgs_R": right}
 
 
 @pytest.fixture
@@ -548,7 +531,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (put(time_stamps=1.3e15 + 1e6 * FEW_S), "divide by 1e6", put(time_stamps=(1.3e15 + 1e6 * FEW_S) / 1e6)),
         (put(time_stamps=1.3e12 + 1e3 * FEW_S), "divide by 1e3", put(time_stamps=(1.3e12 + 1e3 * FEW_S) / 1e3)),
         (put(time_stamps=(1.3e9 + FEW_S).astype(np.float32)), "write it in double"),
-        (put(K=K().T), "expected 0, 0, 1; transpose it", put(K=K())),
+        (put(K=K().T), "expected 0, 0, 1; transpose it"),
         (put(K=K(m22=0.0)), "write fx, 0, cx; 0, fy, cy; 0, 0, 1"),
         (put(K=K(m01=50.0)), "a rectified pair has none; rectify the images"),
         (put(K=K(m00=-500.0)), "expected a positive number; correct K"),
@@ -558,8 +541,8 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "u and v look exchanged: exchange them",
             put(features=many(200.0, 400.0, 200.0, 380.0)[[1, 0, 3, 2]]),
         ),
-        (put(imu_T_cam=TILTED[1].T), "expected 0, 0, 0, 1; transpose it?", put(imu_T_cam=TILTED[1])),
-        (put(cam_T_imu=np.eye(4)), "delete the one that is wrong", gone("cam_T_imu")),
+        (put(imu_T_cam=TILTED[1].T), "expected 0, 0, 0, 1; transpose it?"),
+        (put(cam_T_imu=np.eye(4)), "delete the one that is wrong"),
         (write(save_twice), "save it with one array of that name"),
         (check("--tracks", "images"), "its format has tracks and no images; leave --tracks images out"),
         (check("--topics", "imu=/imu0"), "a bag has; leave --topics out, or compare it by itself"),
@@ -645,14 +628,10 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (kept(motion={"t_ns": [1], "vx": [0.0], "gx": [0.0]}), "motion: missing column ax, ay, az, gx, gy", kept()),
         (edit("rig.toml", "fx_px", "#"), "missing fx_px; it has T_imu_cam"),
         (kept(truth={"t": [1.0]}), "truth: missing column x, y", kept()),
-        (edit("tracks.csv", "track_id", "trackid"), "(rename trackid?)", edit("tracks.csv", "trackid", "track_id")),
+        (edit("tracks.csv", "track_id", "trackid"), "(rename trackid?)"),
         (edit("tracks.csv", "t_ns,", "t,"), "nanoseconds: divide by 1e9", lines("tracks.csv", of_rows(in_seconds))),
-        (
-            lines("tracks.csv", lambda table: [*table, table[3]]),
-            "is there twice in its frame; remove one",
-            lines("tracks.csv", lambda table: table[:-1]),
-        ),
-        (edit("rig.toml", "baseline_m", "baseline"), "remove or rename it", edit("rig.toml", "baseline", "baseline_m")),
+        (lines("tracks.csv", lambda table: [*table, table[3]]), "is there twice in its frame; remove one"),
+        (edit("rig.toml", "baseline_m", "baseline"), "remove or rename it"),
         (
             lines("rig.toml", lambda rows: [*(row for row in rows if "_d" not in row and "_w" not in row), "x = 1\n"]),
             "there is no noise.x; remove or rename it",
@@ -661,7 +640,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             lines("tracks.csv", lambda table: [f"t,{table[0]}", *(f"1.5,{row}" for row in table[1:])]),
             "has the columns t and t_ns; leave one out",
-            lines("tracks.csv", lambda table: [line.partition(",")[2] for line in table]),
         ),
         (text("tracks.csv", b"\xff\xfe\x00\x80"), "write a CSV, one row a line, with names in the first"),
         (
@@ -669,13 +647,12 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "separate them by commas, semicolons or tabs",
             lines("imu.csv", lambda table: [line.replace(" ", ";") for line in table]),
         ),
-        (edit("tracks.csv", "uL", "uR"), "rename or remove one", edit("tracks.csv", "uR", "uL")),
+        (edit("tracks.csv", "uL", "uR"), "rename or remove one"),
         (
             both(
                 edit("tracks.csv", "t_ns", "t"), lines("tracks.csv", lambda rows: [*of_rows(in_seconds)(rows), NAN[4:]])
             ),
             "has no finite time (nan); remove the line",
-            lines("tracks.csv", lambda table: table[:-1]),
         ),
         (lines("tracks.csv", restamped(lambda t: t // 10**9)), "multiply by 1e9"),
         (lines("imu.csv", restamped(lambda t: t // 10**6)), "multiply by 1e6"),
@@ -779,7 +756,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             edit("calib.txt", "-100.0", "100.0"),
             "is not to the right of the left; exchange them",
-            lines("calib.txt", lambda rows: [rows[1].replace("P1", "P0"), rows[0].replace("P0", "P1")]),
         ),
         (
             pixels("image_?/*.png", lambda image: image[::2, ::2]),
@@ -790,12 +766,10 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             moved("image_?/*.png", lambda path: f"{path.stem}_left.png"),
             "name the images of an instant alike, as 000000.png",
-            moved("image_?/*.png", lambda path: path.name.replace("_left", "")),
         ),
         (
             moved("image_?/*.png", lambda path: f"{50 + int(path.stem):06d}.png"),
             "and times.txt has 5, from number 0 on; cut both or neither",
-            moved("image_?/*.png", lambda path: f"{int(path.stem) - 50:06d}.png"),
         ),
         (
             text("poses.txt", "".join(f"{0.1 * k} {k} 0 0 0 0 0 1\n" for k in range(FRAMES))),
@@ -805,11 +779,10 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (text("times.txt", "0.5\n" * FRAMES), "write the time of each"),
         (gone("image_1"), "and stereo needs both cameras; add those of image_1"),
         (lambda case: [path.unlink() for path in case.at.glob("*/*.png")], "with images; unpack them there (.png"),
-        (swap("image_0", "image_1"), "exchange the two, or turn the images back", swap("image_0", "image_1")),
+        (swap("image_0", "image_1"), "exchange the two, or turn the images back"),
         (
             pixels("image_?/*.png", lambda image: image[:, ::-1]),
             "or turn the images back if all are upside down or mirrored",
-            pixels("image_?/*.png", lambda image: image[:, ::-1]),
         ),
         (rolled, "one camera began earlier or dropped an image; pair them by when they were taken", later(1)),
         (pixels("image_1/*.png", lambda image: image[::2, ::2]), "cut or turned, do the same to the calibration"),
@@ -846,7 +819,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             edit(f"{DAY}/image_00/timestamps.txt", "2011-09-26 13", "yesterday 13"),
             "write it as 2011-09-26 13:02:25.96",
-            edit(f"{DAY}/image_00/timestamps.txt", "yesterday 13", "2011-09-26 13"),
         ),
     ],
     "asl": [
@@ -883,7 +855,6 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (
             lines(TABLES[1], restamped(lambda t: t + 20_000_000)),
             "where only the cameras' clocks differ, correct the stamps of cam1",
-            lines(TABLES[1], restamped(lambda t: t - 20_000_000)),
         ),
         (
             both(gone(YAMLS[1]), text("orb.yaml", "Camera1.fx: 50.0")),
@@ -896,7 +867,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (yaml_of(PLACES[0], PLACES[0]), "so there is no baseline; give each its own pose"),
         (yaml_of(PLACES[0], se3(np.eye(3), np.array([0.0, 0.4, 0.0]))), "correct the pose of one of them"),
         (yaml_of(*map(np.linalg.inv, TILTED)), "looks like the inverse of one: invert both", yaml_of(*TILTED)),
-        (swap(*YAMLS), "cam1 is not to the right of cam0; exchange the two", swap(*YAMLS)),
+        (swap(*YAMLS), "cam1 is not to the right of cam0; exchange the two"),
         (edit(YAMLS[1], "[320, 200]", "[640, 400]"), "a pair needs one size; record both alike"),
         (
             yaml_of(PLACES[0], PLACES[1] @ se3_exp(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))),

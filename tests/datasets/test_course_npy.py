@@ -1,7 +1,6 @@
 """The course's pickled recordings: which way the extrinsic goes, how little memory it takes, that nothing is run."""
 
 import io
-import os
 import pickle
 import pickletools
 import tracemalloc
@@ -18,7 +17,7 @@ from tests.datasets.conftest import assert_refused
 from toolkit.audit import audit
 from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.io.numpy_files import read_dict
-from toolkit.geometry import Array, se3, se3_inverse
+from toolkit.geometry import se3, se3_inverse
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import NO_FEATURES, Sequence
 from toolkit.settings import Frontend
@@ -149,24 +148,6 @@ def test_a_large_recording_takes_hardly_any_memory(tmp_path: Path) -> None:
 # What must not be run --------------------------------------------------------------------------------------------
 
 
-class Touches:
-    """Unpickled it makes a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return os.mkdir, (str(self.path),)
-
-
-def test_a_pickle_that_would_run_something_is_refused_by_name_and_nothing_is_run(
-    tmp_path: Path, small: dict[str, Any]
-) -> None:
-    path = saved(tmp_path, {**small, "extra": Touches(tmp_path / "touched")})
-    assert_refused(lambda: load_sequence(str(path)), path, r"names posix\.mkdir.*nothing of it was executed")
-    assert not (tmp_path / "touched").exists()
-
-
 @pytest.mark.parametrize(
     "instructions",
     [
@@ -214,22 +195,30 @@ def test_the_reader_agrees_with_pickle_on_plain_data(tmp_path: Path) -> None:
 # Images beside it ------------------------------------------------------------------------------------------------
 
 
+def as_course(images: Path) -> dict[str, Any]:
+    """Return a folder of KITTI's odometry as the course pickles a recording and its images."""
+    sides = [sorted((images / f"image_{side}").iterdir()) for side in (0, 1)]
+    left, right = ([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths] for paths in sides)
+    K, T_left_right = np.array([[250.0, 0.0, 160.0], [0.0, 250.0, 100.0], [0.0, 0.0, 1.0]]), np.eye(4)
+    T_left_right[0, 3] = 0.4
+    extrinsics = {"extL_T_imu": T_REGULAR_OPTICAL, "extR_T_imu": T_REGULAR_OPTICAL @ T_left_right}
+    motion = {"v_t": np.tile([1.5, 0.0, 0.0], (len(left), 1)), "w_t": np.zeros((len(left), 3))}
+    calibration = {"timestamps": 1.7e9 + np.arange(len(left)) / 30.0, "K_l": K, "K_r": K}
+    return {**motion, **calibration, **extrinsics, "cam_imgs_L": left, "cam_imgs_R": right}
+
+
+def save_npy(path: Path, content: dict[str, Any]) -> Path:
+    """Write a recording, and its images beside it."""
+    images = {key: value for key, value in content.items() if key.startswith("cam")}
+    np.save(path.with_stem(f"{path.stem}_imgs"), images, allow_pickle=True)
+    np.save(path, {key: value for key, value in content.items() if key not in images}, allow_pickle=True)
+    return path
+
+
 @pytest.fixture
 def with_images(kitti_drive: Path, tmp_path: Path) -> Path:
     """Return a recording without features, and the images of a drive towards a wall beside it."""
-    sides = [sorted((kitti_drive / f"image_{side}").iterdir()) for side in (0, 1)]
-    left, right = ([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths] for paths in sides)
-    count = len(left)
-    K = np.array([[250.0, 0.0, 160.0], [0.0, 250.0, 100.0], [0.0, 0.0, 1.0]])
-    T_imu_right = T_REGULAR_OPTICAL @ se3(np.eye(3), np.array([0.4, 0.0, 0.0]))
-    content: dict[str, Array] = {
-        "v_t": np.tile([1.5, 0.0, 0.0], (count, 1)),
-        "w_t": np.zeros((count, 3)),
-        "timestamps": 1.7e9 + np.arange(count) / 30.0,
-        **{"K_l": K, "K_r": K, "extL_T_imu": T_REGULAR_OPTICAL, "extR_T_imu": T_imu_right},
-    }
-    saved(tmp_path, {"cam_imgs_L": left, "cam_imgs_R": right}, "dataset02_imgs.npy")
-    return saved(tmp_path, content, "dataset02.npy")
+    return save_npy(tmp_path / "dataset02.npy", as_course(kitti_drive))
 
 
 def test_tracks_are_those_of_the_images_as_files(with_images: Path, kitti_drive: Path) -> None:
