@@ -56,11 +56,6 @@ def test_not_a_number_is_never_written() -> None:
         to_text(Tree(schema="test.tree/1", rows=({"a": {"b": float("nan")}},)))
 
 
-def test_a_record_that_breaks_its_rule_cannot_be_made() -> None:
-    with pytest.raises(ValueError, match="more entries"):
-        Leaf(count=0, values=(1.0,))
-
-
 @pytest.mark.parametrize(
     ("body", "expected"),
     [

@@ -115,9 +115,9 @@ class Rows:
             raise DataError(f"{what} has {len(cells)} columns, expected {width} ({columns})")
         for cell in cells:
             if not is_number(cell):
-                point = ", with a point in numbers" if any("," in cell for cell in cells) else ""
+                point, shown = ", with a point in numbers" if any("," in cell for cell in cells) else "", cell[:50]
                 raise DataError(
-                    f"{what} is not numeric (could not convert string to float: {cell!r}); expected {columns}{point}"
+                    f"{what} is not numeric (could not convert string to float: {shown!r}); expected {columns}{point}"
                 )
         return list(map(float, cells))
 
