@@ -7,7 +7,7 @@ import pytest
 
 from toolkit.audit.intervals import interval_means
 from toolkit.audit.one_step import errors_are_independent
-from toolkit.audit.robust import INFLATION, LEVEL, Scalar, chance_bound, slope
+from toolkit.audit.robust import LEVEL, Scalar, chance_bound, slope
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.jackknife import jackknife_cov
 from toolkit.measurements import NS_PER_S
@@ -69,13 +69,13 @@ def test_what_is_beyond_the_bound_of_chance_is_so_as_rarely_as_it_says(stretches
         rows = shared + rng.standard_normal((len(shared), 1))
         error = np.sqrt(jackknife_cov(lambda some: some.mean(axis=0), rows, stretches=stretches)[:1, 0])
         formal = np.full(1, rows.std() / np.sqrt(len(rows)))
-        beyond += bool(abs(rows.mean()) > chance_bound(error, formal, float(stretches), INFLATION["twist"])[0])
+        beyond += bool(abs(rows.mean()) > chance_bound(error, formal, float(stretches))[0])
     assert beyond <= 2000 * LEVEL + 3.0 * np.sqrt(2000 * LEVEL)  # three standard deviations of a count of two
 
 
 def test_few_stretches_have_a_bound_and_many_are_not_loosened_by_it() -> None:
     error, formal = np.array([0.002]), np.array([0.002])
-    two, ten = (chance_bound(error, formal, stretches, 3.0)[0] for stretches in (2.0, 10.0))
+    two, ten = (chance_bound(error, formal, stretches)[0] for stretches in (2.0, 10.0))
     assert two < 0.05  # by their own scatter two stretches have none
     assert ten == pytest.approx(
         4.781 * 0.002, rel=1e-3

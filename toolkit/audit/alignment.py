@@ -1,10 +1,9 @@
 """The camera's scale, position and small rotation against odometry, and how significant they are.
 
 One robust regression of the camera's velocities on the measured ones (``velocity_fit``) estimates all three. Slip lasts
-for seconds, so its standard errors are those of a jackknife over stretches that are no shorter. ``turn_by_rotations``
-estimates the rotation from rates of rotation instead. ``way_gone`` says which of two positions the camera has, with the
-systematic error of sound recordings added to the covariance. ``force_beside_camera`` integrates an accelerometer beside
-the camera's velocity.
+for seconds, so its standard errors are those of a jackknife over stretches that are no shorter. ``way_gone`` says which
+of two positions the camera has, with the systematic error of sound recordings added to the covariance.
+``force_beside_camera`` integrates an accelerometer beside the camera's velocity.
 """
 
 from typing import NamedTuple
@@ -14,7 +13,6 @@ import numpy as np
 from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided
 from toolkit.audit.robust import (
     CAUCHY_SIGMAS,
-    INFLATION,
     ITERATIONS,
     Scalar,
     chance_bound,
@@ -24,7 +22,7 @@ from toolkit.audit.robust import (
 )
 from toolkit.geometry import Array, IntArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
-from toolkit.measurements import NS_PER_S, MotionKind
+from toolkit.measurements import NS_PER_S
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.sequence import Sequence
 
@@ -39,8 +37,8 @@ MOST_SIGMAS = 4.0
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
 # The same of sound recordings with an IMU (m), which have 0.06 at most.
 BESIDE_IMU_M = 0.05
-# Limits beyond the standard errors for a rotation (rad) by velocities, which slip and pitch of cars bias, and by rates.
-SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
+# Limit of a rotation (rad) beyond chance: slip and pitch of cars bias it.
+SYSTEMATIC_RAD = 0.018
 # Axes known worse than the best one by this factor are not judged, as that of the direction of travel by velocities.
 MOST_ERROR_RATIO = 4.0
 # Least bound (rad); without noise it would be zero.
@@ -96,34 +94,24 @@ def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
     signs differ (Frisch, "Statistical confluence analysis", 1934).
     """
     measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
-    columns = [-seen[:, :, None], -skew(intervals.w_seen_radps), skew(seen)]
-    response, jacobian = measured - seen, np.concatenate(columns, axis=2)
+    pose = np.concatenate([-skew(intervals.w_seen_radps), skew(seen)], axis=2)
+    response, jacobian = measured - seen, np.concatenate([-seen[:, :, None], pose], axis=2)
     found, formal = _robust_with_formal_cov(response, jacobian)
     stretches = slip_stretches(len(seen) * step_s)
     lasting = jackknife_cov(_robust_solution, response, jacobian, stretches=stretches)
     cov = lasting if stretches == STRETCHES else jackknife_cov(_robust_solution, response, jacobian)
     moving = in_motion(seen, stretches)
-    other = float(_robust_solution(-response, measured[:, :, None])[0])
+    other = float(_robust_solution(-response, np.concatenate([measured[:, :, None], -pose], axis=2))[0])
     one = 1.0 / (1.0 - float(found[0])) - 1.0
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
     error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
-    bound = chance_bound(np.sqrt(lasting[:1, 0]), np.sqrt(formal[:1, 0]), moving, INFLATION["twist"])
+    bound = chance_bound(np.sqrt(lasting[:1, 0]), np.sqrt(formal[:1, 0]), moving)
     by_chance = (1.0 + scale) ** 2 * float(bound[0])
-    turn = _tested(found[_TURN], formal[_TURN, _TURN], lasting[_TURN, _TURN], moving, "twist")
+    turn = _tested(found[_TURN], formal[_TURN, _TURN], lasting[_TURN, _TURN], moving)
     return VelocityFit(Scalar(scale, error), by_chance, Position(found[_LEVER], cov[_LEVER, _LEVER]), turn)
 
 
-def turn_by_rotations(intervals: Intervals) -> Turn:
-    """Return the rotation that aligns the camera's rates of rotation with those of the gyro."""
-    seen = intervals.w_seen_radps
-    bias = np.tile(np.eye(3), (len(seen), 1, 1))
-    response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
-    found, formal = _robust_with_formal_cov(response, jacobian)
-    cov = jackknife_cov(lambda *rows: _robust_with_formal_cov(*rows)[0], response, jacobian)
-    return _tested(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES), "imu")
-
-
-def _tested(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
+def _tested(rad: Array, formal: Array, cov: Array, stretches: float) -> Turn:
     """Return the rotation (3,) about those principal axes of its formal covariance (3, 3) that can be judged.
 
     The jackknife covariance ``cov`` (3, 3) of a few stretches is too uncertain to choose the axes.
@@ -131,7 +119,7 @@ def _tested(rad: Array, formal: Array, cov: Array, stretches: float, kind: Motio
     variance, axes = np.linalg.eigh(formal)
     error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), variance))
     decidable = variance <= MOST_ERROR_RATIO**2 * variance.min()
-    by_chance_rad = chance_bound(error_rad[decidable], np.sqrt(variance[decidable]), stretches, INFLATION[kind])
+    by_chance_rad = chance_bound(error_rad[decidable], np.sqrt(variance[decidable]), stretches)
     return Turn((axes.T @ rad)[decidable], error_rad[decidable], np.maximum(by_chance_rad, LEAST_BOUND_RAD))
 
 

@@ -9,11 +9,11 @@ from toolkit.audit.alignment import (
     MOST_SIGMAS,
     SYSTEMATIC_RAD,
     Position,
+    Turn,
     VelocityFit,
     is_there,
     metres,
     share_of_way,
-    turn_by_rotations,
 )
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
@@ -434,32 +434,46 @@ def _explains(way_m: Array, found: Position) -> bool:
     return is_there(share) and float(beside @ np.linalg.solve(cov_m2, beside)) <= MOST_SIGMAS**2
 
 
-RATIO_SIGMAS = 5.0
-# Limits of the ratios of specific force to gravity and of the gyro's rates to the camera's, beyond five standard
-# errors; of 699 parts of sound recordings two exceed one, by 0.011. Noise lowers the second: only values above 1 count.
-SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
+# Limits, beyond five standard errors, of the ratio of specific force to gravity and of that of odometry's rates to the
+# camera's, which noise lowers: only values above 1 count.
+RATIO_SIGMAS, SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 5.0, 0.05, 0.025
 # Where only a rotation (rad) larger than this would be found, the finding is undecided and says so.
 LARGEST_RAD = 0.05
 
 
 @beside_camera
 def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report small errors of the calibration that bend a trajectory: rotation, K, a sensor's scale.
+    """Report small errors of the calibration that bend a trajectory: rotation, K, the accelerometer's scale.
 
     Points followed over a second show most of them (`self_calibration`). With odometry, whose slip lasts as long, the
-    rotation from frame to frame is judged as well.
+    rotation by its velocities is judged as well.
     """
-    wrongs, unseen = _calibration(evidence, intervals)
-    rotation, force = rotation_ratio(intervals), force_ratio(evidence.sequence)
-    if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation, SYSTEMATIC_RATE[evidence.sequence.motion_kind]):
-        summary = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
-        wrongs.append(Wrong(summary, "the scale of the gyro and the focal length"))
-    near = force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO
-    if force is not None and near and _is_off(force, SYSTEMATIC_FORCE):
+    sequence, rig, kind, found = (
+        evidence.sequence,
+        evidence.sequence.rig,
+        evidence.sequence.motion_kind,
+        evidence.self_calibration,
+    )
+    if kind == "twist":
+        found = self_calibration(sequence, evidence.camera_motion, intervals)
+    wrongs = [] if found is None else wrong(found, rig, kind)
+    unseen = [f"the intrinsics: {_unfitted(kind)}" if found is None else hidden(found, kind)]
+    if evidence.velocity_fit is not None:
+        turned, unturned = _by_turn(evidence.velocity_fit.turn, rig)
+        wrongs, unseen = wrongs or turned, [unturned, *unseen]
+        rate = rotation_ratio(intervals)
+        if 1.0 + RATIO_SIGMAS * rate.error + SYSTEMATIC_RATE < rate.value < MOST_RATIO:
+            summary = f"the gyro turns {rate.value:.3f} +- {rate.error:.3f} times as fast as the camera"
+            wrongs.append(Wrong(summary, "the scale of the gyro and the focal length"))
+    elif found is not None:
+        unseen = [doubtful(found, rig, kind), *unseen]
+    force = force_ratio(sequence)
+    near = force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO  # else a `disagreement`
+    if force is not None and near and abs(force.value - 1.0) > RATIO_SIGMAS * force.error + SYSTEMATIC_FORCE:
         summary = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
         wrongs.append(Wrong(summary, "the scale and the bias of the accelerometer"))
     if not wrongs:
-        return Undecided(unseen) if unseen else None
+        return Undecided("; ".join(filter(None, unseen))) if any(unseen) else None
     return Symptom.warning(
         count=len(wrongs),
         detail="; ".join(one.summary for one in wrongs),
@@ -467,24 +481,9 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     )
 
 
-def _calibration(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str]:
-    """Return what the self-calibration, or with odometry else the turn, finds wrong, and what would not be found."""
-    sequence, kind, found = evidence.sequence, evidence.sequence.motion_kind, evidence.self_calibration
-    if kind == "twist":
-        found = self_calibration(sequence, evidence.camera_motion, intervals)
-    fitted = [] if found is None else wrong(found, sequence.rig, kind)
-    unseen = f"the intrinsics: {_unfitted(kind)}" if found is None else hidden(found, kind)
-    if found is not None and kind == "imu":
-        return fitted, "; ".join(filter(None, (doubtful(found, sequence.rig, kind), unseen)))
-    turned, unturned = _by_turn(evidence, intervals)
-    return fitted or turned, "; ".join(filter(None, (unturned, unseen)))
-
-
-def _by_turn(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str]:
-    """Judge the rotation of the camera by the motion from frame to frame, which does not determine the intrinsics."""
-    rig, kind, by_velocities = evidence.sequence.rig, evidence.sequence.motion_kind, evidence.velocity_fit
-    turn = turn_by_rotations(intervals) if by_velocities is None else by_velocities.turn
-    least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
+def _by_turn(turn: Turn, rig: StereoRig) -> tuple[list[Wrong], str]:
+    """Judge the rotation of the camera by odometry's velocities, and say what would not be found."""
+    least_rad = SYSTEMATIC_RAD + turn.by_chance_rad
     least = float(least_rad.min())
     if (np.abs(turn.rad) > least_rad).any():
         angle, error = turn.angle
@@ -496,22 +495,14 @@ def _by_turn(evidence: Evidence, intervals: Intervals) -> tuple[list[Wrong], str
     if least < LARGEST_RAD:
         return [], ""
     unseen = f"a rotation of it by less than {least:.2f} rad" if np.isfinite(least) else "any rotation of it"
-    cause = "too little change of rotation"
-    if kind == "twist":
-        cause = "wheel slip that lasts for seconds is as large"
-    return [], f"the camera's orientation: {unseen} would not show, for {cause}"
-
-
-def _is_off(ratio: Scalar, systematic: float) -> bool:
-    return abs(ratio.value - 1.0) > RATIO_SIGMAS * ratio.error + systematic
+    return [], f"the camera's orientation: {unseen} would not show, for wheel slip that lasts for seconds is as large"
 
 
 # Limit of the scale beyond chance (0.044 +- 0.007 in cars), and the largest standard error with which it is judged.
 SYSTEMATIC_SCALE, LARGEST_SCALE_ERROR = {"twist": 0.03, "imu": 0.025}, 0.02
-# Where only a larger error would be found, the finding is undecided; with an IMU that is about a stereo system's drift.
-LARGEST_HIDDEN_SCALE = {"twist": 0.08, "imu": 0.01}
-# Where chance is more than this share, below `steady_difference`, it is undecided: 2 % make errors six times as large.
-LARGEST_CHANCE = 0.02
+# From this size on, what would not be found is undecided: 2 % beside odometry make errors of estimators six times as
+# large; with an IMU it is about a stereo system's drift.
+LARGEST_HIDDEN_SCALE = {"twist": 0.02, "imu": 0.01}
 
 
 @beside_camera
@@ -527,23 +518,16 @@ def vision_scale(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
 
 def _scale_beside_odometry(found: VelocityFit) -> Symptom | Undecided | None:
     scale, error = found.scale
-    least = SYSTEMATIC_SCALE["twist"] + found.scale_by_chance
-    if error > LARGEST_SCALE_ERROR:
-        known = f"known to {100.0 * error:.0f} %, a fault of less than {100.0 * least:.0f} % would not show"
-        return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
-    if abs(scale) >= least:
+    if error <= LARGEST_SCALE_ERROR and abs(scale) >= SYSTEMATIC_SCALE["twist"] + found.scale_by_chance:
         cause = (
             "disparities, baseline or focal length are wrong, or wheels: check K, the baseline and the samples' unit"
         )
         is_scale = 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO  # else reported as a disagreement
         return Symptom.warning(_steps(found.scale, "odometry"), cause) if is_scale else None
+    hidden = found.scale_by_chance + abs(scale)
     off = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
-    hidden, by_chance = least + abs(scale), found.scale_by_chance + abs(scale)
-    if hidden >= LARGEST_HIDDEN_SCALE["twist"]:
-        sound = f"as in recordings without faults: a fault of less than {100.0 * hidden:.0f} % would not show"
-        return Undecided(f"{off}, {sound}")
-    within = f"within chance: a scale that is off by less than {100.0 * by_chance:.1f} % would not show"
-    return None if by_chance < LARGEST_CHANCE else Undecided(f"{off}, {within}")
+    unseen = f"{off}: less than {100.0 * hidden:.1f} % would not show beside what slip causes"
+    return None if hidden < LARGEST_HIDDEN_SCALE["twist"] else Undecided(unseen)
 
 
 def _scale_beside_imu(found: SelfCalibration | None) -> Symptom | Undecided | None:
@@ -580,7 +564,7 @@ def steady_difference(evidence: Evidence) -> Symptom | None:
     least, least_rad = (0.0, 0.0) if independent else (SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD)
     if found.scale.error <= LARGEST_SCALE_ERROR and least < beyond < SYSTEMATIC_SCALE["twist"]:
         differences.append(_steps(found.scale, "odometry"))
-    if least_rad < beyond_rad < SYSTEMATIC_RAD["twist"]:
+    if least_rad < beyond_rad < SYSTEMATIC_RAD:
         off = f"the camera moves at an angle of {angle:.3f} +- {error:.3f} rad to the velocities"
         equivalent = f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"
         differences.append(f"{off}, equivalent to {equivalent}")

@@ -19,9 +19,9 @@ LEAST_STRETCHES = 2
 LEVEL = 1e-3
 # How long slip lasts (s); chosen with the parts of the recordings at hand in view.
 SLIP_S = 1.5
-# Factors by which errors that last for seconds increase the scatter of estimates, and their weight in stretches: 248
-# parts of ten drives have 2.0 (median) and 4.6 (90 % quantile), 258 parts with an IMU 1.0 and 1.3.
-INFLATION, INFLATION_STRETCHES = {"twist": 3.0, "imu": 1.5}, 8.0
+# Factor by which errors of odometry that last for seconds increase the scatter of estimates (2.0 in the median of 248
+# parts of ten drives, 4.6 in a tenth), and its weight in stretches.
+INFLATION, INFLATION_STRETCHES = 3.0, 8.0
 # Accuracy of the camera's own rate of rotation (rad/s) and velocity (m/s) over one interval.
 LEAST_SPREAD_W = 0.003
 LEAST_SPREAD_V = 0.05
@@ -102,19 +102,19 @@ def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
     return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * level)) if stretches > LEAST_STRETCHES else np.inf
 
 
-def chance_bound(error: Array, formal: Array, stretches: float, usual: float) -> Array:
+def chance_bound(error: Array, formal: Array, stretches: float) -> Array:
     """Return the bounds (m,) that estimates exceed by chance less often than ``LEVEL``.
 
     ``error`` (m,) is the standard error of a jackknife over stretches of the recording, and ``formal`` (m,) that if
     errors of intervals were independent. A few stretches determine their own scatter badly. Therefore a second bound is
-    computed, in which the inflation of the formal error is pooled with the ``usual`` inflation, and the smaller bound
+    computed, in which the inflation of the formal error is pooled with the usual one, and the smaller bound
     is returned. Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
     microarray experiments" (2004), section 3.
     """
     own_dof = max(stretches - 1.0, 0.0)
     inflation = np.maximum(error / np.maximum(formal, 1e-12), 1.0)
     dof = INFLATION_STRETCHES + own_dof
-    pooled = formal * np.sqrt((INFLATION_STRETCHES * usual**2 + own_dof * inflation**2) / dof)
+    pooled = formal * np.sqrt((INFLATION_STRETCHES * INFLATION**2 + own_dof * inflation**2) / dof)
     by_own = chance_sigmas(stretches) * np.maximum(error, formal)
     return np.asarray(np.minimum(float(stdtrit(dof, 1.0 - 0.5 * LEVEL)) * pooled, by_own))
 
