@@ -38,8 +38,7 @@ from toolkit.progress import SILENT, silent
 from toolkit.report.gate import gate_text
 from toolkit.report.verify_text import verification_text
 from toolkit.runner import run
-from toolkit.verify.promises import subject_of
-from toolkit.verify.verification import verify
+from toolkit.verify import subject_of, verify
 
 # %matplotlib inline
 

@@ -15,7 +15,7 @@ from toolkit.geometry import Array, se3, so3_exp
 from toolkit.measurements import TwistMotion, is_left_only
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
-from toolkit.verify.verification import short
+from toolkit.verify import short
 
 
 def T_imu_cam(sequence: Sequence) -> Array:

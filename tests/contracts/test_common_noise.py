@@ -17,7 +17,7 @@ from toolkit.registry import find, ladder
 from toolkit.sequence import Sequence
 from toolkit.settings import POLICIES, PolicyName, Settings
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-from toolkit.verify.verification import short
+from toolkit.verify import short
 
 RECORDINGS = {"drive": short(DRIVE, 2.0), "flight": short(FLIGHT, 1.0)}
 WEIGHT = 0.25

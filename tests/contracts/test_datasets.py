@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.datasets import built_in_names, load_sequence
 from toolkit.sequence import Sequence
-from toolkit.verify.promises import arrays_of
+from toolkit.verify import arrays_of
 
 PROJECT = Path(__file__).parents[2]
 DATA = PROJECT / os.environ.get("VISLAM_DATA", "../shared/data")

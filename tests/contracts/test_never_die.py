@@ -21,7 +21,7 @@ from toolkit.simulation import FLIGHT, Scenario, simulate
 from toolkit.simulation.scenes import Scene, room
 from toolkit.simulation.sensors import Odometer
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
-from toolkit.verify.promises import gave_up
+from toolkit.verify import gave_up
 
 HALT_AT_S, HALT_S, MOVING_S, RATE_HZ = 4.0, 30.0, 10.0, 3.0
 KNOT_S, MARGIN = 0.2, 4

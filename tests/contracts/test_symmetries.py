@@ -20,7 +20,7 @@ from toolkit.metrics import score_run
 from toolkit.registry import discover, find
 from toolkit.sequence import Observations, Sequence, is_held_out
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
-from toolkit.verify.verification import short
+from toolkit.verify import short
 
 SCENARIOS = {"drive": short(DRIVE, 1.5), "drive-imu": short(DRIVE_IMU, 1.5), "flight": short(FLIGHT, 1.0)}
 SEED = 4

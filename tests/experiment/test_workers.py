@@ -21,7 +21,7 @@ from toolkit.experiment.units import Outcome, Scored, run_unit
 from toolkit.experiment.workers import LostUnit, WorkerProcess, results_of
 from toolkit.metrics import cost
 from toolkit.progress import SILENT, Progress
-from toolkit.verify.promises import arrays_of
+from toolkit.verify import arrays_of
 
 Jobs = Callable[..., list[Any]]
 

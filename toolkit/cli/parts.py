@@ -136,15 +136,14 @@ def verify(options: argparse.Namespace) -> int:
     from toolkit.cli.progress_display import of_this_process
     from toolkit.files.documents import to_text
     from toolkit.report.text import width_of_output
-    from toolkit.report.verify_text import verification_document, verification_text
-    from toolkit.verify.promises import subject_of
-    from toolkit.verify.verification import verify
+    from toolkit.report.verify_text import verification_text
+    from toolkit.verify import subject_of, verify
 
     subject = subject_of(options.estimator)
     with of_this_process()(f"{subject.name}: promises") as progress:
         found = verify(subject, options.estimator, progress)
     if options.json:
-        print(to_text(verification_document(found)), end="")
+        print(to_text(found), end="")
     elif not options.quiet:
         print(verification_text(found, width_of_output()))
     return 0 if found.passed else 1

@@ -25,7 +25,7 @@ from toolkit.report.manifest import Manifest, read_manifest
 from toolkit.report.report_json import Report, SeedsReport, read_report, read_seeds_report
 from toolkit.report.scores import MetricsDocument, Seeds, read_metrics, read_seeds
 from toolkit.report.sweep import SweepRecord, read_sweep
-from toolkit.report.verify_text import VerificationRecord
+from toolkit.verify import VerificationRecord
 
 __all__ = [
     "RECORDS",
