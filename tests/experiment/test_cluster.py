@@ -3,7 +3,6 @@
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -36,11 +35,7 @@ def local() -> Iterator[Any]:
 
 
 def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local, units):
-    requested = [
-        # A short recording is quickly simulated.
-        replace(unit, recording=replace(unit.recording, duration_s=3.0))
-        for unit in units((0, 1, 2), ("dead-reckoning", "ekf"))
-    ]
+    requested = units()
     found: dict[int, Outcome] = {}
     with Cluster(local.scheduler_address) as cluster:
         assert cluster.count == 2

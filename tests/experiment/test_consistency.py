@@ -31,15 +31,14 @@ def make_evaluation() -> Callable[..., Evaluation]:
     return make
 
 
-def run_of(nees: float | None = None, nis: float | None = None, nis_dof: float | None = None) -> Scored:
-    return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis}), NOTHING, NOTHING, nis_dof)
+def run_of(nees: float | None = None, nis: float | None = None, dof: float | None = None) -> Scored:
+    return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis}), NOTHING, NOTHING, dof)
 
 
-def leaning(trend: float, limit: float, **values: float) -> Scored:
-    """Return a run whose corrections have a trend, and its limit."""
-    return Scored(
-        Scores({"correction_trend": trend, "correction_trend_limit": limit, **values}), NOTHING, NOTHING, 900.0
-    )
+def leaning(trend: float, **values: float) -> Scored:
+    """Return a run whose corrections have a trend, with a limit of 4."""
+    scores = Scores({"correction_trend": trend, "correction_trend_limit": 4.0, **values})
+    return Scored(scores, NOTHING, NOTHING, 900.0)
 
 
 def verdict(*runs: Scored) -> str | None:
@@ -47,43 +46,37 @@ def verdict(*runs: Scored) -> str | None:
     return None if found is None else found.verdict
 
 
-@pytest.mark.parametrize(
-    ("nees", "expected"),
-    [(0.19, "timid"), (0.22, "consistent"), (1.0, "consistent"), (2.3, "consistent"), (2.5, "overconfident")],
-)
-def test_one_run_is_checked_by_the_band_of_one_pose(nees, expected):
-    """A textbook's quantiles of six degrees of freedom, 1.237 and 14.449, over 6: 0.206 and 2.408."""
-    assert verdict(run_of(nees)) == expected
+VERDICTS = [
+    # A textbook's quantiles of six degrees of freedom, 1.237 and 14.449, over 6: 0.206 and 2.408.
+    *(([run_of(nees)], "consistent") for nees in (0.22, 1.0, 2.3)),
+    ([run_of(0.19)], "timid"),
+    ([run_of(2.5)], "overconfident"),
+    # Many seeds see what one cannot.
+    ([run_of(1.5)] * 20, "overconfident"),
+    ([run_of(0.6)] * 20, "timid"),
+    ([run_of(1.1)] * 20, "consistent"),
+    # The errors decide where there are any, and else the innovations.
+    ([run_of(nees=1.0, nis=1.5, dof=900.0)], "consistent"),
+    ([run_of(nis=1.5, dof=900.0)], "overconfident"),
+    ([run_of(nis=0.8, dof=900.0)], "timid"),
+    ([run_of(nis=1.05, dof=900.0)], "consistent"),
+    ([run_of(nis=1.5, dof=6.0)], "consistent"),
+    ([run_of()], None),
+    # Corrections that lean one way are reported, unless errors tell of too much certainty; over seeds by their mean.
+    ([leaning(5.1)], "contradicted"),
+    ([leaning(5.1, nees_pose_mean=1.0)], "contradicted"),
+    ([leaning(5.1, nis_mean=0.5)], "contradicted"),
+    ([leaning(5.1, nees_pose_mean=3.0)], "overconfident"),
+    ([leaning(3.9, nis_mean=0.5)], "timid"),
+    ([leaning(3.9)], None),
+    ([leaning(5.0), leaning(2.0)], None),
+    ([leaning(7.0), leaning(2.0)], "contradicted"),
+]
 
 
-def test_many_seeds_see_what_one_cannot():
-    assert verdict(run_of(1.5)) == "consistent"
-    assert verdict(*[run_of(1.5)] * 20) == "overconfident"
-    assert verdict(*[run_of(0.6)] * 20) == "timid"
-    assert verdict(*[run_of(1.1)] * 20) == "consistent"
-
-
-def test_the_errors_decide_where_there_are_any_and_else_the_innovations():
-    assert verdict(run_of(nees=1.0, nis=1.5, nis_dof=900.0)) == "consistent"
-    assert verdict(run_of(nis=1.5, nis_dof=900.0)) == "overconfident"
-    assert verdict(run_of(nis=0.8, nis_dof=900.0)) == "timid"
-    assert verdict(run_of(nis=1.05, nis_dof=900.0)) == "consistent"
-    assert verdict(run_of(nis=1.5, nis_dof=6.0)) == "consistent"
-    assert verdict(run_of()) is None
-
-
-def test_corrections_that_lean_one_way_are_reported_unless_errors_tell_of_too_much_certainty():
-    assert verdict(leaning(5.1, 4.0)) == "contradicted"
-    assert verdict(leaning(5.1, 4.0, nees_pose_mean=1.0)) == "contradicted"
-    assert verdict(leaning(5.1, 4.0, nis_mean=0.5)) == "contradicted"
-    assert verdict(leaning(5.1, 4.0, nees_pose_mean=3.0)) == "overconfident"
-    assert verdict(leaning(3.9, 4.0, nis_mean=0.5)) == "timid"
-    assert verdict(leaning(3.9, 4.0)) is None
-
-
-def test_over_seeds_the_mean_trend_is_held_against_the_mean_limit():
-    assert verdict(leaning(5.0, 4.0), leaning(2.0, 4.0)) is None
-    assert verdict(leaning(7.0, 4.0), leaning(2.0, 4.0)) == "contradicted"
+@pytest.mark.parametrize(("runs", "expected"), VERDICTS)
+def test_who_is_marked_and_as_what(runs, expected):
+    assert verdict(*runs) == expected
 
 
 @pytest.mark.parametrize("alike", [1, 10, 100])

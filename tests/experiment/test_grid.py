@@ -47,10 +47,6 @@ def test_faults_are_planted_in_the_part_that_is_run_and_pairs_are_drawn_alike(pl
     assert 3 <= prepare(recording).sequence.frame_count < 12
 
 
-def test_a_fault_at_its_clean_dose_is_none():
-    assert Trial.of("ekf", faults={"dropped_frames": 0.0, "wrong_noise": 1.0}) == Trial("ekf")
-
-
 def test_what_one_grid_kept_another_finds_to_the_bit(plan, tmp_path, monkeypatch):
     """What a kill leaves is found by the tests of the outcome store and of the command."""
     (fresh, _) = run_grid(plan, [LOST, CLEAN], tmp_path).outcomes.values()
@@ -82,27 +78,17 @@ def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan):
 @pytest.mark.parametrize(
     ("trial", "error", "what"),
     [
-        (lambda: Trial.of("dead-reckoning", faults={"fog": 1.0}), SettingsError, "fault"),
-        (lambda: Trial.of("dead-reckoning", {"window.lag": 1.0}), SettingsError, "window.lag"),
-        (
-            lambda: Trial.of("dead-reckoning", {"estimators.dead-reckoning.fast": 1}),
-            EstimatorError,
-            "no option fast",
-        ),
+        (lambda: Trial.of("ekf", faults={"fog": 1.0}), SettingsError, "fault"),
+        (lambda: Trial.of("ekf", {"window.lag": 1.0}), SettingsError, "window.lag"),
+        (lambda: Trial.of("ekf", {"estimators.ekf.fast": 1}), EstimatorError, "no option fast"),
         (lambda: Trial("no-such"), EstimatorError, "no-such"),
+        (lambda: Trial.of("ekf", faults={"standstill": 1.0}), DataError, "can be planted between twists only"),
     ],
 )
 def test_what_cannot_be_run_is_told_before_anything_runs(plan, trial, error, what, monkeypatch):
     monkeypatch.setattr(pipeline, "run_unit", lambda *_: pytest.fail("a unit was run"))
     with pytest.raises(error, match=what):
-        run_grid(plan, [CLEAN, trial()])
-
-
-def test_a_fault_that_a_recording_cannot_have_is_told_before_anything_runs(monkeypatch):
-    monkeypatch.setattr(pipeline, "run_unit", lambda *_: pytest.fail("a unit was run"))
-    flight = Plan(("flight",), ("dead-reckoning",), max_frames=10, workers=1)
-    with pytest.raises(DataError, match="a standstill can be planted between twists only"):
-        run_grid(flight, [Trial.of("dead-reckoning", faults={"standstill": 1.0})])
+        run_grid(replace(plan, sources=("flight" if error is DataError else "drive",)), [CLEAN, trial()])
 
 
 def test_stretches_of_two_runs_that_lack_frames_are_of_the_same_times():

@@ -13,8 +13,7 @@ from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measurements import MotionNoise
 from toolkit.sequence import Observations, Sequence
-from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse
-from toolkit.settings.reading import settings_of
+from toolkit.settings import Noise, SettingsError, TrackUse
 from toolkit.simulation import SCENARIOS, faults, simulate
 
 FOUND = Finding("time-gap", 1, repaired=False, detail="a gap", blocking=False)
@@ -43,6 +42,16 @@ def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results():
         assert ("none of it is in the part that is run" in conflict.detail) is not concerned
 
 
+def test_a_factor_scales_white_noise_and_no_random_walk():
+    for source, densities in (
+        ("drive", ("velocity_noise_density", "gyro_noise_density")),
+        ("drive-imu", ("gyro_noise_density", "accel_noise_density")),
+    ):
+        before, (_, after) = load_sequence(source).noise, messages(source, motion_scale=3.0)
+        for name, value in vars(before).items():
+            np.testing.assert_array_equal(getattr(after, name), (3.0 if name in densities else 1.0) * value)
+
+
 def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion():
     recorded = load_sequence("drive").rig.cov_uv_px2
     cov_uv_px2, _ = messages("drive", pixel_sigma_px=0.7)
@@ -57,25 +66,6 @@ def test_a_pixel_sigma_that_the_tracks_refute_is_reported():
         reported = {finding.fault: finding.detail for finding in prepare(requested).findings if finding.warning}
         assert set(reported) == ({"track-scatter"} if expected else set())
         assert expected is None or expected in reported["track-scatter"]
-
-
-def test_a_factor_on_twists_scales_both_densities():
-    before, (_, after) = load_sequence("drive").noise, messages("drive", motion_scale=3.0)
-    np.testing.assert_array_equal(after.velocity_noise_density, 3.0 * before.velocity_noise_density)
-    np.testing.assert_array_equal(after.gyro_noise_density, 3.0 * before.gyro_noise_density)
-
-
-def test_a_factor_on_an_imu_leaves_its_random_walks():
-    before, (_, after) = load_sequence("drive-imu").noise, messages("drive-imu", motion_scale=3.0)
-    densities = ("gyro_noise_density", "accel_noise_density")
-    assert after == replace(before, **{name: 3.0 * getattr(before, name) for name in densities})
-
-
-def test_a_start_from_the_truth_is_the_truth_and_says_so():
-    from_truth = prepare(Recording(load_sequence("drive").truncated(20), start="truth"))
-    np.testing.assert_allclose(from_truth.prior.T_world_imu, from_truth.sequence.truth.T_world_imu[0], atol=1e-12)
-    assert "truth" in from_truth.prior.source
-    assert prepare(Recording(load_sequence("drive").truncated(20))).prior.source != from_truth.prior.source
 
 
 def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept():
@@ -172,28 +162,6 @@ def test_a_budget_of_tracks_is_kept_and_reported():
     assert prepared.whole.track_budget is None
 
 
-def test_a_plan_reads_its_recordings_by_the_settings():
-    given = {
-        "first_seed": 5,
-        "seeds": 3,
-        "start": "truth",
-        "noise": {"pixel_sigma_px": 0.7},
-        "tracks": {"budget": 50},
-    }
-    plan = Plan(("drive",), ("ekf",), settings=settings_of(given, "here"), max_frames=9, keep=frozenset({"time-gap"}))
-    assert plan.seeds == (5, 6, 7)
-    assert plan.recording("drive", 6) == Recording(
-        "drive",
-        6,
-        keep=frozenset({"time-gap"}),
-        start="truth",
-        max_frames=9,
-        noise=Noise(pixel_sigma_px=0.7),
-        tracks=TrackUse(budget=50),
-    )
-    assert Plan(("drive",), ("ekf",)).seeds == (DEFAULTS.first_seed,)
-
-
 def test_a_world_is_drawn_of_simulations_alone():
     fixed, drawn = (prepare(Recording("drive", duration_s=1.0, vary=vary)).sequence for vary in ("noise", "world"))
     assert np.abs(fixed.truth.T_world_imu - drawn.truth.T_world_imu).max() > 0.01
@@ -211,8 +179,3 @@ def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run
     assert "tracks are numbered anew" in prepared.provenance.facts[-1]
     compared = run(Plan((named,), ("batch", "fixed-lag", "isam2"), workers=1))[0]
     assert [one.status for one in compared.runs] == ["ok"] * 3
-
-
-def test_tracks_with_ids_that_a_graph_can_have_keep_them():
-    short = load_sequence("drive").truncated(3)
-    assert prepare(Recording(short)).sequence.observations is short.observations

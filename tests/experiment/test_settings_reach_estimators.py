@@ -1,19 +1,17 @@
 """Settings arrive at the estimator they are for, and one that nobody reads is refused before anything runs."""
 
-from collections.abc import Iterator
+import re
 from pathlib import Path
 
 import pytest
 
-from toolkit import discovery, runner
+from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.experiment.pipeline import Plan, prepared_cases, run
 from toolkit.experiment.workers import Workers
-from toolkit.registry import ENTRY_POINT_GROUP, find
 from toolkit.settings.reading import settings_of
 
-_ESTIMATOR = '''
-"""Stands still, and says in its log what it was set to."""
+ESTIMATOR = '''"""Stands still, and says in its log what it was set to."""
 from toolkit.estimate import Finished, Landmarks, Trajectory, Estimate
 
 OPTIONS = ("gain", "mode")
@@ -36,54 +34,33 @@ class Still:
 
 
 @pytest.fixture
-def tunable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Return the name of an installed estimator with options of its own."""
-    from importlib.metadata import EntryPoint
-
-    package = tmp_path / "estimators_with_options"
-    package.mkdir()
-    (package / "__init__.py").write_text('"""Somebody\'s."""\n')
-    (package / "tunable.py").write_text(_ESTIMATOR.lstrip())
-    (package / "plain.py").write_text(_ESTIMATOR.lstrip().replace("OPTIONS", "OTHERS"))
-    monkeypatch.syspath_prepend(str(tmp_path))
-    point = EntryPoint(package.name, package.name, ENTRY_POINT_GROUP)
-    monkeypatch.setattr(discovery, "entry_points", lambda group: [point] if group == ENTRY_POINT_GROUP else [])
-    yield "tunable"
-    import sys
-
-    for module in [m for m in sys.modules if m.partition(".")[0] == package.name]:
-        del sys.modules[module]
+def written(tmp_path: Path) -> tuple[str, str]:
+    """Return an estimator in a file of one's own that has options, and one that has none."""
+    for name, text in (("tunable", ESTIMATOR), ("plain", ESTIMATOR.replace("OPTIONS", "OTHERS"))):
+        (tmp_path / f"{name}.py").write_text(text)
+    return str(tmp_path / "tunable.py"), str(tmp_path / "plain.py")
 
 
-def plan(settings: dict[str, object], *estimators: str) -> Plan:
+def plan(settings: dict[str, object], estimators: tuple[str, ...]) -> Plan:
     return Plan(("drive",), estimators, settings=settings_of(settings, "here"), max_frames=3, workers=1)
 
 
-def test_an_estimator_is_given_its_options_and_the_common_settings(tunable):
-    given = {"window": {"lag_s": 3.5}, "estimators": {tunable: {"gain": 0.5, "mode": "fast"}, "plain": {}}}
-    (comparison,) = run(plan(given, tunable, "plain"))
+def test_an_estimator_is_given_its_options_and_the_common_settings(written):
+    given = {"window": {"lag_s": 3.5}, "estimators": {"tunable": {"gain": 0.5, "mode": "fast"}, "plain": {}}}
+    (comparison,) = run(plan(given, written))
     logs = {outcome.estimator: outcome.log[:2] for outcome in comparison.outcomes}
-    assert logs[tunable] == ("[('gain', 0.5), ('mode', 'fast')]", "lag 3.5")
-    assert logs["plain"] == ("[]", "lag 3.5")
-    assert comparison.settings.options_of(tunable) == {"gain": 0.5, "mode": "fast"}
+    assert logs == {"tunable": ("[('gain', 0.5), ('mode', 'fast')]", "lag 3.5"), "plain": ("[]", "lag 3.5")}
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         ({"tunable": {"gian": 1.0}}, "estimator tunable has no option gian; it has gain, mode"),
-        ({"plain": {"gain": 1.0}}, "estimator plain has no option gain; it has none; tunable has it"),
+        ({"plain": {"landmark_uncertainty": 1.0}}, "estimator plain has no option landmark_uncertainty; it has none; "),
+        ({"ekf": {"landmark_uncertainty": 3}}, "option landmark_uncertainty is 3; it takes true or false"),
     ],
 )
-def test_an_option_nobody_reads_is_refused_before_anything_runs(tunable, monkeypatch, options, expected):
+def test_an_option_nobody_reads_is_refused_before_anything_runs(written, monkeypatch, options, expected):
     monkeypatch.setattr(runner, "run", None)
-    with pytest.raises(EstimatorError, match=expected):
-        prepared_cases(plan({"estimators": options}, tunable, "plain"), Workers(1))
-
-
-def test_options_are_read_without_importing(tunable):
-    import sys
-
-    assert find(tunable).options() == {"gain": (), "mode": ()}
-    assert find("plain").options() == {}
-    assert "estimators_with_options.tunable" not in sys.modules
+    with pytest.raises(EstimatorError, match=re.escape(expected)):
+        prepared_cases(plan({"estimators": options}, (*written, "ekf")), Workers(1))

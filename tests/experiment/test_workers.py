@@ -1,24 +1,21 @@
 """Many processes give what one gives, and what goes wrong in one of them stays there."""
 
-import gc
 import os
-import signal
 import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from loky.backend.synchronize import SemLock
 
 from toolkit.errors import DataError
 from toolkit.experiment.units import Outcome, Scored, run_unit
-from toolkit.experiment.workers import LostUnit, WorkerProcess, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.metrics import cost
 from toolkit.progress import SILENT, Progress
 from toolkit.verify import arrays_of
@@ -263,38 +260,6 @@ def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_p
     """)
     ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines() == ["True", "True", "set()"]
-
-
-def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypatch):
-    shared: list[str] = []
-
-    def register(name: str, kind: str) -> None:
-        real.register(name, kind)
-        shared.append(name)
-        signal.raise_signal(signal.SIGTERM)
-
-    def unregister(name: str, kind: str) -> None:
-        real.unregister(name, kind)
-        shared.remove(name)
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    synchronize = sys.modules[SemLock.__module__]  # loky.backend's attribute of this name is another module
-    real = synchronize.resource_tracker
-    monkeypatch.setattr(synchronize, "resource_tracker", SimpleNamespace(register=register, unregister=unregister))
-    before = signal.signal(signal.SIGTERM, interrupt)
-    process = WorkerProcess()
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            process.submit(int)
-        assert shared
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        process.end()
-    del process
-    gc.collect()
-    assert not shared
 
 
 def test_no_process_outlives_one_that_is_killed(tmp_path, starts_group):

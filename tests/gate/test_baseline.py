@@ -28,21 +28,11 @@ def path(baseline, tmp_path):
 
 def test_a_baseline_is_read_back_to_the_bit(baseline, path):
     assert load_baseline(path) == baseline
-
-
-def test_a_baseline_is_readable(baseline, path):
-    text = path.read_text()
-    json.loads(text)
-    rows = [line for line in text.splitlines() if '"ate_se3_m": [' in line]
+    rows = [line for line in path.read_text().splitlines() if '"ate_se3_m": [' in line]
     assert len(rows) == 6  # an estimator and sequence a line, all of its seeds on it
     assert all(line.endswith(("]", "],")) for line in rows)
-
-
-def test_brackets_in_a_text_stay_as_they_are():
-    given = {"truth": "/data/[ old ]/truth.tum", "names": ["x [", "y ]"], "empty": [], "seeds": [1, 2]}
-    text = json_text(given)
-    assert json.loads(text) == given
-    assert '"seeds": [1, 2]' in text
+    given = {"truth": "/data/[ old ]/truth.tum", "names": ["x [", "y ]"], "empty": []}
+    assert json.loads(json_text(given)) == given  # brackets in a text are none of a list
 
 
 def test_not_a_number_is_never_written(baseline):
@@ -112,14 +102,10 @@ def test_a_folder_gives_the_baseline_of_the_releases_installed(baseline, path):
 SHIPPED = sorted((Path(__file__).parents[1] / "baselines").glob("*.json"))
 
 
-@pytest.mark.parametrize("shipped", SHIPPED, ids=lambda path: path.name)
+@pytest.mark.parametrize("shipped", SHIPPED or [None], ids=str)
 def test_a_shipped_baseline_is_usable_and_named_by_its_releases(shipped):
     baseline = load_baseline(shipped)
     gtsam, numpy = (baseline.releases[name] for name in ("gtsam", "numpy"))
     assert shipped.stem == f"gtsam-{gtsam}_numpy-{'.'.join(numpy.split('.')[:2])}"
     assert {*baseline.bounds.simulated, *baseline.bounds.recorded} <= set(describe())
     assert all(status == "ok" for _, m in baseline.cases for one in m.runs.values() for status in one.status)
-
-
-def test_a_baseline_is_shipped():
-    assert SHIPPED
