@@ -21,7 +21,6 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth import load_truth
 from toolkit.errors import DataError, VislamError
 from toolkit.estimator import Estimator, Setup
-from toolkit.experiment.pipeline import Plan
 from toolkit.metrics import describe
 from toolkit.registry import LADDER, defaults, find
 from toolkit.report.comparison_table import comparison_table
@@ -62,11 +61,6 @@ def ate(result: Result) -> list[float | None]:
     return [row.value("ate_se3_m") for row in result.comparison.rows]
 
 
-def test_a_sequence_and_its_name_give_the_same(result: Result) -> None:
-    again = toolkit.compare(load_sequence("drive"), ["dead-reckoning", "ekf"], max_frames=FRAMES, workers=1)
-    assert ate(again) == ate(result)
-
-
 @pytest.mark.usefixtures("unrendered")
 def test_a_result_is_saved_and_a_recording_and_its_truth_are_paths_or_strings(tmp_path: Path, result: Result) -> None:
     assert result.save(str(tmp_path / "run")) == tmp_path / "run"
@@ -76,22 +70,14 @@ def test_a_result_is_saved_and_a_recording_and_its_truth_are_paths_or_strings(tm
         assert compared.sequence.truth.t_ns.tolist() == load_truth(truth).truth.t_ns.tolist()
 
 
-def test_estimators_are_one_name_several_or_the_default_ones(result: Result) -> None:
-    for names in ("ekf", ["ekf"], iter(["ekf"])):
-        alone = toolkit.compare("drive", names, max_frames=FRAMES, workers=1)
+def test_estimators_are_one_name_several_or_the_default_ones_and_a_source_a_name_or_a_sequence(result: Result) -> None:
+    for source, names in (("drive", "ekf"), (load_sequence("drive"), iter(["ekf"]))):
+        alone = toolkit.compare(source, names, max_frames=FRAMES, workers=1)
         assert alone.comparison.estimators == ("ekf",)
         assert ate(alone) == ate(result)[2:]
     assert toolkit.compare("drive", max_frames=3, workers=1).comparison.estimators == defaults() != ()
     assert not result.comparison.changes
     assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
-
-
-def test_an_estimator_that_is_no_file_is_compared_under_its_own_name(result: Result) -> None:
-    own = {"mine": find("dead-reckoning").load()}
-    with_own = toolkit.compare("drive", "ekf", own=own, max_frames=FRAMES, workers=1)
-    assert list(with_own.runs) == ["ekf", "mine"]
-    assert with_own.metrics["mine", "final"]["ate_se3_m"] == result.metrics["dead-reckoning", "final"]["ate_se3_m"]
-    assert list(toolkit.compare("drive", own=own, max_frames=FRAMES, workers=1).runs) == ["mine"]
 
 
 def test_faults_that_are_kept_are_not_repaired() -> None:
@@ -112,20 +98,9 @@ def test_a_table_has_the_columns_requested_in_their_order_by_key_or_name(result:
     at = [heading[:2] for heading in whole.headings].index(("ATE", "SE(3)"))
     assert [row[-1] for row in chosen.rows] == [row[at] for row in whole.rows]
     assert len(result.table("all").table.headings) > len(whole.headings)
-
-
-def test_an_unknown_column_is_refused(result: Result) -> None:
-    with pytest.raises(VislamError, match=r"no metric is called ate_se3; did you mean ate_se3_m\?"):
-        result.table("ate_se3")
-    with pytest.raises(SettingsError, match="a column is an int; give names"):
-        result.table(3)  # type: ignore[arg-type]
-
-
-def test_mappings_of_a_result_are_looked_into_and_shown_like_any(result: Result) -> None:
-    assert ("batch", "final") not in result.metrics
-    assert result.metrics["ekf", "final"].get("ate_se3") is None
-    assert result.figures.get("top_batch") is None
-    assert repr(result.metrics["ekf", "final"]) == repr(dict(result.metrics["ekf", "final"]))
+    for shown in (result.table, result.to_latex):
+        with pytest.raises(SettingsError, match="a column is an int; give names"):
+            shown(3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -187,32 +162,14 @@ def test_records_are_a_row_of_every_value_and_those_of_a_filter_are_there_once(r
             assert by_key[0, line.estimator, line.label, key] == line.value(key)
 
 
-def test_a_frame_of_pandas_has_the_records(result: Result) -> None:
+def test_a_frame_of_pandas_has_the_records(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = result.to_pandas()
     assert list(frame.columns) == ["sequence", "seed", "estimator", "output", "metric", "value"]
     ate_m = frame[(frame.metric == "ate_se3_m") & (frame.estimator == "ekf")].value
     assert list(ate_m) == [result.metrics["ekf", "causal"]["ate_se3_m"]]
-
-
-def test_without_pandas_one_line_says_what_to_install(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     with pytest.raises(VislamError, match=r'pandas; pip install "vislam-toolkit\[pandas\]"$'):
         result.to_pandas()
-
-
-def test_a_table_for_a_paper_has_every_line_and_its_terms(result: Result) -> None:
-    text = result.to_latex("ate_se3_m")
-    assert text.startswith("% drive: ")
-    assert text.count(r"\\") == 1 + len(result.comparison.lines)
-    assert r"\bottomrule" in text
-    with pytest.raises(SettingsError, match="a column is an int"):
-        result.to_latex(3)  # type: ignore[arg-type]
-
-
-def test_seeds_are_repeated_from_the_first(over: Result) -> None:
-    assert over.comparison.seeds == (1, 2)
-    assert len(set(over.comparison.hashes)) == 2
-    assert over.runs == {}
 
 
 def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> None:
@@ -239,7 +196,7 @@ def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> No
 
 
 def test_settings_are_a_record_or_nested_values(result: Result) -> None:
-    given = {"noise": {"pixel_sigma_px": 0.5}, "first_seed": 1}
+    given = {"noise": {"pixel_sigma_px": np.float64(0.5)}, "first_seed": np.int64(1)}
     by_values = toolkit.compare("drive", "ekf", settings=given, max_frames=FRAMES, workers=1)
     by_record = toolkit.compare("drive", "ekf", settings=by_values.comparison.settings, max_frames=FRAMES, workers=1)
     assert ate(by_values) == ate(by_record) != ate(result)[2:]
@@ -266,7 +223,10 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"truth": "gt.tum", "seeds": 2}, "truth and seeds exclude each other"),
         ({"trajectories": "est.tum"}, "trajectories: expected object, got string"),
         ({"trajectories": {3: "est.tum"}}, "an int for a name, 3; give a text"),
-        ({"estimators": []}, "there is nothing to compare"),
+        ({"estimators": []}, "there is nothing to compare: name an estimator, or a trajectory"),
+        ({"estimators": "ekf,rts"}, r"give several names as a list: \['ekf', 'rts'\]"),
+        ({"estimators": {"my": print}}, r"functions build\(setup\) go by name into own"),
+        ({"resume": "kept"}, "there is one seed: give seeds"),
         ({"estimators": [3]}, r"estimators\[0\]: expected string, got integer"),
         ({"own": [find("ekf").load()]}, "own is a list; give a dict, by name"),
         ({"own": {"mine": 3}}, "own has 'mine': an int; give functions"),
@@ -284,13 +244,6 @@ def test_what_cannot_be_compared_is_refused_before_anything_runs(
     monkeypatch.setattr(toolkit.api, "run_plan", None)
     with pytest.raises(SettingsError, match=why):
         toolkit.compare(**{"source": "drive", "estimators": "ekf", **requested})
-
-
-def test_numbers_of_numpy_are_settings_like_any(monkeypatch: pytest.MonkeyPatch) -> None:
-    plans: list[Plan] = []
-    monkeypatch.setattr(toolkit.api, "run_plan", lambda plan, *_: plans.append(plan) or (None,))
-    toolkit.compare("drive", "ekf", seeds=np.int64(2), settings={"window": {"lag_s": np.float64(3.0)}})
-    assert (plans[0].settings.seeds, plans[0].settings.window.lag_s) == (2, 3.0)
 
 
 def _with(**columns: np.ndarray) -> Sequence:

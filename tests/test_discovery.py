@@ -12,9 +12,8 @@ import pytest
 from filters import dead_reckoning
 from toolkit import datasets, discovery, metrics, runner
 from toolkit.cli import main
-from toolkit.discovery import FoundModule
 from toolkit.errors import DataError, EstimatorError, ExtensionError, VislamError
-from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, EstimatorEntry, discover, find, find_all, ladder
+from toolkit.registry import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, simulate
 
@@ -85,29 +84,21 @@ def test_the_projects_own_estimators_are_found():
     assert all(entry.change() for entry in rungs)
 
 
-def test_a_new_file_is_a_new_estimator(write, tmp_path):
+def test_a_new_file_is_a_new_estimator_and_none_is_imported_to_find_it(write, announce, tmp_path):
     write("_helper.py", "")
     parts = tmp_path / "their_estimators" / "parts"  # folders and private files are parts, not estimators
     parts.mkdir()
     (parts / "__init__.py").write_text("")
     assert discover() == {}
     write("my_new_filter.py", "def build(setup):\n    return setup")
-    assert list(discover()) == ["my-new-filter"]
+    write("explosive.py", "raise RuntimeError('imported')")
+    announce(ENTRY_POINT_GROUP, {"ant.py": ""}, "their_others")
+    assert list(discover()) == ["ant", "explosive", "my-new-filter"]
+    assert find("explosive").summary() == "Stands still and says so."
+    assert "their_estimators.explosive" not in sys.modules
     entry = find("my-new-filter")
     assert entry.summary() == "Stands still and says so."
     assert entry.load()("a setup") == "a setup"
-
-
-def test_discovery_and_summaries_import_nothing(write):
-    write("explosive.py", "raise RuntimeError('imported')")
-    assert find("explosive").summary() == "Stands still and says so."
-    assert "their_estimators.explosive" not in sys.modules
-
-
-def test_several_packages_are_found_together(announce):
-    announce(ENTRY_POINT_GROUP, {"zebra.py": "build = print"})
-    announce(ENTRY_POINT_GROUP, {"ant.py": ""}, "their_others")
-    assert list(discover()) == ["ant", "zebra"]
 
 
 def test_a_missing_optional_dependency_makes_one_estimator_unavailable(write):
@@ -137,21 +128,6 @@ def test_a_typo_still_fails(write, body, error):
     write("typo.py", body)
     with pytest.raises(error):
         find("typo").load()
-
-
-def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(write):
-    write("aaa.py", 'RUNG, CHANGE = 20, "+ the future"')
-    write("bbb.py", 'RUNG: int = 10\nCHANGE = "the past"')
-    write("ccc.py", "raise RuntimeError('imported')")
-    assert [(entry.name, entry.rung(), entry.change()) for entry in ladder()] == [
-        ("bbb", 10, "the past"),
-        ("aaa", 20, "+ the future"),
-    ]
-    assert find("ccc").rung() is None
-    assert find("ccc").change() == ""
-    assert list(find_all(["ccc", LADDER, "aaa"])) == ["ccc", "bbb", "aaa"]
-    with pytest.raises(EstimatorError, match="no estimator is called ddd"):
-        find_all([LADDER, "ddd"])
 
 
 def test_a_module_says_which_common_rules_it_treats_otherwise(write):
@@ -190,22 +166,20 @@ def test_an_entry_point_to_nowhere_is_reported(monkeypatch):
     [
         ('RUNG, CHANGE = 30, "+ more"', 30, "+ more"),
         ('RUNG = 30\nCHANGE: str = "+ more"', 30, "+ more"),
-        ("RUNG: int = 7", 7, ""),
         ('"""RUNG = 3"""\nother = 4', None, ""),
-        ("import no_such_package\nRUNG = 1\nRUNG = 2", 2, ""),
+        ("import no_such_package\nRUNG = 1\nRUNG: int = 2", 2, ""),
         ('RUNG = "high"\ndef f():\n    CHANGE = "x"', None, ""),
     ],
 )
-def test_a_rung_is_read_without_importing(tmp_path: Path, source: str, rung: int | None, change: str) -> None:
-    path = tmp_path / "one.py"
-    path.write_text(source)
-    entry = EstimatorEntry("one", FoundModule("nowhere.one", path))
-    assert (entry.rung(), entry.change()) == (rung, change)
-
-
-def test_a_metric_of_another_package_is_known(announce: Announce) -> None:
-    announce(metrics.ENTRY_POINT_GROUP, {"answers.py": METRIC, "_part.py": "raise RuntimeError"})
-    assert list(metrics.describe())[-1] == "answer"
+def test_the_ladder_is_every_estimator_with_a_rung_read_without_importing(write, source, rung, change) -> None:
+    write("lowest.py", "RUNG = 1")
+    write("one.py", source)
+    assert (find("one").rung(), find("one").change()) == (rung, change)
+    rungs = ["lowest"] + ["one"] * (rung is not None)
+    assert list(find_all([LADDER, "lowest"])) == rungs
+    assert [entry.name for entry in ladder()] == rungs
+    with pytest.raises(EstimatorError, match="no estimator is called ddd"):
+        find_all([LADDER, "ddd"])
 
 
 def test_a_dataset_of_another_package_is_read(announce: Announce, tmp_path: Path) -> None:
@@ -223,16 +197,12 @@ def test_a_missing_dependency_makes_one_file_unavailable(announce: Announce, tmp
     announce(datasets.ENTRY_POINT_GROUP, {"needy.py": "import a_package_nobody_has\n"})
     lacking = {"needy": "it needs the package a_package_nobody_has"}
     assert metrics.unavailable() == datasets.unavailable() == lacking
-    assert "answer" in metrics.describe()
+    assert list(metrics.describe())[-1] == "answer"
+    with pytest.raises(VislamError, match="needy is unavailable: it needs the package a_package_nobody_has"):
+        metrics.metrics_called(["needy"])
     (tmp_path / "recording").write_text("of nobody")
     with pytest.raises(DataError, match=r"no known format.*; needy is unavailable: it needs the package a_package_nob"):
         datasets.load_sequence(str(tmp_path / "recording"))
-
-
-def test_a_metric_that_is_unavailable_is_named_where_it_is_requested(announce: Announce) -> None:
-    announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
-    with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
-        metrics.metrics_called(["answer"])
 
 
 @pytest.mark.parametrize(
@@ -302,27 +272,6 @@ def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp
     (tmp_path / "some.file").write_text("theirs")
     with pytest.raises(ExtensionError, match=r"theirs\.py returned a str; it must return a Sequence"):
         datasets.load_sequence(str(tmp_path / "some.file"))
-
-
-def test_a_defect_of_another_package_is_not_blamed_on_vislam(
-    announce: Announce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    broken = DATASET.replace("    from dataclasses", "    1 / 0\n    from dataclasses")
-    announce("toolkit.datasets", {"theirs.py": broken})
-    (tmp_path / "some.file").write_text("theirs")
-    assert main(["check-data", str(tmp_path / "some.file")]) == 70
-    message = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"a defect of \S+theirs\.py, line 9, which another package brings \(ZeroDivisionError", message)
-    assert "vislam itself" not in message
-
-
-def test_a_defect_that_comes_back_from_another_process_keeps_its_place(announce: Announce, tmp_path: Path) -> None:
-    announce("toolkit.datasets", {"theirs.py": DATASET})
-    file = tmp_path / "their_datasets" / "theirs.py"
-    error = ValueError("boom")
-    error.__cause__ = RuntimeError(f'\n"""\nTraceback (most recent call last):\n  File "{file}", line 7, in load\n"""')
-    assert discovery.line_of_another_package(error) == f"{file}, line 7"
-    assert discovery.line_of_another_package(ValueError("boom")) == ""
 
 
 @pytest.mark.parametrize(

@@ -67,18 +67,14 @@ TURN = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
 @every_scenario
 @pytest.mark.parametrize("jump", [JUMP_M, TURN], ids=["position", "heading"])
-def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction(scenario, jump, run_on):
+def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction_and_a_few_are_not(scenario, jump, run_on):
     sequence = recording(scenario)
     spoiled = jumping(run_on("ekf", scenario).causal, 0.2, jump)
     reason = contradiction(spoiled, sequence)
     assert "contradict the measured motion" in reason
     assert int(reason.split()[0]) > 15 and f"at most {100 * MOST_FAR_STEPS:.0f} %" in reason
-
-
-@every_scenario
-def test_a_few_jumps_are_not(scenario, run_on):
-    sequence = recording(scenario)
-    assert contradiction(jumping(run_on("ekf", scenario).causal, 0.02, JUMP_M), sequence) is None
+    few = jumping(run_on("ekf", scenario).causal, 0.02, jump)
+    assert contradiction(few, sequence) is None
 
 
 @every_scenario
@@ -89,19 +85,6 @@ def test_a_single_leap_beyond_what_the_measured_motion_goes_is_a_contradiction(s
     poses[-5:, 1, 3] += leap_m
     reason = contradiction(replace(causal, T_world_imu=poses), recording(scenario))
     assert ("farther away than the Moon" if leap_m > 1e9 else "and the measured motion covers") in reason
-
-
-def test_a_vehicle_that_stands_far_from_the_world_is_a_contradiction():
-    """Nothing moves: each of its steps is the measured one."""
-    sequence = recording("drive")
-    values = sequence.motion.values.copy()
-    values[:, :3] = 0.0
-    standing = replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
-    pose = sequence.truth.T_world_imu[:1].copy()
-    pose[:, :3, 3] = 1e20
-    poses = np.repeat(pose, len(sequence.truth.t_ns), axis=0)
-    reason = contradiction(Trajectory(sequence.truth.t_ns, poses), standing)
-    assert reason == "its position is farther away than the Moon from estimate 0 on"
 
 
 @pytest.mark.parametrize(("ways", "is_one"), [(1.9, False), (2.1, True)])
@@ -159,6 +142,7 @@ def gated(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, 
     ],
 )
 def test_a_filter_that_rejects_nearly_all_measurements_has_diverged(share, in_the_end, reason):
+    assert gate_collapse(gated(0.0, 0.0, tested=1)) is gate_collapse({}) is None  # a few rejections are no sign
     found = gate_collapse(gated(share, in_the_end))
     assert found is None if reason is None else found.startswith(reason)
 
@@ -184,8 +168,3 @@ def test_a_filter_of_tracks_with_outliers_that_is_millimetres_off_has_not_diverg
     assert gate_collapse(run.info) is None
     off_m = run.causal.T_world_imu[:, :3, 3] - sequence.truth.T_world_imu[:, :3, 3]
     assert np.abs(off_m).max() < 0.05
-
-
-def test_a_few_rejections_are_no_sign():
-    assert gate_collapse(gated(0.0, 0.0, tested=1)) is None
-    assert gate_collapse({}) is None

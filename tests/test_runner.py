@@ -66,22 +66,20 @@ def raising(error: BaseException, at: int = 0) -> Answer:
 
 
 def test_both_outputs_landmarks_diagnostics_and_log_are_kept(sequence):
-    done = run(sequence)
+    calls: list[tuple[int, int]] = []
+    done = run(sequence, progress=SimpleNamespace(advance=lambda *counts: calls.append(counts)))
+    assert calls == [(k + 1, FRAMES) for k in range(FRAMES)]
     assert (done.estimator, done.status, done.log) == ("some", "ok", ("all is well",))
     for output in ("causal", "final"):
         np.testing.assert_array_equal(done.trajectory(output).T_world_imu, sequence.truth.T_world_imu)
     np.testing.assert_array_equal(done.info["nis"], np.arange(FRAMES))
 
 
-def test_progress_hears_every_frame(sequence):
-    calls = []
-    run(sequence, progress=SimpleNamespace(advance=lambda *counts: calls.append(counts)))
-    assert calls == [(k + 1, FRAMES) for k in range(FRAMES)]
-
-
-def test_who_answers_only_at_the_end_has_no_causal_output(sequence):
+def test_who_answers_only_at_the_end_has_no_causal_output_and_who_never_does_has_failed(sequence):
     done = run(sequence, lambda sound, _: None)
     assert (done.causal, done.status, done.info) == (None, "ok", {})
+    nothing = run(sequence, lambda sound, _: None, lambda _: Finished(Trajectory.of([]), Landmarks.none()))
+    assert nothing.status == "failed" and "it returned no estimate for any frame" in nothing.log[0]
 
 
 def test_an_error_ends_the_run_with_its_reason_and_what_was_reported_before(sequence):
@@ -91,12 +89,6 @@ def test_an_error_ends_the_run_with_its_reason_and_what_was_reported_before(sequ
     assert any("test_runner.py" in line for line in done.log[1:]), "a defect keeps its traceback"
     assert done.final is None
     np.testing.assert_array_equal(done.causal.t_ns, sequence.frames_t_ns[:5])
-
-
-def test_an_estimator_that_cannot_go_on_says_why_in_one_line(sequence):
-    done = run(sequence, end=raising(EstimatorError("the smoother's error\nis not a number")))
-    assert done.status == "failed"
-    assert done.log == (f"failed after {FRAMES} estimates: the smoother's error is not a number",)
 
 
 # As GTSAM words it: an empty line, what it found, and a paragraph of advice.
@@ -110,6 +102,7 @@ OF_GTSAM = "\nIndeterminate linear system near variable\n77 (Symbol: l7).\n\nThe
         (ValueError(), "ValueError"),
         (np.linalg.LinAlgError("Singular"), "rounding left a matrix without a root or an inverse (LinAlgError: Sing"),
         (SystemExit(3), "SystemExit: 3"),
+        (EstimatorError("the smoother's error\nis not a number"), "the smoother's error is not a number"),
     ],
 )
 def test_the_reason_of_a_failed_run_is_one_line_that_says_what_happened(error, reason, sequence):
@@ -242,9 +235,3 @@ def test_a_finish_that_answers_otherwise_fails_its_run_and_keeps_the_causal_answ
     assert done.status == "failed"
     assert why in done.log[0]
     assert len(done.causal) == FRAMES
-
-
-def test_who_answers_nothing_at_all_has_failed(sequence):
-    done = run(sequence, lambda sound, _: None, lambda sound: Finished(Trajectory.of([]), Landmarks.none()))
-    assert done.status == "failed"
-    assert "it returned no estimate for any frame" in done.log[0]

@@ -9,9 +9,7 @@ import importlib
 import importlib.machinery
 import importlib.util
 import pkgutil
-import re
 import sys
-import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,10 +19,6 @@ from pathlib import Path
 from types import ModuleType
 
 from toolkit.errors import ExtensionError
-
-GROUPS = ("toolkit.datasets", "toolkit.estimators", "toolkit.metrics")
-_OURS = ("toolkit", "filters")
-_PLACE = re.compile(r'^\W*File "(.+?)", line (\d+)', re.MULTILINE)
 
 
 def shown_name(module: str) -> str:
@@ -124,22 +118,6 @@ def announced(group: str) -> list[FoundModule]:
             )
         found += modules_in(package, spec.submodule_search_locations)
     return found
-
-
-def line_of_another_package(error: BaseException) -> str:
-    """Return file and line of the innermost code that an error came through in a package announced by others.
-
-    For an error from another process the traceback that it carries is searched. The result is empty where only the
-    toolkit's own code is in the traceback.
-    """
-    announced_packages = {point.value for group in GROUPS for point in entry_points(group=group)}
-    folders: list[str] = []
-    for package in sorted(one for one in announced_packages if one.partition(".")[0] not in _OURS):
-        with suppress(Exception):  # a package that cannot be found is reported elsewhere
-            folders += ((spec := _spec(package)) and spec.submodule_search_locations) or ()
-    places = _PLACE.findall("".join(traceback.format_exception(error)))
-    inside = [f"{file}, line {line}" for file, line in places if any(Path(file).is_relative_to(one) for one in folders)]
-    return inside[-1] if inside else ""
 
 
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:

@@ -164,17 +164,10 @@ def _unexpected(error: Exception) -> int:
     elif isinstance(error, UnicodeError):
         lacking = f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8"
     else:
-        return _ended_with(_defect(error), _DEFECT)
+        told, how = f"{type(error).__name__}: {error}", f"set {_WITH_TRACEBACK}=1 to see where, and report it there"
+        what = "a defect of vislam, or of a package or a file that it was given, not of your data"
+        return _ended_with(f"{what} ({told}); {how}", _DEFECT)
     return _ended_with(lacking, _SYSTEM)
-
-
-def _defect(error: Exception) -> str:
-    from toolkit.discovery import line_of_another_package  # slow for a help text
-
-    told, how = f"{type(error).__name__}: {error}", f"set {_WITH_TRACEBACK}=1 to see where, and report it"
-    if theirs := line_of_another_package(error):
-        return f"a defect of {theirs}, which another package brings ({told}); {how} there"
-    return f"a defect of vislam itself, not of your data ({told}); {how}"
 
 
 def _means_behind(error: BaseException | None) -> BaseException | None:
