@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from toolkit.datasets import load_sequence, tracked_images
+from toolkit.datasets import load_images, load_sequence
 from toolkit.errors import DataError
 from toolkit.frontend.tracking import ImageRecording
 
@@ -16,8 +16,7 @@ CAMERAS = ("cam0", "cam1")
 
 
 def recording(root: Path) -> ImageRecording:
-    found = tracked_images(str(root))
-    assert found is not None
+    found = load_images(str(root))
     assert all(pair.left.is_file() and pair.right.is_file() for pair in found.pairs)
     return found
 

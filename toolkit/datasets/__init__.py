@@ -255,15 +255,6 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
     return reader.images_of(path, frontend)
 
 
-def tracked_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRecording | None:
-    """Return the image pairs that a recording's tracks are made of, None where they are made of something else.
-
-    Raises DataError where the source cannot be read.
-    """
-    path, reader = _found_at(source)
-    return reader.images_of(path, frontend) if reader and _of_images(reader, path, frontend) else None
-
-
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:
     """Say whether a source is another recording under another seed, as simulations are.
 

@@ -2,9 +2,6 @@
 
 It has two forms: of a comparison, and of one over seeds. First the records of both, then the functions that fill them.
 Times ``t_s`` count from the first frame; numbers have six digits; a value that is not finite is null.
-
-The error of a sighting in an image is its leave-one-view-out error: its distance from the prediction by the track's
-other sightings and the estimated poses. It needs only these poses, and is small where poses and track are accurate.
 """
 
 from collections.abc import Callable, Iterator, Sized
@@ -15,19 +12,12 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.answers import Output
-from toolkit.datasets import tracked_images
-from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
-from toolkit.frontend import ImageRecording
-from toolkit.frontend.cameras import Image
-from toolkit.frontend.images import Unusable
-from toolkit.frontend.tracking import read_pairs
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
-from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import CardRecord, card_record
 from toolkit.report.comparison_table import header_lines, noise_line, sequence_line
@@ -168,31 +158,6 @@ class DrawnMap(Struct, frozen=True, kw_only=True):
     output: Annotated[Output, Meta(description="with whose alignment they move")]
 
 
-class TrackErrors(Struct, frozen=True, kw_only=True):
-    """How far the sightings of a frame are from where an output's poses and their tracks' other sightings say."""
-
-    estimator: str
-    output: Output
-    off_px: Annotated[Numbers, Meta(description="null where a track has fewer than three posed sightings")]
-
-
-class CameraFrame(Struct, frozen=True, kw_only=True):
-    """A left image, rectified, with the sightings that are in it."""
-
-    t_s: Annotated[float, Meta(description="seconds from the first frame")]
-    image: Annotated[str, Meta(description="its JPEG file in the run directory")]
-    width_px: int
-    height_px: int
-    u_px: Numbers
-    v_px: Numbers
-    errors: tuple[TrackErrors, ...]
-
-    def __post_init__(self) -> None:
-        _check_lengths({"u_px": self.u_px, "v_px": self.v_px})
-        for one in self.errors:
-            _check_lengths({"u_px": self.u_px, f"off_px of {one.estimator}": one.off_px})
-
-
 class AuditMessage(Struct, frozen=True, kw_only=True):
     """A fault of the recording and what became of it."""
 
@@ -233,7 +198,6 @@ class Report(Struct, frozen=True, kw_only=True):
     maps: tuple[DrawnMap, ...]
     words: Messages
     card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where requested")] = UNSET
-    frames: Annotated[tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks")] = UNSET
     contests: Contests = UNSET
 
 
@@ -295,8 +259,8 @@ def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, 
     return _FILES[kind].format(plain_name(estimator), output)
 
 
-def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()) -> Report:
-    """Return what the report of a comparison draws and says, with some images' tracks; not finite becomes null."""
+def report_document(comparison: Comparison) -> Report:
+    """Return what the report of a comparison draws and says; what is not finite becomes null."""
     curves = error_curves(comparison)
     return Report(
         schema="vislam.report/1",
@@ -313,7 +277,6 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         ),
         words=_messages(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
-        frames=frames or UNSET,
         contests=tuple(contest_record(one) for one in comparison.contests),
     )
 
@@ -453,73 +416,3 @@ def _rms_over_runs(errors: Array) -> Array:
     known = np.isfinite(errors)
     total, count = np.where(known, errors, 0.0) ** 2, known.sum(axis=0)
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
-
-
-FOLDER = "frames"
-_COUNT = 4
-_JPEG_QUALITY = 80
-
-
-def camera_frames(comparison: Comparison) -> tuple[tuple[CameraFrame, bytes], ...]:
-    """Return some frames, spread over the recording, each with its JPEG, where its tracks are made of images."""
-    recording = None if comparison.over_seeds else _images(comparison)
-    if recording is None:
-        return ()
-    import cv2
-
-    sequence = comparison.sequence
-    shown = np.unique(np.linspace(0, sequence.frame_count - 1, _COUNT + 2)[1:-1].astype(np.int64))
-    seen = np.isin(sequence.observations.frame, shown)
-    errors_px = {row: found for row in comparison.rows if (found := _errors_px(row, sequence, seen)) is not None}
-    frames = []
-    for k, image in _left_images(recording, sequence.frames_t_ns, shown):
-        here = np.flatnonzero(sequence.observations.frame == k)
-        uv_px = sequence.observations.uv_px[here]
-        frame = CameraFrame(
-            t_s=seconds(sequence, sequence.frames_t_ns[[k]])[0],
-            image=f"{FOLDER}/{int(sequence.frames_t_ns[k])}.jpg",
-            width_px=image.shape[1],
-            height_px=image.shape[0],
-            u_px=numbers(uv_px[:, 0]),
-            v_px=numbers(uv_px[:, 2]),
-            errors=tuple(
-                TrackErrors(estimator=row.estimator, output=row.output, off_px=numbers(of_all[here]))
-                for row, of_all in errors_px.items()
-            ),
-        )
-        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        frames.append((frame, jpeg))
-    return tuple(frames)
-
-
-def _images(comparison: Comparison) -> ImageRecording | None:
-    try:
-        return tracked_images(comparison.source, comparison.settings.frontend)
-    except DataError:  # a sequence given as a value has a name and no path
-        return None
-
-
-def _errors_px(row: Row, sequence: Sequence, requested: BoolArray) -> Array | None:
-    """Return the error (N,) px of every sighting whose track has one that is asked for (N,); NaN where there is none.
-
-    None where the row has no poses of its own.
-    """
-    if row.repeats_causal or row.run.trajectory(row.output) is None:
-        return None
-    observations = sequence.observations
-    wanted = np.flatnonzero(np.isin(observations.track_id, observations.track_id[requested]))
-    poses = Evaluation(row.run, row.output, sequence).poses_of_frames
-    with np.errstate(all="ignore"):  # a diverged run overflows; that becomes null
-        found, found_px = errors_left_out(observations.select(wanted), poses, sequence.rig)
-    errors_px = np.full(len(observations), np.nan)
-    errors_px[wanted[found]] = found_px
-    return errors_px
-
-
-def _left_images(recording: ImageRecording, frames_t_ns: IntArray, shown: IntArray) -> Iterator[tuple[int, Image]]:
-    """Yield the left images of frames; an image that was removed since the tracks were made is left out."""
-    pair_at = {pair.t_ns: pair for pair in recording.pairs}
-    there = [(k, pair_at[t]) for k, t in zip(shown.tolist(), frames_t_ns[shown].tolist(), strict=True) if t in pair_at]
-    for (k, _), images in zip(there, read_pairs(recording, [pair for _, pair in there]), strict=True):
-        if not isinstance(images, Unusable):
-            yield k, images[0]

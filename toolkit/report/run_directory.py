@@ -33,7 +33,6 @@ from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.manifest import Manifest, manifest_document, read_manifest
 from toolkit.report.report_json import (
-    CameraFrame,
     DrawnOverSeeds,
     DrawnRun,
     Report,
@@ -150,8 +149,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
                 _write_truth(comparison, directory)
         else:
             _write_text(directory / METRICS, to_text(metrics_document(comparison)))
-            frames = _written_frames(comparison, directory)
-            _write_text(directory / REPORT, to_line(report_json.report_document(comparison, frames)))
+            _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
             _write_trajectories(comparison, directory)
         captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
@@ -176,15 +174,6 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
     trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
     for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
         take_over(target / name, directory / name)
-
-
-def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
-    seen = report_json.camera_frames(comparison)
-    for frame, jpeg in seen:
-        place = directory / frame.image
-        place.parent.mkdir(exist_ok=True)
-        place.write_bytes(jpeg)
-    return tuple(frame for frame, _ in seen)
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:
@@ -236,7 +225,6 @@ class RunFiles:
     manifest: Manifest
     tracks: dict[str, DrawnPath]
     landmarks: dict[str, Array]
-    images: dict[str, bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,15 +282,7 @@ def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
     tracks = {name: DrawnPath(table[:, 0] - start_s, table[:, 1:4]) for name, table in tables.items()}
     points = {one.landmarks: _numbers(directory / one.landmarks, _LANDMARK_COLUMNS, ",", 1) for one in report.maps}
     landmarks = {name: each[np.isfinite(each).all(axis=1), 1:] for name, each in points.items()}
-    images = {frame.image: _inside(directory, frame.image) for frame in report.frames or ()}
-    return RunFiles(directory, scores, report, manifest, tracks, landmarks, images)
-
-
-def _inside(directory: Path, name: str) -> bytes:
-    """Return the content of a file that a report names; raises DataError for a name that leads out of its directory."""
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise DataError(f"{directory / REPORT} names {name}, which is not in the run directory; repeat the comparison")
-    return read_input(directory / name)
+    return RunFiles(directory, scores, report, manifest, tracks, landmarks)
 
 
 def _check_same_runs(

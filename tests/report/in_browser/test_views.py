@@ -1,15 +1,9 @@
 """The views and charts of the page in a real browser: they move and zoom by pointer, by keyboard and by touch."""
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-
-from toolkit.report.html import write_html
 
 pytest.importorskip("selenium.webdriver", reason="needs selenium, from the extra 'test'")
 
@@ -38,40 +32,6 @@ def test_views_answer_to_the_keyboard(page: Page, single: Path, view: str, key: 
     assert page.picture(canvas) != before
     page.press(canvas, back)
     assert page.picture(canvas) == before
-
-
-def test_images_of_the_recording_are_coloured_by_the_estimator_requested(
-    page: Page, run_directory: Path, tmp_path: Path
-) -> None:
-    """A grey image with two sightings: blue by one estimator, red by the other."""
-    shown = Path(shutil.copytree(run_directory, tmp_path / "run"))
-    (shown / "frames").mkdir()
-    (shown / "frames/1.jpg").write_bytes(cv2.imencode(".jpg", np.full((120, 200), 128, np.uint8))[1].tobytes())
-    document = json.loads((shown / "report.json").read_text())
-    reported = (("late", "final", [0, 0]), ("astray", "causal", [9, None]))
-    off = [{"estimator": name, "output": output, "off_px": px} for name, output, px in reported]
-    frame = {
-        "t_s": 1.0,
-        "image": "frames/1.jpg",
-        "width_px": 200,
-        "height_px": 120,
-        "u_px": [50, 150],
-        "v_px": [60, 60],
-    }
-    document["frames"] = [frame | {"errors": off}]
-    (shown / "report.json").write_text(json.dumps(document))
-    write_html([shown], tmp_path / "page.html")
-    page.open(tmp_path / "page.html")
-    canvas = ".camera canvas"
-    page.into_view(canvas)
-    before = page.picture(canvas)
-    page.run(
-        "const s = [...document.querySelectorAll('select')]"
-        ".find((s) => s.parentElement.textContent.includes('coloured'));"
-        "s.selectedIndex = 1 - s.selectedIndex; s.dispatchEvent(new Event('change'))"
-    )
-    assert page.picture(canvas) != before
-    assert "9.00 px off in the median" in page.find(canvas).get_attribute("aria-label")
 
 
 CUT = """

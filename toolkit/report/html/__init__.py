@@ -21,7 +21,7 @@ from toolkit.report.text import Table, as_html, in_html
 # In the order in which they build upon each other; together they are the body of one function.
 SCRIPTS = (
     *("dom", "numbers", "state", "hints", "table", "canvas", "gestures", "scene", "top_view", "orbit_view"),
-    *("axes", "chart", "charts", "seeds", "frames", "words", "case", "main"),
+    *("axes", "chart", "charts", "seeds", "words", "case", "main"),
 )
 _IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 # Characters that could end the script element or open a comment in it, or that older parsers take as the end of a line.

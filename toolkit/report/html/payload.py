@@ -4,7 +4,6 @@ Over seeds: means with their spread, every seed's value, NEES and its band. Seri
 recording's points, as many as a screen can show, to keep the file small.
 """
 
-import base64
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,7 +17,7 @@ from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import look_numbers
 from toolkit.report.messages import ContestRecord, contest_text
-from toolkit.report.report_json import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
+from toolkit.report.report_json import ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
 from toolkit.report.text import unit_of
@@ -91,30 +90,7 @@ def _of_one_run(files: RunFiles, rows: list[Json]) -> Json:
             | _with_median({"t_s": one.t_s, "step_ms": one.step_ms}, "step_ms")
             for one in report.steps
         ],
-        "frames": [_frame(frame, files, rows) for frame in report.frames or ()],
     }
-
-
-def _frame(frame: CameraFrame, files: RunFiles, rows: list[Json]) -> Json:
-    ids = {(row["estimator"], "causal" if row["output"] == "both" else row["output"]): row["id"] for row in rows}
-    errors = {
-        ids[one.estimator, one.output]: _decimals(one.off_px, 2)
-        for one in frame.errors
-        if (one.estimator, one.output) in ids
-    }
-    content = base64.b64encode(files.images[frame.image]).decode("ascii")
-    return {
-        "t_s": frame.t_s,
-        "image": f"data:image/jpeg;base64,{content}",
-        "size": [frame.width_px, frame.height_px],
-        "u": _decimals(frame.u_px, 1),
-        "v": _decimals(frame.v_px, 1),
-        "off": errors,
-    }
-
-
-def _decimals(values: Sequence[float | None], digits: int) -> list[float | None]:
-    return [None if value is None else round(value, digits) for value in values]
 
 
 def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:

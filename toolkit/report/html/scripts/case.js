@@ -53,7 +53,6 @@ function runParts(one) {
         one.error ? el("div", { class: "choice" }, el("span", { text: "errors over" }), over) : null),
       el("div", { class: "charts" }, chartsOf(one)),
       scrubber(one)),
-    framesOf(one),
   ];
 }
 
