@@ -65,7 +65,6 @@ class _OwnModule(FoundModule):
     """A module that no package announces, as ``my_package.my_filter``."""
 
     def load(self) -> ModuleType:
-        """Import it; raises EstimatorError where that fails, for whatever reason."""
         try:
             return importlib.import_module(self.module)
         except (Exception, SystemExit) as error:  # a script may end where it is imported
@@ -97,7 +96,6 @@ class Watched:
 
 
 def setup_of(sequence: Sequence) -> Setup:
-    """Return the setup of an estimator for a recording with its own prior, as a simulated one has."""
     assert sequence.prior is not None
     return runner.setup_of(sequence, sequence.prior)
 
@@ -137,7 +135,6 @@ def declines(build: Build, sequence: Sequence) -> str:
 
 
 def answers(build: Build, sequence: Sequence) -> Iterator[Estimate | None]:
-    """Yield an estimator's answer to each packet of a recording."""
     estimator = build(setup_of(sequence))
     for packet in sequence.packets():
         yield estimator.step(packet)
@@ -164,7 +161,6 @@ def _copies_of(value: object) -> tuple[Array, ...]:
 
 
 def look_ahead(watched: Watched) -> str:
-    """Say at which frame an answer changes when later packets are withheld."""
     for count in (2, len(watched.online) // 2):
         early = answers(watched.build, watched.sequence.truncated(count))
         for k, (answer, full) in enumerate(zip(early, watched.online, strict=False)):
@@ -207,7 +203,6 @@ def _largest(left: Array, right: Array) -> float:
 
 
 def changed_later(watched: Watched) -> str:
-    """Say which answer changed after it was given."""
     for k, (answer, copies) in enumerate(zip(watched.online, watched.online_copies, strict=True)):
         for array, copy in zip(arrays_of(answer), copies, strict=True):
             if not np.array_equal(array, copy, equal_nan=True):
@@ -216,7 +211,6 @@ def changed_later(watched: Watched) -> str:
 
 
 def touched(watched: Watched) -> str:
-    """Say whether the setup or a packet was written to."""
     given = (watched.setup, watched.packets)
     for array, copy in zip(arrays_of(given), watched.given_copies, strict=True):
         if not np.array_equal(array, copy, equal_nan=True):
@@ -225,7 +219,6 @@ def touched(watched: Watched) -> str:
 
 
 def not_finite(watched: Watched) -> str:
-    """Say at which frame a pose, velocity or bias is no number."""
     final = watched.finished.trajectory
     for name in ("T_world_imu", "v_world", "bias"):
         of_frames = [None if answer is None else getattr(answer, name) for answer in watched.online]
@@ -280,7 +273,6 @@ def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
 
 
 def no_rotation(watched: Watched) -> str:
-    """Say which pose has a matrix that is not a rotation."""
     poses = [answer.T_world_imu for answer in watched.online if answer is not None]
     stacked = np.concatenate([np.array(poses).reshape(-1, 4, 4), watched.finished.trajectory.T_world_imu])
     rotations = stacked[:, :3, :3]

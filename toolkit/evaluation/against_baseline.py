@@ -16,9 +16,9 @@ import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
 
 from toolkit.errors import DataError, no_such, one_line, printable
-from toolkit.evaluation.gathering import files_by_sequence, truths_in
-from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth, score_file
-from toolkit.evaluation.standings import EvaluationRecord, RunRecord, read_evaluation
+from toolkit.evaluation.gathering import Item, files_by_sequence, truths_in
+from toolkit.evaluation.scoring import TIME_COVERAGE, Terms, read_truth
+from toolkit.evaluation.standings import EvaluationRecord, RunRecord, evaluated_run, read_evaluation
 from toolkit.files import documents
 from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Criterion, MetricValues, Percent, Values, json_text
 from toolkit.gate.case_check import check_recorded
@@ -29,8 +29,6 @@ from toolkit.geometry import Array
 from toolkit.settings import SettingsError
 
 Align = Literal["se3", "yaw", "sim3"]
-# The scores of a run by metric, or why it has none.
-Scored = Mapping[str, float | None] | str
 # Growth of an error that is no regression (percent), and loss of time coverage that is accepted (percentage points).
 BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
 # Failed runs whose reasons are told.
@@ -102,7 +100,6 @@ def load_trajectory_baseline(path: Path) -> TrajectoryBaselineRecord:
 
 
 def to_text(baseline: TrajectoryBaselineRecord) -> str:
-    """Return the file's text, the values of all runs of a metric on one line."""
     return json_text(to_builtins(baseline))
 
 
@@ -134,7 +131,7 @@ class FolderOfRuns:
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Return the sequences there are files of; raises DataError where there are none."""
+        """The sequences there are files of; raises DataError where there are none."""
         return tuple(self._files)
 
     def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
@@ -154,15 +151,11 @@ class FolderOfRuns:
         elif not (path := place_of(before.truth) or Path(before.truth)).is_file():
             where = f"its truth is not at {path}, where the baseline had it"
             raise DataError(f"{where}; name another place with --truth")
-        truth = read_truth(sequence, path)
+        truth, terms = read_truth(sequence, path), Terms(gap_s=gap_s, least_coverage_percent=0.0)
         _check_truth(path.as_posix(), truth.digest, before)
-        by_file: dict[str, Scored] = {}
-        for file in files:
-            try:
-                by_file[str(file.relative_to(self.folder))] = score_file(file, truth, Terms(gap_s=gap_s)).values
-            except DataError as error:
-                by_file[str(file.relative_to(self.folder))] = printable(one_line(str(error)))
-        return _record(sequence, (path.as_posix(), truth.digest), by_file, align, before)
+        names = {file: str(file.relative_to(self.folder)) for file in files}
+        runs = {name: evaluated_run(Item("", sequence, name, file), truth, terms) for file, name in names.items()}
+        return _record(sequence, (path.as_posix(), truth.digest), runs, align, before)
 
     @cached_property
     def _files(self) -> dict[str, tuple[Path, ...]]:
@@ -180,7 +173,6 @@ class EvaluatedRuns:
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Return the sequences there are runs of."""
         return tuple(self._runs)
 
     def scored(self, sequence: str, align: Align, gap_s: float, before: SequenceRecord | None) -> SequenceRecord:
@@ -196,10 +188,7 @@ class EvaluatedRuns:
             raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
         truth = next(one for one in self._record.sequences if one.sequence == runs[0].sequence)
         _check_truth(truth.truth, truth.truth_hash, before)
-        by_file: dict[str, Scored] = {
-            run.file or run.run: run.metrics if run.status == "ok" else f"{run.run} failed: {run.log[0]}"
-            for run in runs
-        }
+        by_file = {run.file or run.run: run for run in runs}
         return _record(sequence, (truth.truth, truth.truth_hash), by_file, align, before)
 
     @cached_property
@@ -216,18 +205,23 @@ class EvaluatedRuns:
 
 
 def _record(
-    sequence: str, truth: tuple[str, str], by_file: Mapping[str, Scored], align: Align, before: SequenceRecord | None
+    sequence: str, truth: tuple[str, str], runs: Mapping[str, RunRecord], align: Align, before: SequenceRecord | None
 ) -> SequenceRecord:
     """Return the scores of a sequence's runs, or why there are none, by file; ``truth`` is its place and its hash.
 
     Raises DataError where all failed, or any where a baseline is made of them.
     """
-    failed = {file: why for file, why in by_file.items() if isinstance(why, str)}
-    if failed and (before is None or len(failed) == len(by_file)):
+    why = {
+        file: run.log[0] if run.file else f"{run.run}: {run.log[0]}" for file, run in runs.items() if run.status != "ok"
+    }
+    failed = {file: printable(words) for file, words in why.items()}
+    if failed and (before is None or len(failed) == len(runs)):
         raise DataError(next(iter(failed.values())))
-    keys = scored_metrics(align)
-    values = {key: tuple(None if isinstance(one, str) else one.get(key) for one in by_file.values()) for key in keys}
-    record = SequenceRecord(sequence=sequence, truth=truth[0], truth_hash=truth[1], files=tuple(by_file), scores=values)
+    scores = {
+        key: tuple(None if file in failed else run.metrics.get(key) for file, run in runs.items())
+        for key in scored_metrics(align)
+    }
+    record = SequenceRecord(sequence=sequence, truth=truth[0], truth_hash=truth[1], files=tuple(runs), scores=scores)
     return record if before is None else CheckedRuns(**structs.asdict(record), failed=failed)
 
 

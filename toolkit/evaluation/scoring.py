@@ -14,15 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
-from toolkit.datasets.trajectories.belonging import (
-    Reference,
-    body_of,
-    other_axes,
-    range_s,
-)
+from toolkit.datasets.trajectories.belonging import Reference, body_of, other_axes, range_s
 from toolkit.datasets.trajectories.covariances import CONVENTIONS, CovConvention
 from toolkit.datasets.trajectories.formats import PosesFile, check_order, read_finite_poses, read_rows
 from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
 from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.measurements import NS_PER_S
@@ -86,13 +82,11 @@ METRICS: tuple[Metric, ...] = (
 _OVER_A_SECOND = ("rpe_1s_m", "rpe_1s_deg")
 # Metrics that need stamps.
 _OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRICS))
-# Metrics that depend on the body's axes, and not on its position alone.
-_OF_THE_BODY = (
-    *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
-    *("end_drift_percent", *_NEES_KEYS),
-)
-# Remark where the truth repeats one position.
 _OF_POSITIONS = tuple(metric.key for metric in ate.METRICS)
+_OF_ORIENTATIONS = ("ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
+# Metrics that depend on the body's axes, and not on its position alone.
+_OF_THE_BODY = ("ate_none_m", *_OF_ORIENTATIONS, "end_drift_percent", *_NEES_KEYS)
+# Remark where the truth repeats one position.
 _STANDS = (
     "the truth stands still, all its positions are one: these are the estimate's own motion, unless it ought to stand"
 )
@@ -102,7 +96,6 @@ _STAYS = "the estimate stands still, all its positions are one: its errors are t
 _LOOKS_ONE_WAY = (
     "the estimate's orientations are all one, as where none was written: these are the truth's own rotations"
 )
-_OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
 _OFF = (
     "its orientations are off by one turn of {:.1f} deg, about which they scatter by {:.1f} deg: an extrinsic is off, "
     "and not the estimate alone"
@@ -112,8 +105,7 @@ _LEAPS = "the estimate jumps, {} time(s), the farthest by {:.3g} m {:.1f} s afte
 _LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Of the hash of a truth: significant digits that are hashed, hexadecimal digits that are kept.
 _DIGITS, _LENGTH = 9, 16
-# Where KITTI has the stamps of poses.
-_TIMES = "times.txt"
+_TIMES = "times.txt"  # where KITTI has the stamps of poses
 # Assumed interval of frames without stamps, where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 NO_COVARIANCE = "the file states no covariance"
@@ -142,21 +134,16 @@ class Terms:
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses (N, 4, 4) of a file on their stamps (N,) ns."""
+class TruthFile:
+    """The truth of a sequence, poses (N, 4, 4) on stamps (N,) ns; these are its lines where it has none.
+
+    ``left_out`` are lines without a pose; ``cov`` (N, d, d) is there where it is another estimate, and states
+    covariances.
+    """
 
     path: Path
     t_ns: IntArray
     poses: Array
-
-
-@dataclass(frozen=True, eq=False)
-class TruthFile(Poses):
-    """The truth of a sequence; its stamps are its lines where it has none, ``left_out`` are lines without a pose.
-
-    ``cov`` (N, d, d) is there where it is another estimate, and states covariances.
-    """
-
     name: str
     is_timed: bool
     left_out: str = ""
@@ -174,12 +161,10 @@ class TruthFile(Poses):
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the first pose to the last."""
         return float((self.t_ns[-1] - self.t_ns[0]) / NS_PER_S)
 
     @property
     def path_m(self) -> float:
-        """Return the length of the path."""
         return float(distance_along(self.poses[:, :3, 3])[-1])
 
 
@@ -211,11 +196,24 @@ def _with_times(file: PosesFile) -> PosesFile:
     return replace(file, t_ns=rows.stamps(NS_PER_S)) if as_many else file
 
 
-def _read(path: Path, truth: TruthFile, terms: Terms) -> tuple[PosesFile, Poses]:
+def _read(path: Path, truth: TruthFile, terms: Terms) -> tuple[PosesFile, Trajectory]:
+    """Read a file, and return its poses on their stamps, or on the truth's where it has none but as many lines."""
     file = read_poses(path, terms.cov_convention)
+    if len(file) == 0:
+        raise DataError(f"{path}: it holds no poses")
     if file.t_ns is None and truth.is_timed and len(file) != len(truth.poses):
         file = _with_times(file)
-    return file, _stamped(file, truth, terms.offset_s)
+    if file.t_ns is not None and truth.is_timed:
+        return file, file.trajectory(file.t_ns + round(terms.offset_s * NS_PER_S))
+    if file.t_ns is not None:
+        raise DataError(
+            f"{truth.path}: it has no stamps, and {path} has; put {_TIMES} with a stamp in seconds for each pose "
+            "beside it, or give both without stamps"
+        )
+    if len(file) != len(truth.poses):
+        what = f"{path}: {len(file)} lines without stamps, and the truth has {len(truth.poses)} poses"
+        raise DataError(f"{what}; write a pose for each, or a format with stamps")
+    return file, file.trajectory(truth.t_ns)
 
 
 def aligned_file(path: Path, truth: TruthFile, terms: Terms) -> Matched:
@@ -223,7 +221,7 @@ def aligned_file(path: Path, truth: TruthFile, terms: Terms) -> Matched:
 
     Raises DataError where the file cannot be used, Unavailable where nothing can be fitted.
     """
-    matched = _matched(_read(path, truth, terms)[1], truth, terms.max_dt_s)
+    matched = _matched(path, _read(path, truth, terms)[1], truth, terms.max_dt_s)
     return replace(matched, estimate=PairsAgainstTruth(matched).se3_alignment.apply(matched.estimate))
 
 
@@ -234,11 +232,9 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     length, order of quaternions or number of lines is named.
     """
     file, estimate = _read(path, truth, terms)
-    if len(file) == 0:
-        raise DataError(f"{path}: it holds no poses")
     near = matched_poses(estimate, truth)
     turn = body_of(file, truth.reference, estimate.t_ns, (near.truth, near.estimate))
-    matched = _matched(estimate, truth, terms.max_dt_s)
+    matched = _matched(path, estimate, truth, terms.max_dt_s)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
@@ -271,29 +267,13 @@ def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
     return scores.remarked(_OF_POSITIONS, _LEAPS.format(int(leaps.sum()), step_m[row], at_s))
 
 
-def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
-    """Return the poses on their stamps, or on the truth's where the file has no stamps but as many lines."""
-    if file.t_ns is not None and truth.is_timed:
-        return Poses(file.path, file.t_ns + round(offset_s * NS_PER_S), file.T_world_imu)
-    if file.t_ns is not None:
-        raise DataError(
-            f"{truth.path}: it has no stamps, and {file.path} has; put {_TIMES} with a stamp in seconds for each pose "
-            "beside it, or give both without stamps"
-        )
-    if len(file) != len(truth.poses):
-        what = f"{file.path}: {len(file)} lines without stamps, and the truth has {len(truth.poses)} poses"
-        raise DataError(f"{what}; write a pose for each, or a format with stamps")
-    return Poses(file.path, truth.t_ns, file.T_world_imu)
-
-
-def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:
+def _matched(path: Path, estimate: Trajectory, truth: TruthFile, max_dt_s: float | None) -> Matched:
     matched = matched_poses(estimate, truth) if max_dt_s is None else nearest_poses(estimate, truth, max_dt_s)
-    alone = next((file.path for file in (estimate, truth) if file.t_ns.size < 2), None)
-    if alone is not None:
-        raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
+    if len(estimate) < 2:
+        raise DataError(f"{path}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
-            f"{estimate.path}: {len(matched)} of its poses match the truth in time; it covers "
+            f"{path}: {len(matched)} of its poses match the truth in time; it covers "
             f"{range_s(estimate.t_ns)}, the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, "
             "or allow more with --max-dt"
         )
@@ -313,19 +293,19 @@ def time_coverage_percent(t_ns: IntArray, truth_t_ns: IntArray, gap_s: float) ->
     return 100.0 * covered / max(end - begin, 1)
 
 
-def matched_poses(estimate: Poses, truth: Poses) -> Matched:
+def matched_poses(estimate: Trajectory, truth: TruthFile) -> Matched:
     """Return the pairs on the stamps of the sparser of the two, between whose neighbours the other is interpolated."""
     path_m = distance_along(truth.poses[:, :3, 3])
     truth_period_ns, period_ns = median_period_ns(truth.t_ns), median_period_ns(estimate.t_ns)
     if truth_period_ns > period_ns:
-        met, poses = poses_at(estimate.t_ns, estimate.poses, truth.t_ns, period_ns)
+        met, poses = poses_at(estimate.t_ns, estimate.T_world_imu, truth.t_ns, period_ns)
         return Matched(truth.t_ns[met], truth.poses[met], poses, path_m[met])
     met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, truth_period_ns)
     t_ns = estimate.t_ns[met]
-    return Matched(t_ns, true, estimate.poses[met], np.interp(t_ns, truth.t_ns, path_m))
+    return Matched(t_ns, true, estimate.T_world_imu[met], np.interp(t_ns, truth.t_ns, path_m))
 
 
-def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched:
+def nearest_poses(estimate: Trajectory, truth: TruthFile, max_dt_s: float) -> Matched:
     """Pair each pose of the one with fewer poses with the nearest of the other, as evo does; nothing is interpolated.
 
     Of two that are equally near it is the earlier one; a pose may be paired twice.
@@ -336,10 +316,10 @@ def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched
     nearest = _nearest(many, few)
     met = np.flatnonzero(np.abs(many[nearest] - few) <= max_dt_s * NS_PER_S)
     rows, others = (nearest[met], met) if estimate_is_longer else (met, nearest[met])
-    return Matched(estimate.t_ns[rows], truth.poses[others], estimate.poses[rows], path_m[others])
+    return Matched(estimate.t_ns[rows], truth.poses[others], estimate.T_world_imu[rows], path_m[others])
 
 
-def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile, terms: Terms) -> Scores:
+def _score(matched: Matched, file: PosesFile, estimate: Trajectory, truth: TruthFile, terms: Terms) -> Scores:
     pairs = PairsAgainstTruth(matched, terms.level)
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
     scores = Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)})
@@ -349,7 +329,7 @@ def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile,
         return scores | _nees_scores(file, estimate, truth, level=terms.level)
 
 
-def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> str:
+def _how_matched(estimate: Trajectory, truth: TruthFile, max_dt_s: float | None) -> str:
     """Say how poses were paired where stamps differ, which is needed to compare with numbers of other tools."""
     if not truth.is_timed:
         return "paired line by line, for the files have no stamps"
@@ -364,7 +344,7 @@ def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> s
     return f"paired with the nearest pose, {typical} off, and not interpolated"
 
 
-def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: bool) -> Scores:
+def _nees_scores(file: PosesFile, estimate: Trajectory, truth: TruthFile, *, level: bool) -> Scores:
     """Return the scores of the stated covariances, None with the reason.
 
     The remark on them is where their convention, by the truth, is another one.
@@ -372,7 +352,6 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
     covariances = file.covariances
     if covariances is None:
         return Scores.none(_NEES_KEYS, NO_COVARIANCE)
-    cov = covariances.of(file.T_world_imu)
 
     def errors(cov: Array, *, placed: bool | None) -> StatedErrors:
         return stated_against(cov, estimate, truth, level=level, placed=placed)
@@ -385,10 +364,10 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
     # The same errors for all readings: in the truth's world if any of them allows it.
     placed = not any(map(allows_the_truths_world, CONVENTIONS.values()))
     likelier = likelier_reading(covariances, file.T_world_imu, partial(errors, placed=placed))
-    if cov is None:
+    if estimate.cov is None:
         return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
     try:
-        stated = errors(cov, placed=None)
+        stated = errors(estimate.cov, placed=None)
     except Unavailable as reason:
         return Scores.none(_NEES_KEYS, str(reason))
     scores = nees.of_stated(stated) | uncertainty.of_stated(stated)
@@ -397,7 +376,7 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: TruthFile, *, level: b
 
 
 def stated_against(
-    cov: Array, estimate: Poses, truth: TruthFile, *, level: bool, placed: bool | None = None
+    cov: Array, estimate: Trajectory, truth: TruthFile, *, level: bool, placed: bool | None = None
 ) -> StatedErrors:
     """Return the errors of the poses that have a covariance, of (N, d, d), and a true pose, with the covariances.
 
@@ -410,8 +389,7 @@ def stated_against(
         raise Unavailable(NOT_MET)
     if truth.cov is not None:
         cov = cov[:, :6, :6] + truth.cov[_nearest(truth.t_ns, estimate.t_ns), :6, :6]
-    poses, rows = estimate.poses[met], np.flatnonzero(met)
-    t_ns = estimate.t_ns[met]
+    poses, rows, t_ns = estimate.T_world_imu[met], np.flatnonzero(met), estimate.t_ns[met]
     if not placed:
         stated = with_covariances(BodyErrors(t_ns, rows, se3_inverse(poses) @ true, poses, placed=False), cov)
         if placed is False or _is_in_the_truths_world(stated):

@@ -68,36 +68,19 @@ class Quartiles(Struct, frozen=True, kw_only=True):
     upper_quartile: float | None
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
+class OverRuns(Struct, frozen=True, kw_only=True):
     """All runs of a system on a sequence."""
 
-    system: str
     sequence: str
-    runs: tuple[RunRecord, ...]
-
-    @property
-    def ok(self) -> int:
-        """Return how many runs ended well."""
-        return sum(run.status == "ok" for run in self.runs)
-
-    def quantiles(self, metric: Metric) -> Quartiles | None:
-        """Return the quartiles over all runs; None where runs are ok and none of them has a value."""
-        good = [run.metrics.get(metric.key) for run in self.runs if run.status == "ok"]
-        values = [value for value in good if value is not None]
-        return None if good and not values else _quartiles(values, len(self.runs) - self.ok, metric)
+    estimator: str
+    runs: Count
+    ok: Count
+    metrics: Annotated[dict[str, Quartiles | None], Meta(description="null where runs are ok and none has a value")]
 
     def median(self, metric: Metric) -> float | None:
         """Return the median over all runs, None where failed runs decide it or there is no value."""
-        found = self.quantiles(metric)
+        found = self.metrics.get(metric.key)
         return None if found is None else found.median
-
-    def reason(self, key: str) -> str:
-        """Return why a metric has no value in any run that is ok, or why no run is."""
-        if not self.ok:
-            return next((run.log[0] for run in self.runs if run.log), "no run is ok")
-        notes = (run.notes.get(key) for run in self.runs if run.status == "ok")
-        return next((note for note in notes if note), "not computed")
 
 
 class StandingRecord(Struct, frozen=True, kw_only=True):
@@ -143,30 +126,33 @@ class EvaluatedSystems:
 
     @cached_property
     def systems(self) -> tuple[str, ...]:
-        """The systems, in the order given."""
         return tuple(dict.fromkeys(run.estimator for run in self.runs))
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Return the sequences' names."""
         return tuple(self.truths)
 
     @cached_property
-    def cells(self) -> Mapping[tuple[str, str], Cell]:
+    def cells(self) -> Mapping[tuple[str, str], OverRuns]:
         """The runs by system and sequence; every pair of the two has some."""
+        return {pair: self._over_runs(*pair, len(runs)) for pair, runs in self._runs_of.items()}
+
+    @cached_property
+    def _runs_of(self) -> Mapping[tuple[str, str], list[RunRecord]]:
         found: dict[tuple[str, str], list[RunRecord]] = {}
         for run in self.runs:
             found.setdefault((run.estimator, run.sequence), []).append(run)
-        return {key: Cell(*key, tuple(runs)) for key, runs in found.items()}
+        return found
+
+    def ok_runs(self, system: str, sequence: str) -> list[RunRecord]:
+        return [run for run in self._runs_of[system, sequence] if run.status == "ok"]
 
     @property
     def all_ok(self) -> bool:
-        """Say whether every run ended well."""
         return all(run.status == "ok" for run in self.runs)
 
     @cached_property
     def scored_metrics(self) -> tuple[Metric, ...]:
-        """The metrics that any run has."""
         given = {key for run in self.runs for key, value in run.metrics.items() if value is not None}
         return tuple(metric for metric in METRICS if metric.key in given)
 
@@ -208,6 +194,14 @@ class EvaluatedSystems:
             for name in self.systems
         }
 
+    def _over_runs(self, system: str, sequence: str, runs: int) -> OverRuns:
+        good = [run.metrics for run in self.ok_runs(system, sequence)]
+        metrics: dict[str, Quartiles | None] = {}
+        for metric in self.scored_metrics:
+            values = [value for run in good if (value := run.get(metric.key)) is not None]
+            metrics[metric.key] = None if good and not values else _quartiles(values, runs - len(good), metric)
+        return OverRuns(sequence=sequence, estimator=system, runs=runs, ok=len(good), metrics=metrics)
+
     def _standing(self, system: str, ranks: Array) -> StandingRecord:
         cells = [self.cells[system, sequence] for sequence in self.sequences]
         solved = np.isfinite(self._costs[system])
@@ -217,7 +211,7 @@ class EvaluatedSystems:
             wins=int(((ranks == 1.0) & solved).sum()),
             sequences=len(cells),
             solved=int(solved.sum()),
-            runs=sum(len(cell.runs) for cell in cells),
+            runs=sum(cell.runs for cell in cells),
             ok=sum(cell.ok for cell in cells),
             metrics={metric.key: _over_sequences(cells, metric) for metric in self.scored_metrics},
         )
@@ -266,11 +260,12 @@ def _evaluated(unit: tuple[TruthFile, list[Item], Terms], progress: Progress) ->
     runs = []
     for i, item in enumerate(items):
         progress.advance(i, len(items))
-        runs.append(_evaluated_run(item, truth, terms))
+        runs.append(evaluated_run(item, truth, terms))
     return runs
 
 
-def _evaluated_run(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
+def evaluated_run(item: Item, truth: TruthFile, terms: Terms) -> RunRecord:
+    """Score a run; one that cannot be used, or covers too little of the truth's time, failed, with the reason."""
     if item.path is None:
         return _run(item, None, "there is no trajectory")
     try:
@@ -338,9 +333,9 @@ def _paired(pair: tuple[str, str], log_ratios: Array, p: float, p_holm: float) -
     )
 
 
-def _over_sequences(cells: Sequence[Cell], metric: Metric) -> Quartiles | None:
+def _over_sequences(cells: Sequence[OverRuns], metric: Metric) -> Quartiles | None:
     """Return the quartiles of the medians of sequences; those where every ok run lacks the metric take no part."""
-    due = [cell for cell in cells if cell.quantiles(metric) is not None]
+    due = [cell for cell in cells if cell.metrics[metric.key] is not None]
     medians = [median for cell in due if (median := cell.median(metric)) is not None]
     return _quartiles(medians, len(due) - len(medians), metric) if medians else None
 
@@ -371,16 +366,6 @@ class SequenceScored(Struct, frozen=True, kw_only=True):
     path_m: Annotated[float, Meta(ge=0)]
 
 
-class OverRuns(Struct, frozen=True, kw_only=True):
-    """All runs of a system on a sequence."""
-
-    sequence: str
-    estimator: str
-    runs: Count
-    ok: Count
-    metrics: Annotated[dict[str, Quartiles | None], Meta(description="null where runs are ok and none has a value")]
-
-
 class EvaluationRecord(Struct, frozen=True, kw_only=True):
     """Every run of every system, and what they say together."""
 
@@ -403,7 +388,6 @@ class EvaluationRecord(Struct, frozen=True, kw_only=True):
 
 
 def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
-    """Return an evaluation as a record."""
     return EvaluationRecord(
         schema="vislam.evaluation/1",
         terms=of_attributes(TermsRecord, evaluation.terms),
@@ -416,13 +400,7 @@ def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
             for name, truth in evaluation.truths.items()
         ),
         runs=evaluation.runs,
-        over_runs=tuple(
-            OverRuns(
-                sequence=cell.sequence, estimator=cell.system, runs=len(cell.runs), ok=cell.ok,
-                metrics={metric.key: cell.quantiles(metric) for metric in evaluation.scored_metrics},
-            )
-            for cell in evaluation.cells.values()
-        ),
+        over_runs=tuple(evaluation.cells.values()),
         leaderboard=evaluation.leaderboard,
         paired=evaluation.paired,
         notes=evaluation.notes,

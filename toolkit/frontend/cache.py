@@ -71,7 +71,6 @@ def save(key: str, tracks: Mapping[str, Any]) -> None:
 
 
 def folder() -> Path:
-    """Return the folder of what is kept."""
     given = os.environ.get("VISLAM_CACHE")
     if given:
         return Path(given)

@@ -35,7 +35,6 @@ class Camera:
 
     @property
     def K(self) -> Array:
-        """Return the calibration matrix (3, 3)."""
         fx, fy, cx, cy = self.pinhole_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
@@ -74,7 +73,6 @@ class RectifiedPair:
         return StereoRig(*pinhole_px, self.baseline_m, np.eye(4), np.diag([1.0, 1.0, 0.5]))
 
     def apply(self, image: Image, side: int) -> Image:
-        """Return a rectified image of the left (0) or right (1) camera."""
         if self.maps is None:
             return image
         import cv2

@@ -71,7 +71,6 @@ def _cells_of(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int])
 
 
 def halved(image: Image) -> Image:
-    """Return an image of half the width and height."""
     import cv2
 
     return np.asarray(cv2.pyrDown(image), dtype=np.uint8)

@@ -38,7 +38,6 @@ class Patches:
 
     @classmethod
     def none(cls) -> Self:
-        """Return the patches of no track."""
         size = _LATTICE.shape[1]
         return cls(np.empty((0, size), np.float32), np.empty((0, 6, size), np.float32), np.empty((0, 2, 2)))
 
@@ -86,7 +85,6 @@ class Patches:
         return Patches(self.values[rows], self.solvers[rows], self.warps[rows])
 
     def joined(self, others: "Patches") -> "Patches":
-        """Return these patches and others behind them."""
         mine, theirs = vars(self), vars(others)
         return Patches(**{name: np.concatenate([mine[name], theirs[name]]) for name in mine})
 

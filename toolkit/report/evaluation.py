@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from toolkit.errors import DataError
 from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE
 from toolkit.evaluation.standings import (
-    Cell,
     EvaluatedSystems,
+    OverRuns,
     PairedRecord,
     Quartiles,
     StandingRecord,
@@ -112,7 +112,7 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
         ranked_by = evaluation.ranked_by
         spread = found[ranked_by][i]
         cells = [evaluation.cells[standing.estimator, sequence] for sequence in evaluation.sequences]
-        count = sum(one.quantiles(ranked_by) is not None for one in cells) if several else standing.runs
+        count = sum(one.metrics.get(ranked_by.key) is not None for one in cells) if several else standing.runs
         ends = () if spread is None or count < 2 else (spread.lower_quartile, spread.upper_quartile)
         quartiles = " .. ".join(cell(end, ranked_by, units[ranked_by]) for end in ends) or MISSING
         values = [cell(medians[metric][i], metric, units[metric]) for metric in metrics]
@@ -127,7 +127,7 @@ def _quartiles_of(
 ) -> Quartiles | None:
     if several:
         return standing.metrics.get(metric.key)
-    return evaluation.cells[standing.estimator, evaluation.sequences[0]].quantiles(metric)
+    return evaluation.cells[standing.estimator, evaluation.sequences[0]].metrics.get(metric.key)
 
 
 def _best(medians: list[float | None], metric: Metric) -> set[int]:
@@ -151,9 +151,9 @@ def sequences_table(evaluation: EvaluatedSystems) -> Table:
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
-def _median_and_failures(runs: Cell, metric: Metric, unit: ShownUnit) -> str:
-    failed = f"{len(runs.runs) - runs.ok} of {len(runs.runs)} failed" if runs.ok < len(runs.runs) else ""
-    median = runs.median(metric)
+def _median_and_failures(over: OverRuns, metric: Metric, unit: ShownUnit) -> str:
+    failed = f"{over.runs - over.ok} of {over.runs} failed" if over.ok < over.runs else ""
+    median = over.median(metric)
     if median is None:
         return failed or MISSING
     return f"{cell(median, metric, unit)} ({failed})" if failed else cell(median, metric, unit)

@@ -130,12 +130,10 @@ class Reading(NamedTuple):
 
 
 def in_other_order(order: OtherOrder) -> Reading:
-    """Return the reading with quaternions in the other order."""
     return Reading(f"read {order.name}", order.remedy, order.reread)
 
 
 def of_the_camera(sequence: Sequence) -> Reading:
-    """Return the reading of poses of the left camera."""
     R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T
     remedy = "the poses look like the left camera's: multiply each by the inverse of T_imu_cam from the right"
     return Reading("read as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
@@ -199,7 +197,6 @@ def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:
 
 
 def range_s(t_ns: IntArray) -> str:
-    """Return the first and the last of stamps as text."""
     return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
 
 
@@ -280,12 +277,10 @@ class _Steps(NamedTuple):
         return np.asarray(turns / self.duration_s[:, None])
 
     def mean_rates(self, reference: Reference) -> Array:
-        """Return the means (M, 3) of the reference's rates, taken as straight lines."""
         at_stamps = turned(reference.rates_t_ns, reference.rates_radps, self.t_ns)
         return np.asarray((at_stamps[self.end] - at_stamps[self.start]) / self.duration_s[:, None])
 
     def speeds(self, positions: Array) -> Array:
-        """Return the speeds (M,) m/s of positions (N, 3)."""
         return np.asarray(np.linalg.norm(positions[self.end] - positions[self.start], axis=1) / self.duration_s)
 
 
@@ -371,7 +366,6 @@ class BodyTurn(NamedTuple):
 
     @property
     def angle_rad(self) -> float:
-        """The angle of the turn."""
         return float(_angle_rad(self.R_truth_body))
 
     @property
@@ -381,7 +375,6 @@ class BodyTurn(NamedTuple):
 
     @property
     def is_other_body(self) -> bool:
-        """Say whether the body's axes are others."""
         return self.is_told and self.angle_rad > _OTHER_AXES_RAD
 
 
@@ -592,7 +585,6 @@ class _Fit:
 
     @property
     def is_near(self) -> bool:
-        """Say whether the positions fit as given, or mirrored."""
         return min(self.off_share(np.eye(3)), self.off_share(-np.eye(3))) < _FITTING_SHARE
 
     @property
@@ -602,7 +594,6 @@ class _Fit:
 
     @property
     def turns(self) -> bool:
-        """Say whether both have orientations that change."""
         return self.turned_by_rad > _FITTING_RAD
 
     @cached_property
@@ -644,5 +635,4 @@ def _scatter_rad(rotations: Array) -> tuple[Array, float]:
 
 
 def _angle_rad(rotations: Array) -> Array:
-    """Return the angles (...) of rotations (..., 3, 3)."""
     return np.asarray(np.linalg.norm(so3_log(rotations), axis=-1))

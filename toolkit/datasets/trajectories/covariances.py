@@ -43,12 +43,10 @@ class CovConvention(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the name by which options and headers call it."""
         return f"{self.order}/{self.perturbation}"
 
     @property
     def words(self) -> str:
-        """Return the convention as the header of a file says it."""
         blocks = "rotation (rad), position (m)" if self.order == "rot-pos" else "position (m), rotation (rad)"
         return f"cov-convention {self.name}: {blocks}; {MEANINGS[self.perturbation]}"
 

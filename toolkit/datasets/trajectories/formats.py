@@ -84,7 +84,6 @@ class Rows:
 
     @property
     def width(self) -> int:
-        """The number of cells of the first line."""
         return len(self.cells[0])
 
     def numbers(self, width: int, columns: str) -> Array:
@@ -253,7 +252,6 @@ class Stamped:
         return 1 + len(self.order) + _TRIANGLES[self.covariance]
 
     def recognises(self, rows: Rows) -> bool:
-        """Say whether rows have the separator and the number of columns of this format."""
         fits = rows.width >= self._width if self.may_go_on else rows.width == self._width
         return fits and rows.commas == self.commas
 
@@ -345,7 +343,6 @@ class Kitti:
     _WIDTH = 12
 
     def recognises(self, rows: Rows) -> bool:
-        """Say whether rows have twelve columns between blanks."""
         return not rows.commas and rows.width == self._WIDTH
 
     def parse(self, rows: Rows) -> PosesFile:

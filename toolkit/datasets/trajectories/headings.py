@@ -50,7 +50,6 @@ def named_columns(names: Sequence[str]) -> Named | None:
 
 
 def is_of_the_globe(names: Iterable[str]) -> bool:
-    """Say whether a table has latitudes and longitudes."""
     words = {word for name in names for word in _words(name)}
     return bool(words & {"lat", "latitude"} and words & {"lon", "long", "lng", "longitude"})
 

@@ -69,8 +69,8 @@ def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
 
 
 def _middle(evaluation: EvaluatedSystems, system: str, sequence: str) -> RunRecord | None:
-    key, cell = evaluation.ranked_by.key, evaluation.cells[system, sequence]
-    good = [(value, run) for run in cell.runs if run.status == "ok" and (value := run.metrics.get(key)) is not None]
+    key, runs = evaluation.ranked_by.key, evaluation.ok_runs(system, sequence)
+    good = [(value, run) for run in runs if (value := run.metrics.get(key)) is not None]
     ordered = sorted(good, key=lambda pair: pair[0])
     return ordered[(len(ordered) - 1) // 2][1] if ordered else None
 
@@ -175,8 +175,7 @@ def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
         over = "the runs that are ok"
         groups = {
             sequence: {
-                name: [run.metrics.get(metric.key) for run in cells[name, sequence].runs if run.status == "ok"]
-                for name in systems
+                name: [run.metrics.get(metric.key) for run in evaluation.ok_runs(name, sequence)] for name in systems
             }
             for sequence in sequences
         }
