@@ -361,8 +361,7 @@ def calibration(places: list[Any], unstated: str = "") -> Items:
         info.value.P[[0, 2, 3, 5, 6, 10]] = 250.0, 160.0, -100.0 * side, 250.0, 100.0, 1.0
         if unstated:
             getattr(info.value, unstated).fill(0.0)
-    mounted = [ROS.transform(START_NS, "imu0", f"cam{side}", T) for side, T in enumerate(places)]
-    return [ROS.static(START_NS, mounted), *infos]
+    return [ROS.static(START_NS, {f"cam{side}": T for side, T in enumerate(places)}), *infos]
 
 
 def beside(case: Case) -> None:
@@ -405,12 +404,10 @@ def imu(name: str, late_ns: int = 0, gyro: float = 1.0, accel: float = 1.0) -> l
 
 
 def wheels(name: str, speed_mps: float, kind: str = "nav_msgs/msg/Odometry") -> list[Item]:
-    made, twist = [], ROS.make("geometry_msgs/Twist", ROS.vector([speed_mps, 0.0, 0.0]), ROS.vector([0.0] * 3))
-    for t_ns in range(START_NS - PERIOD_NS, START_NS + FRAMES * PERIOD_NS, PERIOD_NS):
-        one = ROS.odometry(t_ns, [0.0] * 6 + [1.0], [speed_mps, 0.0, 0.0], [0.0] * 3)._replace(topic=name)
-        stamped = ROS.make("geometry_msgs/TwistStamped", ROS.header(t_ns, "imu0"), twist)
-        made.append(one if kind == one.type else one._replace(type=kind, value=stamped))
-    return made
+    twist = {"linear": [speed_mps, 0.0, 0.0]}
+    parts = {"child_frame_id": "imu0", "twist": {"twist": twist}} if kind.endswith("Odometry") else {"twist": twist}
+    stamps = range(START_NS - PERIOD_NS, START_NS + FRAMES * PERIOD_NS, PERIOD_NS)
+    return [ROS.item(t_ns, name, kind, "imu0", **parts) for t_ns in stamps]
 
 
 def in_frame(one: Item, frame: str) -> Item:

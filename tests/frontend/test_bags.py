@@ -3,7 +3,7 @@
 import importlib.util
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,7 @@ from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.bags import ROLES
 from toolkit.datasets.io import bag_reader
 from toolkit.errors import DataError
-from toolkit.geometry import so3_exp
+from toolkit.geometry import se3, so3_exp
 from toolkit.measurements import ImuNoise
 from toolkit.models.noise import mems_imu
 from toolkit.motion_samples import ImuSamples, TwistSamples
@@ -46,6 +46,21 @@ class Item(NamedTuple):
     value: Any
 
 
+def fill(message: Any, values: Mapping[str, Any]) -> Any:
+    """Set fields of a message, and return it."""
+    for name, value in values.items():
+        part = getattr(message, name)
+        if isinstance(value, Mapping):
+            fill(part, value)
+        elif is_dataclass(part):
+            inner = [field.name for field in fields(part) if field.name != "__msgtype__"]
+            number = int if "sec" in inner else float
+            fill(part, dict(zip(inner, map(number, value), strict=True)))
+        else:
+            setattr(message, name, value)
+    return message
+
+
 @dataclass(frozen=True)
 class Ros:
     """The messages of one generation of ROS."""
@@ -61,70 +76,63 @@ class Ros:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
         return cls(kind, store)
 
-    def make(self, name: str, *values: Any) -> Any:
-        return self.store.types[name.replace("/", "/msg/")](*values)
+    def zero(self, kind: str, **values: Any) -> Any:
+        """Return a message of a type, zero but for some fields; a part of it is a mapping, or its numbers in order."""
+        name = kind.replace("/", "/msg/") if kind.count("/") == 1 else kind
+        fields = {field: self._nothing(*of_field) for field, of_field in self.store.fielddefs[name][1]}
+        return fill(self.store.types[name](**fields), values)
 
-    def header(self, t_ns: int, frame: str) -> Any:
-        stamp = self.make("builtin_interfaces/Time", *divmod(int(t_ns), 10**9))
-        return self.make("std_msgs/Header", *(() if self.kind != "ros1" else (0,)), stamp, frame)
+    def _nothing(self, node: Any, detail: Any) -> Any:
+        if node.name == "NAME":
+            return self.zero(detail)
+        if node.name == "BASE":
+            return {"string": "", "bool": False}.get(detail[0], 0)
+        (inner, of_inner), count = detail
+        return np.zeros(count, of_inner[0]) if inner.name == "BASE" else []
 
-    def vector(self, values: Any) -> Any:
-        return self.make("geometry_msgs/Vector3", *map(float, values))
-
-    def pose(self, values: Any) -> Any:
-        position = self.make("geometry_msgs/Point", *map(float, values[:3]))
-        return self.make("geometry_msgs/Pose", position, self.make("geometry_msgs/Quaternion", *map(float, values[3:])))
+    def item(self, t_ns: int, topic: str, kind: str, frame: str = "", **values: Any) -> Item:
+        """Return a message with a header."""
+        value = self.zero(kind, header={"stamp": divmod(int(t_ns), 10**9), "frame_id": frame}, **values)
+        return Item(t_ns, topic, value.__msgtype__, value)
 
     def imu(self, t_ns: int, gyro: Any, accel: Any) -> Item:
-        turn = self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        nothing = np.zeros(9)
-        parts = (turn, nothing, self.vector(gyro), nothing, self.vector(accel), nothing)
-        return Item(
-            t_ns, "/imu0", "sensor_msgs/msg/Imu", self.make("sensor_msgs/Imu", self.header(t_ns, "imu0"), *parts)
-        )
+        measured = {"angular_velocity": gyro, "linear_acceleration": accel}
+        return self.item(t_ns, "/imu0", "sensor_msgs/Imu", "imu0", **measured)
 
     def image(self, t_ns: int, camera: str, image: np.ndarray, encoding: str = "mono8") -> Item:
-        step = image.strides[0]
-        parts = (*image.shape[:2], encoding, 0, step, np.ascontiguousarray(image).view(np.uint8).ravel())
-        value = self.make("sensor_msgs/Image", self.header(t_ns, camera), *parts)
-        return Item(t_ns, f"/{camera}/image_raw", "sensor_msgs/msg/Image", value)
+        (height, width), data = image.shape[:2], np.ascontiguousarray(image).view(np.uint8).ravel()
+        parts = {"height": height, "width": width, "encoding": encoding, "step": image.strides[0], "data": data}
+        return self.item(t_ns, f"/{camera}/image_raw", "sensor_msgs/Image", camera, **parts)
 
     def compressed(self, t_ns: int, camera: str, content: bytes) -> Item:
-        parts = ("png", np.frombuffer(content, np.uint8))
-        value = self.make("sensor_msgs/CompressedImage", self.header(t_ns, camera), *parts)
-        return Item(t_ns, f"/{camera}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", value)
+        topic, data = f"/{camera}/image_raw/compressed", np.frombuffer(content, np.uint8)
+        return self.item(t_ns, topic, "sensor_msgs/CompressedImage", camera, format="png", data=data)
 
     def camera_info(self, t_ns: int, camera: str, sensor: Mapping[str, Any]) -> Item:
         fx, fy, cx, cy = sensor["intrinsics"]
-        K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
-        lens = np.array([*sensor["distortion_coefficients"], 0.0])
-        region = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
-        width, height = sensor["resolution"]
-        parts = (height, width, "plumb_bob", lens, K, np.zeros(9), np.zeros(12), 0, 0, region)
-        value = self.make("sensor_msgs/CameraInfo", self.header(t_ns, camera), *parts)
-        return Item(t_ns, f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", value)
+        lens = {"K": np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])}
+        lens["D"] = np.array([*sensor["distortion_coefficients"], 0.0])
+        lens = lens if self.kind == "ros1" else {name.lower(): values for name, values in lens.items()}
+        lens |= dict(zip(("width", "height"), sensor["resolution"], strict=True))
+        topic, model = f"/{camera}/camera_info", "plumb_bob"
+        return self.item(t_ns, topic, "sensor_msgs/CameraInfo", camera, distortion_model=model, **lens)
 
-    def transform(self, t_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
-        turn = self.make("geometry_msgs/Quaternion", *Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
-        moved = self.make("geometry_msgs/Transform", self.vector(T[:3, 3]), turn)
-        return self.make("geometry_msgs/TransformStamped", self.header(t_ns, parent), child, moved)
+    def transform(self, t_ns: int, topic: str, parent: str, child: str, T: np.ndarray) -> Item:
+        moved = {"translation": T[:3, 3], "rotation": Rotation.from_matrix(T[:3, :3]).as_quat()}
+        kind = "geometry_msgs/TransformStamped"
+        return self.item(t_ns, topic, kind, parent, child_frame_id=child, transform=moved)
 
-    def static(self, t_ns: int, transforms: list[Any]) -> Item:
-        return Item(t_ns, "/tf_static", TF, self.store.types[TF](transforms))
+    def static(self, t_ns: int, T_imu_child: Mapping[str, np.ndarray], topic: str = "/tf_static") -> Item:
+        moved = [self.transform(t_ns, topic, "imu0", child, T).value for child, T in T_imu_child.items()]
+        return Item(t_ns, topic, TF, self.store.types[TF](moved))
 
     def pose_stamped(self, t_ns: int, values: Any) -> Item:
-        value = self.make("geometry_msgs/PoseStamped", self.header(t_ns, "world"), self.pose(values))
-        return Item(t_ns, "/ground_truth/pose", "geometry_msgs/msg/PoseStamped", value)
+        pose = {"position": values[:3], "orientation": values[3:]}
+        return self.item(t_ns, "/ground_truth/pose", "geometry_msgs/PoseStamped", "world", pose=pose)
 
-    def odometry(self, t_ns: int, pose: Any, linear: Any, angular: Any) -> Item:
-        twist = self.make("geometry_msgs/Twist", self.vector(linear), self.vector(angular))
-        twists = self.make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
-        poses = self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), np.zeros(36))
-        value = self.make("nav_msgs/Odometry", self.header(t_ns, "odom"), "imu0", poses, twists)
-        return Item(t_ns, "/odom", "nav_msgs/msg/Odometry", value)
-
-    def text(self, t_ns: int, text: str) -> Item:
-        return Item(t_ns, "/chatter", "std_msgs/msg/String", self.make("std_msgs/String", text))
+    def odometry(self, t_ns: int, linear: Any, angular: Any) -> Item:
+        twist, pose = {"twist": {"linear": linear, "angular": angular}}, {"pose": {"orientation": (0, 0, 0, 1)}}
+        return self.item(t_ns, "/odom", "nav_msgs/Odometry", "odom", child_frame_id="imu0", twist=twist, pose=pose)
 
     def write(self, path: Path, items: list[Item]) -> Path:
         """Write messages to a bag in order of time and return its path."""
@@ -177,7 +185,7 @@ def calibration_of(asl: Path, ros: Ros, t_ns: int) -> Iterator[Item]:
     """Yield the calibration of an ASL folder as messages."""
     sensors = {camera: sensor(asl / "mav0" / camera) for camera in ("cam0", "cam1")}
     mounted = {camera: np.array(one["T_BS"]["data"]).reshape(4, 4) for camera, one in sensors.items()}
-    yield ros.static(t_ns, [ros.transform(t_ns, "imu0", camera, T) for camera, T in mounted.items()])
+    yield ros.static(t_ns, mounted)
     for camera, one in sensors.items():
         yield ros.camera_info(t_ns, camera, one)
 
@@ -194,7 +202,8 @@ def written(asl: Path, kind: str, folder: Path, items: list[Item]) -> Path:
 def film_of(asl: Path, ros: Ros) -> list[Item]:
     """Return the whole of an ASL folder as messages, and one that nobody needs."""
     film = [*motion_of(asl, ros), *images_of(asl, raw(ros)), *truth_of(asl, ros)]
-    return [*film, ros.text(film[0].t_ns, "hello")]
+    chatter = Item(film[0].t_ns, "/chatter", "std_msgs/msg/String", ros.zero("std_msgs/String", data="hello"))
+    return [*film, chatter]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -232,9 +241,7 @@ def test_a_bag_that_brings_its_calibration_needs_no_file_beside_it(asl: Path, tm
 def test_an_odometer_stands_for_the_motion_where_there_is_no_imu(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("mcap")
     poses = list(truth_of(asl, ros))
-    twists = [
-        ros.odometry(one.t_ns, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], [0.3, 0.1, 0.0], [0.0, 0.0, 0.2]) for one in poses
-    ]
+    twists = [ros.odometry(one.t_ns, [0.3, 0.1, 0.0], [0.0, 0.0, 0.2]) for one in poses]
     bag = load_sequence(str(written(asl, "mcap", tmp_path / "bag", [*images_of(asl, raw(ros)), *twists])))
     assert isinstance(bag.motion, TwistSamples)
     np.testing.assert_array_equal(bag.motion.values[0], [0.3, 0.1, 0.0, 0.0, 0.0, 0.2])
@@ -245,18 +252,13 @@ def test_an_odometer_stands_for_the_motion_where_there_is_no_imu(asl: Path, tmp_
 
 def test_poses_of_another_frame_are_moved_to_the_body(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("sqlite")
-    T_imu_marker = np.eye(4)
-    T_imu_marker[:3, 3] = [0.1, 0.2, 0.3]
-    poses = list(truth_of(asl, ros))
-    marked = []
+    T_imu_marker = se3(np.eye(3), np.array([0.1, 0.2, 0.3]))
+    poses, marked = list(truth_of(asl, ros)), []
     for one in poses:
         at, turn = one.value.pose.position, one.value.pose.orientation
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-        T[:3, 3] = [at.x, at.y, at.z]
-        value = ros.transform(one.t_ns, "world", "marker", T @ T_imu_marker)
-        marked.append(Item(one.t_ns, "/vicon/marker", bag_reader.TRANSFORM, value))
-    static = ros.static(poses[0].t_ns, [ros.transform(poses[0].t_ns, "imu0", "marker", T_imu_marker)])
+        T = se3(Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix(), np.array([at.x, at.y, at.z]))
+        marked.append(ros.transform(one.t_ns, "/vicon/marker", "world", "marker", T @ T_imu_marker))
+    static = ros.static(poses[0].t_ns, {"marker": T_imu_marker})
     film = [*motion_of(asl, ros), *images_of(asl, raw(ros)), *marked, static]
     truth = load_sequence(str(written(asl, "sqlite", tmp_path / "bag", film))).truth
     expected = load_sequence(str(asl)).truth
@@ -279,16 +281,16 @@ def test_a_truth_keeps_the_poses_it_has_or_is_of_positions_alone_or_left_out(asl
     assert lost.truth is not None
     alone = "the truth is of positions alone"
     for item in posed:
-        item.value.pose.orientation.w = item.value.pose.orientation.x = 0.0
-        item.value.pose.orientation.y = item.value.pose.orientation.z = 0.0
+        fill(item.value, {"pose": {"orientation": [0.0] * 4}})
     zero = load_sequence(str(written(asl, "sqlite", tmp_path / "zero", film)))
     assert any(alone in fact for fact in zero.provenance.facts)
     assert zero.truth is not None and (zero.truth.T_world_imu[:, :3, :3] == np.eye(3)).all()
     assert load_sequence(str(tmp_path / "zero/film"), 0, Frontend(topics="truth=none")).truth is None
     points = []
     for item in posed:
-        value = ros.make("geometry_msgs/PointStamped", item.value.header, item.value.pose.position)
-        points.append(Item(item.t_ns, "/leica/position", bag_reader.POINT, value))
+        at = item.value.pose.position
+        where = {"x": at.x, "y": at.y, "z": at.z}
+        points.append(ros.item(item.t_ns, "/leica/position", "geometry_msgs/PointStamped", point=where))
     film = [*(item for item in film if item not in posed), *points]
     path = written(asl, "sqlite", tmp_path / "point", film)
     assert load_sequence(str(path)).truth is None
@@ -355,14 +357,11 @@ def test_the_baseline_is_between_both_projections_or_that_of_the_transforms(asl:
 def test_transforms_of_tf_that_never_change_mount_the_camera(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("ros1")
     film = bare(ros, asl)
-    static = next(item for item in film if item.topic == "/tf_static")
-    stamps = [item.t_ns for item in film if item.topic == "/cam0/image_raw"]
-    moving = np.eye(4)
+    static = next(item for item in film if item.topic == "/tf_static").value.transforms
     repeated = []
-    for k, t_ns in enumerate(stamps):
-        moving[0, 3] = 0.1 * k
-        value = ros.store.types[TF]([*static.value.transforms, ros.transform(t_ns, "odom", "imu0", moving)])
-        repeated.append(Item(t_ns, "/tf", TF, value))
+    for k, t_ns in enumerate(item.t_ns for item in film if item.topic == "/cam0/image_raw"):
+        moving = ros.transform(t_ns, "/tf", "odom", "imu0", se3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])))
+        repeated.append(Item(t_ns, "/tf", TF, ros.zero(TF, transforms=[*static, moving.value])))
     film = [item for item in film if item.topic != "/tf_static"]
     path = ros.write(tmp_path / "tf.bag", [*film, *repeated])
     bag = load_sequence(str(path))
