@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
-from toolkit.datasets.io.numpy_files import NpzArchive, array_names, opened
+from toolkit.datasets.io.numpy_files import NpzArchive, holds_arrays, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measurements import StereoRig
@@ -33,7 +33,7 @@ _NAMES = {"features"}.union(*(keys.split("|") for keys in _REQUIRED))
 
 def recognises(path: Path) -> bool:
     """Say whether the path is an npz with at least one of the format's keys."""
-    return bool(_NAMES & array_names(path))
+    return holds_arrays(path, _NAMES)
 
 
 def load(path: Path) -> Sequence:

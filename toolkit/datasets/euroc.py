@@ -133,7 +133,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     facts = (
         *seen.facts,
         *remarks,
-        *(() if choice is None else (choice.reason,)),
+        *(() if choice is None else choice.facts),
         *(calibration.source, calibration.noise_source, *calibration.shifted, *calibration.unused),
     )
     simulated = is_simulated(layout.root)
@@ -177,7 +177,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
             "euroc",
             f"{path}: {ALL_SIMULATED if is_simulated(layout.root) else SIMULATED}, seed {seed}",
             (
-                *(_how_simulated(layout), choice.reason, calibration.source, calibration.noise_source),
+                *(_how_simulated(layout), *choice.facts, calibration.source, calibration.noise_source),
                 *(*calibration.unused, *_few_images(layout)),
             ),
         ),

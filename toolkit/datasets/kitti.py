@@ -31,7 +31,6 @@ from toolkit.datasets.io.image_pairs import (
     check_one_clock,
     check_several_stamps,
     first_with_images,
-    has_folders,
     image_folder,
     image_size,
     images_in,
@@ -93,7 +92,7 @@ uses_images = images_only
 
 def recognises(path: Path) -> bool:
     """Say whether the path has the folders of a pair, as KITTI names them, or one with images."""
-    return _layout(path) is not None or any(has_folders(path, *folders) for folders in _FOLDERS)
+    return _layout(path) is not None or any(all((path / side).is_dir() for side in folders) for folders in _FOLDERS)
 
 
 def load(path: Path) -> Sequence:
@@ -348,45 +347,34 @@ def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
     return TwistSamples(t_ns, v_mps, w_radps), noise, truth, (how, *facts)
 
 
-class _Day(NamedTuple):
-    """The three files of a drive's day: all cameras, the laser scanner in camera 0, and the IMU in the scanner."""
-
-    cameras: Fields
-    velo: Fields
-    imu: Fields
-
-
-def _day_of(root: Path) -> _Day:
-    folder = next((f for f in (root, root.parent) if is_regular(f / _CAMERAS)), root.parent)
+def _of_the_day(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
+    """Return the pair of two cameras whose images have a size: the rectified one, or the sensor's."""
+    folder = next((f for f in (layout.root, layout.root.parent) if is_regular(f / _CAMERAS)), layout.root.parent)
     where = (
         f"the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} into the folder of the "
         "day or of the drive"
     )
-    return _Day(*(_calibration(folder / name, where) for name in (_CAMERAS, _VELO, _IMU)))
-
-
-def _of_the_day(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
-    """Return the pair of two cameras whose images have a size: the rectified one, or the sensor's."""
-    day, sides = _day_of(layout.root), tuple(camera.name.removeprefix("image_") for camera in _cameras(layout))
+    cameras, velo, imu = (_calibration(folder / name, where) for name in (_CAMERAS, _VELO, _IMU))
+    sides = tuple(camera.name.removeprefix("image_") for camera in _cameras(layout))
     names = [f"{what}_{side}" for side in sides for what in ("S", "K", "D", "R", "T", "S_rect", "P_rect")]
-    day.cameras.require(*names, "R_rect_00")
-    for other in (day.velo, day.imu):
+    cameras.require(*names, "R_rect_00")
+    for other in (velo, imu):
         other.require("R", "T")
-    T_cam0_imu = _rigid_motion(day.velo) @ _rigid_motion(day.imu)
-    rectified_px, raw_px = (_size(day.cameras, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
+    T_cam0_imu = _rigid_motion(velo) @ _rigid_motion(imu)
+    rectified_px, raw_px = (_size(cameras, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
     if size_px == rectified_px:
-        T_rect_cam0 = se3(day.cameras.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
-        rigid(day.cameras.path, "R_rect_00", T_rect_cam0)
-        return _already(day.cameras, sides, size_px, T_rect_cam0 @ T_cam0_imu)
+        T_rect_cam0 = se3(cameras.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
+        rigid(cameras.path, "R_rect_00", T_rect_cam0)
+        return _already(cameras, sides, size_px, T_rect_cam0 @ T_cam0_imu)
     if size_px != raw_px:
         size, *both = (f"{width}x{height}" for width, height in (size_px, rectified_px, raw_px))
         raise DataError(
-            f"{day.cameras.path}: images of {size} px are neither rectified ones of that day, {both[0]}, nor raw ones, "
+            f"{cameras.path}: images of {size} px are neither rectified ones of that day, {both[0]}, nor raw ones, "
             f"{both[1]}; take the calibration of the images' day, or images that were not scaled or cut"
         )
-    cameras = [_camera(day.cameras, side) for side in sides]
-    T_left_cam0, T_right_cam0 = (_rigid_motion(day.cameras, f"_{side}") for side in sides)
-    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0), str(day.cameras.path))
+    left, right = (_camera(cameras, side) for side in sides)
+    T_left_cam0, T_right_cam0 = (_rigid_motion(cameras, f"_{side}") for side in sides)
+    pair = rectified(left, right, T_right_cam0 @ se3_inverse(T_left_cam0), str(cameras.path))
     facts = ("raw images, rectified with the day's calibration",)
     return _Mounted(pair, se3_inverse(T_left_cam0 @ T_cam0_imu), facts)
 

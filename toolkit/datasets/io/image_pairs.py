@@ -78,11 +78,6 @@ def images_only(path: Path, tracks: Tracks) -> bool:
     return True
 
 
-def has_folders(root: Path, left: str, right: str) -> bool:
-    """Say whether both folders of a pair are there, with images or without: what lacks is told when it is read."""
-    return (root / left).is_dir() and (root / right).is_dir()
-
-
 def images_in(folder: Path) -> list[Path]:
     """Return the image files of a folder by name, without hidden ones; none where there is no such folder.
 
@@ -282,13 +277,9 @@ def _nearest(t_ns: IntArray, wanted_ns: IntArray, reach_ns: float) -> IntArray:
     if t_ns.size == 0:
         return np.full(wanted_ns.size, -1)
     order = np.argsort(t_ns, kind="stable")
-    after = np.clip(np.searchsorted(t_ns[order], wanted_ns), 1, max(t_ns.size - 1, 1))
-    before = after - 1
-    after = np.minimum(after, t_ns.size - 1)
-    nearer = np.where(
-        np.abs(t_ns[order[after]] - wanted_ns) < np.abs(t_ns[order[before]] - wanted_ns), order[after], order[before]
-    )
-    return np.where(np.abs(t_ns[nearer] - wanted_ns) <= reach_ns, nearer, -1)
+    half_way = t_ns[order][:-1] + np.diff(t_ns[order]) // 2
+    nearest = order[np.searchsorted(half_way, wanted_ns)]
+    return np.where(np.abs(t_ns[nearest] - wanted_ns) <= reach_ns, nearest, -1)
 
 
 def check_both_cameras(root: Path, left: Path, right: Path) -> None:

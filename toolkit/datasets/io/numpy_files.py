@@ -10,11 +10,12 @@ import io
 import math
 import mmap
 import pickle
+import re
 import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,7 @@ MAGIC = b"\x93NUMPY"
 _CHUNK_BYTES = 1 << 18
 # Longer byte strings of a pickle stay in the file.
 _LONG_BYTES = 1 << 16
-_ZIP_MAGIC, _ZIP_HEADER = b"PK\x03\x04", struct.Struct("<26xHH")
+_ZIP_MAGIC, _LOOKED_AT = b"PK\x03\x04", 1 << 16
 _DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError, MemoryError)
 _DAMAGED_PICKLE = (
     *(ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError, MemoryError, RecursionError),
@@ -183,25 +184,16 @@ def opened(path: Path) -> Iterator[NpzArchive]:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
 
 
-def array_names(path: Path) -> set[str]:
-    """Return the keys of an archive without reading arrays; of a damaged one its first key, of anything else none."""
+def holds_arrays(path: Path, names: Iterable[str]) -> bool:
+    """Say whether a file is an archive, whole or damaged, that has an array of one of these names."""
     if not is_regular(path):
-        return set()
-    try:
-        with open_input(path) as file, zipfile.ZipFile(file) as archive:
-            return set(NpzArchive(path, archive).keys)
-    except (OSError, *_DAMAGED_ZIP):
-        return _first_key(path)
-
-
-def _first_key(path: Path) -> set[str]:
-    """Read the name in the first local header: a truncated archive has lost the directory at its end."""
-    with path.open("rb") as stream:
-        header = stream.read(_ZIP_HEADER.size)
-        if len(header) < _ZIP_HEADER.size or not header.startswith(_ZIP_MAGIC):
-            return set()
-        name_length, _ = _ZIP_HEADER.unpack(header)
-        return {stream.read(name_length).decode(errors="replace").removesuffix(".npy")}
+        return False
+    with open_input(path) as file:
+        begin = file.read(_LOOKED_AT)
+        file.seek(max(path.stat().st_size - _LOOKED_AT, 0))
+        # An archive lists its members at its end, which one that was cut off has lost; the first is named at the start.
+        listed = begin + file.read()
+    return begin.startswith(_ZIP_MAGIC) and any(re.search(rf"(?<!\w){name}\.npy".encode(), listed) for name in names)
 
 
 # Pickles of plain data ----------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ Huang, "vicon2gt", 2020). Their names are alike; the rates of rotation of the se
 first do not.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,16 +137,8 @@ def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | No
 # Of EuRoC recordings -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The truth to use, and a sentence with its file and the reason."""
-
-    truth: Truth
-    reason: str
-
-
-def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> Choice:
-    """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
+def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> TruthRead:
+    """Return the truth of a recording and why; of several, the one whose rates of rotation agree best with the gyro.
 
     Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged;
     ``images`` says why tracks are not made of images, nothing where there are none.
@@ -161,7 +153,7 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) ->
     return choice
 
 
-def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
+def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | None:
     """Return the truth of a recording as :func:`choose_truth`, or None where there is none."""
     read = {path: _read(path, mav0) for path in _tables(root, mav0)}
     if not read:
@@ -181,7 +173,7 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
     # Orientations that are all one are what a body has that never turns.
     turns = _turning_radps(found[best], imu) > _MOST_OFF_RADPS
     reason = "; ".join((reason, *(fact for fact in read[best].facts if turns or fact != OF_POSITIONS)))
-    return Choice(found[best], reason)
+    return TruthRead(found[best], (reason,))
 
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
