@@ -105,7 +105,7 @@ def _read(
 ) -> tuple[Mounted, tuple[StampedPair, ...], MotionSamples, Truth | None, tuple[str, ...]]:
     """Return the cameras, the image pairs (in the spool), the motion, the truth, and what to know of them."""
     with ros.opened(path) as bag:
-        chosen = choose(path, bag.topics, frontend.topics)
+        chosen, topics = choose(path, bag.topics, frontend.topics)
         source = recorded(bag, chosen)
         motion, how_moved = _motion_of(source)
         camera = mounted(source, motion)
@@ -117,7 +117,7 @@ def _read(
         raise DataError(f"{path}: {_why_no_pairs(chosen, listed, motion)}")
     check_frame_count(path, len(within.pairs))
     camera = _as_filmed(camera, within.pairs, frontend)
-    facts = (*within.remarks, *unstamped, *how_moved, *whose, *chosen.facts, *camera.facts)
+    facts = (*within.remarks, *unstamped, *how_moved, *whose, *topics, *camera.facts)
     return camera, within.pairs, motion, truth, facts
 
 
@@ -213,11 +213,11 @@ def _motion_of(source: Recorded) -> tuple[MotionSamples, tuple[str, ...]]:
 def _twists(source: Recorded) -> TwistSamples:
     path, topic = source.path, source.chosen.get("twist")
     if topic is None:
-        others = ", ".join(one.name for one in _usable(source.chosen.topics, ROLES["twist"]))
+        others = ", ".join(one.name for one in _usable(source.topics, ROLES["twist"]))
         remedy = (
             f"name one with --topics twist=TOPIC ({others})"
             if others
-            else f"{_RECORD_ONE}; {_there_are(source.chosen.topics)}"
+            else f"{_RECORD_ONE}; {_there_are(source.topics)}"
         )
         raise DataError(
             f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read, so nothing measures the motion; "
@@ -289,38 +289,15 @@ _LONGEST = 900
 _COMPRESSED_SUFFIX = "/compressed"
 # The topics asked for by role, None of a truth that is left out.
 Given = dict[str, Topic | None]
+# The topics of a recording by role. Where the accelerometer has one by itself, as ``accel``, ``imu`` is the gyro's.
+Chosen = Mapping[str, Topic]
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """The topics of a recording by role, all that there are, and remarks on the choice.
+def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> tuple[Chosen, tuple[str, ...]]:
+    """Return the topics by role, and which these are and which not used.
 
-    Where the accelerometer has a topic by itself, as ``accel``, ``imu`` is the gyro's.
+    Raises DataError where a requested one, or a pair of images, is missing.
     """
-
-    by_role: Mapping[str, Topic]
-    topics: Sequence[Topic]
-    facts: tuple[str, ...]
-
-    def __getitem__(self, role: str) -> Topic:
-        return self.by_role[role]
-
-    def get(self, role: str) -> Topic | None:
-        """Return the topic of a role, None where there is none."""
-        return self.by_role.get(role)
-
-    @property
-    def rectified(self) -> bool:
-        """Whether the images come rectified, as ROS says it in the last words of a topic's name."""
-        return any(_RECTIFIED in word for word in self["left"].name.split("/")[-2:])
-
-    def transforms(self, name: str) -> list[Topic]:
-        """Return the topics of transforms whose last word is a name: tf_static, or tf, which may change."""
-        return [one for one in _usable(self.topics, ros.TRANSFORMS) if one.name.rpartition("/")[2] == name]
-
-
-def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
-    """Return the topics by role; raises DataError where a requested one, or a pair of images, is missing."""
     given = _requested(path, topics, requested)
     left, right = _stereo(path, topics, given)
     imus = _usable(topics, (ros.IMU,))
@@ -337,12 +314,17 @@ def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen
         "twist": given.get("twist") or (None if imu else _most(odometry)),
         "truth": truth,
     }
-    by_role = {role: topic for role, topic in found.items() if topic is not None}
-    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in by_role.items()]
-    chosen = Chosen(by_role, topics, (f"topics: {', '.join(named)}",))
-    used = {topic.name for topic in (*by_role.values(), *chosen.transforms(_STATIC))}
+    chosen = {role: topic for role, topic in found.items() if topic is not None}
+    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in chosen.items()]
+    used = {topic.name for topic in (*chosen.values(), *_transforms(topics, _STATIC))}
     left_out = ", ".join(str(topic) for topic in topics if topic.name not in used)
-    return replace(chosen, facts=(*chosen.facts, f"topics not used: {left_out}")) if left_out else chosen
+    facts = (f"topics: {', '.join(named)}", *((f"topics not used: {left_out}",) if left_out else ()))
+    return chosen, facts
+
+
+def _transforms(topics: Sequence[Topic], name: str) -> list[Topic]:
+    """Return the topics of transforms whose last word is a name: tf_static, or tf, which may change."""
+    return [one for one in _usable(topics, ros.TRANSFORMS) if one.name.rpartition("/")[2] == name]
 
 
 def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> Given:
@@ -511,6 +493,7 @@ class Recorded:
     """
 
     path: Path
+    topics: Sequence[Topic]
     chosen: Chosen
     held: Mapping[str, Sequence[Message]]
     tree: Tree
@@ -542,7 +525,7 @@ class Recorded:
 
 def recorded(bag: Bag, chosen: Chosen) -> Recorded:
     """Read what a bag holds but its images; /tf is read where /tf_static does not join the body and the camera."""
-    fixed, changing = chosen.transforms(_STATIC), chosen.transforms(_MOVING)
+    fixed, changing = _transforms(bag.topics, _STATIC), _transforms(bag.topics, _MOVING)
     wanted = (*map(chosen.get, ("imu", "accel", "twist", "truth")), *fixed)
     held: dict[str, list[Message]] = {}
     for message in bag.messages({topic.name for topic in wanted if topic is not None}):
@@ -551,7 +534,7 @@ def recorded(bag: Bag, chosen: Chosen) -> Recorded:
         if topic is not None:
             held[topic.name] = list(islice(bag.messages({topic.name}), 1))
     static = [one for topic in fixed for message in held.get(topic.name, ()) for one in _joints(message)]
-    found = Recorded(bag.path, chosen, held, Tree(static))
+    found = Recorded(bag.path, bag.topics, chosen, held, Tree(static))
     if not changing or found.T_imu_left is not None:
         return found
     moving = (one for message in bag.messages({topic.name for topic in changing}) for one in _joints(message))
@@ -593,10 +576,10 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
 
 
 def _not_joined(source: Recorded) -> str:
-    used = source.chosen.by_role.values()
-    others = ", ".join(one.name for one in _usable(source.chosen.topics, (ros.IMU,)) if one not in used)
+    used = source.chosen.values()
+    others = ", ".join(one.name for one in _usable(source.topics, (ros.IMU,)) if one not in used)
     other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
-    tf = "/tf_static and no fixed transform of /tf" if source.chosen.transforms(_MOVING) else "/tf_static"
+    tf = "/tf_static and no fixed transform of /tf" if _transforms(source.topics, _MOVING) else "/tf_static"
     return (
         f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
         f"{source.body!r} and {source.frame_of(source.chosen['left'])!r}; {_PUT_BESIDE}{other}"
@@ -633,7 +616,8 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     T_right_left = source.tree.between(
         *(source.frame_of(one) for one in (source.chosen["right"], source.chosen["left"]))
     )
-    if source.chosen.rectified:
+    # As ROS says it in the last words of a topic's name.
+    if any(_RECTIFIED in word for word in source.chosen["left"].name.split("/")[-2:]):
         if not baseline_m > 0.0 and T_right_left is not None:
             baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
         if not (baseline_m > 0.0 and pinhole_px[0] > 0.0):
