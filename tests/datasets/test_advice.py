@@ -788,12 +788,12 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say("check-data", "@/image_0"), "is a part of a recording: name the whole recording"),
         (say("check-data", "@/poses.txt"), "name a recording and --trajectory NAME=FILE, or vislam evaluate"),
         (
-            both(lambda case: shutil.make_archive(str(case.at / "all"), "gztar", case.at), gone("image_0", "image_1")),
-            "and remove what was packed",
-        ),
-        (
             both(text("all.tar", bytes(257) + b"ustar" + bytes(9)), say("check-data", "@/all.tar")),
             "and name what was in it",
+        ),
+        (
+            both(lambda case: shutil.make_archive(str(case.at / "all"), "gztar", case.at), gone("image_0", "image_1")),
+            "and remove what was packed",
         ),
         (say("check-data", "@/.."), "is not a recording, but contains some: name drive.odometry in it"),
         (say("check-data", "https://example.org/a.npz"), "it is an address: download it and name the file"),
@@ -825,8 +825,8 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (text(YAMLS[0], BOMB), "values, with those that aliases (*name) repeat"),
         (edit(YAMLS[0], "rate_hz", "sensor_type"), "gives sensor_type a second time"),
         (edit(YAMLS[0], "data: [1", "data: [2"), "T_BS is not a rotation"),
-        (gone("mav0/imu0/data.csv"), "lay them out as KITTI's image_0, image_1 and calib.txt", as_kitti),
         (bag_inside, "no measurements but those of a bag: name bag in it", say("check-data", "@/bag")),
+        (gone("mav0/imu0/data.csv"), "lay them out as KITTI's image_0, image_1 and calib.txt", as_kitti),
         (edit(YAMLS[0], "distortion_model: none\n", ""), "lacks distortion_model or intrinsics of a camera; add them"),
         (
             both(gone("truth.tum", *TABLES), moved("mav0/cam?/data/*.png", lambda path: f"x{path.name}")),

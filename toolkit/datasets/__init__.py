@@ -10,6 +10,7 @@ Read ``course_npz`` first, then the others; parts they share are in ``io``, form
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
 """
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -21,11 +22,11 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from toolkit.datasets.io.unrecognised import why_unrecognised
+from toolkit.datasets.trajectories import read_poses
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import DataError, ExtensionError, did_you_mean, type_of
+from toolkit.errors import DataError, ExtensionError, did_you_mean, printable, type_of
 from toolkit.estimate import Trajectory
-from toolkit.files.reading import open_input, unreadable
+from toolkit.files.reading import is_regular, open_input, unreadable
 from toolkit.frontend import ImageRecording
 from toolkit.measurements import StereoRig
 from toolkit.progress import SILENT, Progress
@@ -38,6 +39,22 @@ _SHOWN = 8
 _COMPARED = 1000
 
 _ADDRESS = re.compile(r"\w+://")
+# What unpacks a file, by how it begins.
+_UNPACKED_BY = {
+    b"\x1f\x8b": "gunzip",
+    b"\x28\xb5\x2f\xfd": "unzstd",
+    b"BZh": "bunzip2",
+    b"\xfd7zXZ": "unxz",
+    b"PK\x03\x04": "unzip",
+    b"7z\xbc\xaf": "7z x",
+}
+# Archives of NumPy arrays, which need not be unpacked.
+_ARRAYS = ".npz"
+_TAR, _TAR_AT = b"ustar", 257
+# Entries of a folder that are examined, and recordings among them that are named.
+_LOOKED_AT, _NAMED = 50, 3
+# Levels below and above a path that are searched: users name dataset/sequences, or the folder of one camera.
+_BELOW, _ABOVE = 3, 4
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -105,7 +122,6 @@ class _Found(NamedTuple):
 
 
 def modules() -> dict[str, FoundModule]:
-    """Return every module of this package and of the announced ones by name, importing none of them."""
     return {one.name: one for one in _modules()}
 
 
@@ -115,7 +131,6 @@ def _modules() -> tuple[FoundModule, ...]:
 
 @cache
 def _found() -> _Found:
-    """Import every module of this package and of the announced ones."""
     modules: dict[str, ModuleType] = {}
     missing: dict[str, str] = {}
     for found in _modules():
@@ -153,18 +168,15 @@ def formats() -> dict[str, str]:
 
 
 def unavailable() -> dict[str, str]:
-    """Return the dataset modules that cannot be imported here, by name, with the dependency they lack."""
     return dict(_found().missing)
 
 
 def built_ins() -> dict[str, Maker]:
-    """Return the maker of every built-in sequence, by name."""
     offers = [module for module in _found().modules.values() if isinstance(module, BuiltIns)]
     return {name: make for offer in offers for name, make in sorted(offer.BUILT_IN.items())}
 
 
 def built_in_names() -> tuple[str, ...]:
-    """Return the names of the sequences that need no path."""
     return tuple(built_ins())
 
 
@@ -209,7 +221,11 @@ def is_built_in(source: str) -> bool:
     if source not in built_ins():
         return False
     path = Path(source)
-    return not (path.exists() and any(reader.recognises(path) for reader in _readers().values()))
+    return not (path.exists() and _is_recording(path))
+
+
+def _is_recording(path: Path) -> bool:
+    return any(reader.recognises(path) for reader in _readers().values())
 
 
 def told_of_both(sequence: Sequence, source: str) -> Sequence:
@@ -295,7 +311,7 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
                 return reader
     except OSError as error:  # a file that can be opened and not read, as on a failing disk
         raise DataError(unreadable(path, error)) from error
-    what = why_unrecognised(path, lambda inside: any(reader.recognises(inside) for reader in _readers().values()))
+    what = _why_unrecognised(path)
     lacking = "".join(f"; {name} is unavailable: {why}" for name, why in unavailable().items())
     raise DataError(f"{source}: {what}; there are {', '.join(formats())}{lacking}")
 
@@ -352,3 +368,76 @@ def _check_types(sequence: Sequence) -> None:
             raise DataError(f"{whose}: motion.{vector} has {rows} rows, and there are {stamps} stamps")
     if why := why_not_sightings(sequence):
         raise DataError(f"{whose}: {why}")
+
+
+# A path of no format: an archive, a trajectory, a run directory, a folder of recordings -------------------------------
+
+
+def _why_unrecognised(path: Path) -> str:
+    guess = _of_folder(path) if path.is_dir() else _of_file(path) if is_regular(path) else ""
+    if guess:
+        return guess
+    whole = next((above for above in islice(path.absolute().parents, _ABOVE) if _is_recording(above)), None)
+    if whole is not None:
+        return (
+            f"is a part of a recording: name the whole recording, {printable(str(whole))}; by itself it is of no "
+            "known format"
+        )
+    return "its content is of no known format"
+
+
+def _of_folder(path: Path) -> str:
+    if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
+        return (
+            "is a run directory and no recording: vislam report shows it, and --config "
+            f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
+        )
+    inside = [printable(str(entry.relative_to(path))) for entry in _recordings_in(path)]
+    if not inside and (packed := _packed_in(path)):
+        return packed
+    return f"is not a recording, but contains some: name {' or '.join(inside)} in it" if inside else ""
+
+
+def _packed_in(folder: Path) -> str:
+    files = [entry for entry in islice(sorted(folder.iterdir()), _LOOKED_AT) if is_regular(entry)]
+    packed = [f"{file.name} with {how}" for file in files if (how := _unpacked_by(file))]
+    if not packed:
+        return ""
+    named = printable(", ".join(packed[:_NAMED]))
+    of_rosbag2 = any(ending in name for name in packed for ending in (".db3", ".mcap"))
+    lost = " (metadata.yaml is missing; a single one is read without it)" if of_rosbag2 else ""
+    return f"holds packed files: unpack {named}{lost} and remove what was packed; as it stands it is of no known format"
+
+
+def _of_file(path: Path) -> str:
+    if path.stat().st_size == 0:
+        return "the file is empty and so of no known format"
+    if how := _unpacked_by(path):
+        return f"is packed, unpack it with {how} and name what was in it: as it stands it is of no known format"
+    try:
+        read_poses(path)
+    except DataError:
+        return ""
+    return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
+
+
+def _recordings_in(path: Path) -> list[Path]:
+    """Return a few recordings in a folder, or, where it has none, in the folders in it, and so on."""
+    level = [path]
+    for _ in range(_BELOW):
+        entries = [entry for folder in level for entry in islice(sorted(folder.iterdir()), _LOOKED_AT)][:_LOOKED_AT]
+        found = [entry for entry in entries if _is_recording(entry)][:_NAMED]
+        if found:
+            return found
+        level = [entry for entry in entries if entry.is_dir() and os.access(entry, os.R_OK | os.X_OK)]
+    return []
+
+
+def _unpacked_by(path: Path) -> str:
+    with open_input(path) as file:
+        begin = file.read(_TAR_AT + len(_TAR))
+    if path.suffix == _ARRAYS:
+        return ""
+    if begin[_TAR_AT:] == _TAR:
+        return "tar xf"
+    return next((how for magic, how in _UNPACKED_BY.items() if begin.startswith(magic)), "")

@@ -251,7 +251,6 @@ def _messages_of(source: Recorded, topic: Topic) -> Sequence[Message]:
 
 
 def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Array]:
-    """Return stamps (N,) and what an Imu measures (N, 3)."""
     messages = _messages_of(source, topic)
     part = ros.VECTORS[topic.type][what == "acceleration"]
     values = ros.columns([message.value for message in messages], part)
@@ -436,7 +435,6 @@ def _truth_topic(topics: Sequence[Topic]) -> Topic | None:
 
 
 def _usable(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:
-    """Return the topics of some types that hold messages which can be read."""
     return [topic for topic in topics if topic.type in types and topic.count and not topic.unreadable]
 
 
@@ -500,7 +498,6 @@ class Recorded:
     in_tf: bool = False
 
     def of(self, topic: Topic | None) -> Sequence[Message]:
-        """Return the messages of a topic in the order of recording; none where there is no such topic."""
         return () if topic is None else self.held.get(topic.name, ())
 
     def frame_of(self, topic: Topic | None, *, of_child: bool = False) -> str:
@@ -519,7 +516,6 @@ class Recorded:
 
     @property
     def T_imu_left(self) -> Array | None:
-        """Where the left camera stands on the body, None where no transform says it."""
         return self.tree.between(self.body, self.frame_of(self.chosen["left"]))
 
 
@@ -641,7 +637,6 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
 
 
 def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
-    """Return the topics of both calibrations and their first messages; raises DataError where one is missing."""
     chosen, topics, infos = source.chosen, [], []
     for image, topic in ((chosen["left"], chosen.get("left_info")), (chosen["right"], chosen.get("right_info"))):
         messages = source.of(topic)

@@ -83,7 +83,6 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
 
 
 def images_of(path: Path, frontend: Frontend) -> ImageRecording:
-    """Return the image pairs and their cameras; raises DataError where there are none or not one a stamp."""
     parts = _parts(path)
     spool = ImageSpool(str(_beside(path)))
     pairs, size_px = _spooled(parts, spool, SILENT)
@@ -91,7 +90,6 @@ def images_of(path: Path, frontend: Frontend) -> ImageRecording:
 
 
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
-    """Read a recording and make its tracks of the images beside it; raises DataError as :func:`images_of`."""
     parts = _parts(path)
     spool = ImageSpool(str(_beside(path)))
     try:

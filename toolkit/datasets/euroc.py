@@ -58,8 +58,8 @@ SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 ALL_SIMULATED = "simulated IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
-_BAGS = {".bag", ".db3", ".mcap"}
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
+_BAGS = {".bag", ".db3", ".mcap"}
 # With fewer of its images a recording is cut short or a sample: tracks from them would be of another recording.
 _NEARLY_ALL = 0.9
 # Up to 14 m the disparity stays five standard deviations above zero.

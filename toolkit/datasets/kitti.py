@@ -320,12 +320,10 @@ def _listed_by_stamps(layout: _Layout) -> Listed:
 
 
 def _cameras(layout: _Layout) -> tuple[Path, ...]:
-    """Return the folders of both cameras, whose images may be in a folder inside."""
     return tuple(layout.root / images.relative_to(layout.root).parts[0] for images in (layout.left, layout.right))
 
 
 def _packets_motion(layout: _Layout, frames_t_ns: IntArray) -> _Moved:
-    """Return what the packets say; without packets a smooth motion is assumed."""
     packets = _read_packets(layout.root / "oxts")
     if packets is None:
         how = "no oxts: no motion input, all estimators assume smooth motion"

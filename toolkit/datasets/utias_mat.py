@@ -38,7 +38,6 @@ _MOTION_CAPTURE_FACTS = (
 
 
 def recognises(path: Path) -> bool:
-    """Say whether the path is a Matlab file of any version."""
     if not is_regular(path):
         return False
     with open_input(path) as stream:

@@ -45,8 +45,6 @@ class _Truth(Struct, frozen=True):
 
 
 class _Text(Struct, frozen=True, kw_only=True):
-    """What recording.json holds."""
-
     schema: Literal["vislam.recording/1"] = "vislam.recording/1"
     name: str
     provenance: Provenance

@@ -45,11 +45,9 @@ _NO_CHOICE = "Invalid enum value"
 _PLACED = re.compile(r"(?P<what>.*) - at (`key` in )?`\$(?P<path>[^`]*)`", re.DOTALL)
 
 
-def _as_it_is(value: Any) -> Any:
-    return value
-
-
-def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is, **given: Any) -> Record:
+def of_attributes(
+    record: type[Record], value: object, made: Callable[[Any], Any] = lambda value: value, **given: Any
+) -> Record:
     """Return the record with the given fields and, for the others, the value's attributes of the same names."""
     rest = [name for name in record.__struct_fields__ if name not in given]
     return record(**given, **{name: made(getattr(value, name)) for name in rest})
@@ -81,7 +79,6 @@ def to_line(record: msgspec.Struct) -> str:
 
 
 def reader(record: type[Record], remedy: str, older: Older | None = None) -> Callable[[Path], Record]:
-    """Return the function that reads the record in a file, as :func:`read` does."""
     return partial(read, record=record, remedy=remedy, older=older)
 
 
@@ -117,7 +114,7 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
         document = json.loads(content, parse_constant=_NotFinite, parse_float=_finite_or_not)
     except _NOT_JSON as why:
         raise DataError(f"cannot be read as JSON ({why})") from why
-    known = schema_names(record)
+    known = get_args(get_type_hints(record)["schema"])  # names and versions, the present one last
     given = document.get("schema") if isinstance(document, dict) else None
     wanted = known[-1]
     if older and isinstance(document, dict) and isinstance(given, str) and given in older:
@@ -131,13 +128,7 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
         raise DataError(f"breaks the contract {wanted}: {readable(why, document, record)}") from why
 
 
-def schema_names(record: type[msgspec.Struct]) -> tuple[str, ...]:
-    """Return the names and versions of a record's contract, such as vislam.metrics/1, the present one last."""
-    return get_args(get_type_hints(record)["schema"])
-
-
 def schema(record: type[msgspec.Struct]) -> Json:
-    """Return the JSON schema (draft 2020-12) of a record."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(record)}
 
 
@@ -193,7 +184,6 @@ def _choices(record: type[msgspec.Struct], steps: tuple[str | int, ...]) -> Iter
 
 
 def _inside(kind: inspect.Type, step: str | int) -> Iterator[inspect.Type]:
-    """Yield the types that one step into a value of a type may lead to."""
     if isinstance(kind, inspect.StructType):
         yield from (one for field in kind.fields if field.encode_name == step for one in _each(field.type))
     elif isinstance(kind, inspect.DictType):

@@ -17,8 +17,7 @@ _KINDS = (
     (stat.S_ISDIR, "it is a directory; name a file"),
     (stat.S_ISFIFO, "it is a pipe; write it to a regular file first"),
     (stat.S_ISSOCK, "it is a socket; name a regular file"),
-    (stat.S_ISCHR, "it is a device; name a regular file"),
-    (stat.S_ISBLK, "it is a device; name a regular file"),
+    (lambda mode: stat.S_ISCHR(mode) or stat.S_ISBLK(mode), "it is a device; name a regular file"),
 )
 _REMEDIES = {
     **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG), "check the path"),
@@ -41,7 +40,6 @@ def open_input(path: Path) -> BinaryIO:
 
 
 def read_input(path: Path) -> bytes:
-    """Return the content of a regular file; raises DataError as :func:`open_input` does."""
     with open_input(path) as file:
         try:
             return file.read()
@@ -80,7 +78,6 @@ def check_regular(path: Path) -> None:
 
 
 def is_regular(path: Path) -> bool:
-    """Say whether a path is a regular file; False where it cannot be examined."""
     try:
         return stat.S_ISREG(path.stat().st_mode)
     except (OSError, ValueError):

@@ -224,7 +224,7 @@ class LineFile:
             raise _unwritable(path, error, "place") from error
         try:
             self._lock()
-            self._cut_off(whole_length(path.read_bytes()))
+            self._cut_off(path.read_bytes().rfind(b"\n") + 1)
         except BaseException:
             self.close()
             raise
@@ -241,7 +241,6 @@ class LineFile:
             raise _unwritable(self._path, error, "place") from error
 
     def close(self) -> None:
-        """Let other processes write."""
         os.close(self._fd)
 
     def _lock(self) -> None:
@@ -259,14 +258,8 @@ class LineFile:
             os.ftruncate(self._fd, length)
 
 
-def whole_length(content: bytes) -> int:
-    """Return how long the part of a text is whose lines have their ends."""
-    return content.rfind(b"\n") + 1
-
-
 def whole_lines(content: bytes) -> list[bytes]:
-    """Return the lines of a text that have their ends, without them."""
-    return content[: whole_length(content)].split(b"\n")[:-1]
+    return content.split(b"\n")[:-1]
 
 
 def _swap(new: Path, target: Path, owner: Owner) -> None:

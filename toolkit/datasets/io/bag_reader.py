@@ -280,7 +280,6 @@ def stamp_ns(header: Any, recorded_ns: int) -> int:
 
 
 def is_stamped(header: Any) -> bool:
-    """Say whether a header has a stamp."""
     return bool(header.stamp.sec or header.stamp.nanosec)
 
 
@@ -368,7 +367,6 @@ def poses_of(messages: Sequence[Message], message_type: str) -> tuple[IntArray, 
 
 
 def frame_name(name: Any) -> str:
-    """Return the name of a frame without the slash that ROS 1 may write before it."""
     return str(name).lstrip("/")
 
 

@@ -105,7 +105,6 @@ class Fields:
         return array
 
     def positive(self, key: str) -> float:
-        """Return a single positive number."""
         value = self.number(key)
         if value <= 0.0:
             raise DataError(f"{self.path}: {key} is {value:g}, expected a positive number")
@@ -121,7 +120,6 @@ class Fields:
         return float(vector[0])
 
     def rigid(self, key: str) -> Array:
-        """Return a rigid motion (4, 4)."""
         return rigid(self.path, key, self.constant(key, 4, 4))
 
 
@@ -134,7 +132,6 @@ def check_numeric(path: Path, key: str, dtype: np.dtype[np.generic]) -> None:
 
 
 def rigid(path: Path, key: str, T: Array) -> Array:
-    """Return T (4, 4), or raise DataError where it is not a rotation and a translation."""
     check_rigid(f"{path}: {key}", T, _RIGID_TOLERANCE)
     return T
 
@@ -342,8 +339,6 @@ def read_fields(path: Path) -> Fields:
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """PyYAML's safe loader, which takes OpenCV's matrices as the mappings they are, and a key only once."""
-
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._values, self._values_in = 0, dict[int, int]()

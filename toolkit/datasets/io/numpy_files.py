@@ -130,11 +130,9 @@ class NpzArchive:
 
     @property
     def keys(self) -> list[str]:
-        """The keys of all arrays."""
         return [name.removesuffix(".npy") for name in self.archive.namelist() if name.endswith(".npy")]
 
     def fields(self, *left_out: str) -> Fields:
-        """Read every array whole, but for the keys left out."""
         return Fields(self.path, {key: self._dense(key) for key in self.keys if key not in left_out})
 
     def corners(self, key: str, frame_count: int) -> Corners:

@@ -144,7 +144,6 @@ class Columns:
         return exact_ns(list(map(str, self._cells(SECONDS))), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
 
     def at(self, row: int) -> str:
-        """Return how a row is called."""
         return f"row {row}" if self.numbers_of_rows is None else f"line {self.numbers_of_rows[row]}"
 
     def _cells(self, name: str) -> Sequence[Any]:

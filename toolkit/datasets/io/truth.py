@@ -117,7 +117,6 @@ def stamps_within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) ->
 
 
 def truth_near(truth: Truth, t_ns: IntArray) -> Truth:
-    """Return the truth at those stamps (K,) that lie between truths close enough to interpolate."""
     return truth_at(truth, stamps_within(t_ns, truth.t_ns, truth.t_ns))
 
 
