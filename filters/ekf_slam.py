@@ -10,13 +10,10 @@ observes. Here every Jacobian is evaluated at first estimates, with which global
 unobservable (Huang, Mourikis & Roumeliotis 2010).
 
 A landmark's first estimate comes from one stereo sighting, and may be poor. With an IMU, a landmark that has moved from
-its first estimate by more than 0.3 of its distance is therefore started again from its next sighting; what its earlier
-sightings contributed to the other states is kept. Over six draws of 15 s this made the position error 0.75 +- 0.12
-times as large on `drive-imu` (NEES 3.0 -> 1.1). With thirty tracks that are never lost and 2 px of noise the factor was
-0.51 +- 0.21 there (NEES 18 -> 1.6) and 0.64 +- 0.22 on `flight`. Between 0.2 and 0.4 the threshold hardly matters. With
-odometry, which measures how much nearer landmarks come, restarting costs more than the old Jacobians do: on real drives
-the error was 6 % larger. What remains approximate: an update is one Gauss-Newton step with Jacobians at first
-estimates.
+its first estimate by more than a share of its distance is therefore started again from its next sighting; what its
+earlier sightings contributed to the other states is kept (docs/estimators.md). With odometry, which measures how much
+nearer landmarks come, restarting costs more than the old Jacobians do. What remains approximate: an update is one
+Gauss-Newton step with Jacobians at first estimates.
 """
 
 from collections.abc import Callable

@@ -2,11 +2,10 @@
 
 What it approximates: as `riekf`, but a frame corrects to the most probable state given the prediction instead of taking
 one Gauss-Newton step. The prediction stays Gaussian and past sightings stay linearised where they were. It therefore
-matters in which coordinates the prediction is Gaussian: iterated over landmarks in metres, the mean is biased along
-their depth (NEES of the pose 3 to 9 in flight and on the road, where one step has 1), and more so with Jacobians of the
-covariance at first estimates. Landmarks are therefore parametrised by inverse depth from the camera that first saw
-them, as in `riekf`; in these coordinates a stereo sighting is linear. The covariance is that of the right-invariant
-error, reduced with Jacobians at the corrected estimate, so that global position and heading stay unobservable.
+matters in which coordinates the prediction is Gaussian: iterated over landmarks in metres, the mean would be biased
+along their depth. Landmarks are therefore parametrised by inverse depth from the camera that first saw them, as in
+`riekf`; in these coordinates a stereo sighting is linear. The covariance is that of the right-invariant error, reduced
+with Jacobians at the corrected estimate, so that global position and heading stay unobservable.
 
 The update is Gauss-Newton to the most probable state given the prediction and one frame. An EKF update is the first
 step of that iteration; every further step linearises where the one before it ended (Bell & Cathey 1993, "The iterated

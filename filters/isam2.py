@@ -93,10 +93,7 @@ class Isam2:
         return {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
 
     def _relinearise(self, in_view: dict[int, Array], estimate: Estimate) -> None:
-        """Mark the landmarks (3,) m in view that are too far from their linearisation points, rejected ones included.
-
-        ``in_view`` is in ascending order of track ids.
-        """
+        """Mark the landmarks (3,) m in view, by ascending id, that are too far from where they are linearised."""
         keys, now = landmark_keys(in_view), np.array(list(in_view.values())).reshape(-1, 3)
         rows = np.flatnonzero(linearised_badly(now, self._tree.linearised_at(keys), estimate.T_world_imu, self._rig))
         self._tree.relinearise(keys[row] for row in rows)

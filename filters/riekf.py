@@ -7,9 +7,8 @@ translation or rotation of the world is then the same error vector at every esti
 it wherever they are evaluated. They can therefore be evaluated at the latest estimates. Only the biases are outside the
 group, and only through them does the propagation of the error depend on the estimate.
 
-A landmark is anchored in the camera that first saw it, and is parametrised by its inverse depth from there. In metres
-the squared position error was 2.2 times as large on drive-imu, and 1.3 times in flight. What remains approximate: an
-update is one Gauss-Newton step, and a landmark's first estimate is one stereo sighting, whose depth is not Gaussian.
+A landmark is anchored in the camera that first saw it, and is parametrised by its inverse depth from there. What
+remains approximate: an update is one Gauss-Newton step.
 """
 
 from functools import partial

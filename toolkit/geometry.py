@@ -65,10 +65,7 @@ def skew(v: Array) -> Array:
 
 
 def transposed(matrices: Array) -> Array:
-    """Return matrices (..., m, n) transposed, (..., n, m), in memory too.
-
-    A product of many small ones with a view of the transposed takes three times as long.
-    """
+    """Return matrices (..., m, n) transposed in memory too: products of small ones are three times as fast."""
     return np.ascontiguousarray(np.swapaxes(matrices, -1, -2))
 
 

@@ -267,10 +267,7 @@ def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None
 
 
 def cholesky_root(cov: Array) -> Array:
-    """Return the lower triangular C with ``C C^T`` equal to a covariance (n, n), which may be overwritten.
-
-    Raises LinAlgError where it has none.
-    """
+    """Return the lower triangular C of ``C C^T`` (n, n), which may be overwritten; raise LinAlgError without one."""
     # LAPACK is column-major and NumPy row-major: the transposed upper root is the lower one, and nothing is copied.
     root, failed = dpotrf(cov.T, lower=0, overwrite_a=1)
     if failed:

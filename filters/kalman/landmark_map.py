@@ -74,10 +74,7 @@ def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, A
 
 
 def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
-    """Start the landmarks of rows (m,) of a frame from its pose (4, 4).
-
-    Tracks whose disparity is too small are left for a later frame.
-    """
+    """Start the landmarks of rows (m,) of a frame from its pose (4, 4), but for those of too small a disparity."""
     uvs_px = frame.uvs_px[rows]
     near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
     return LandmarkMap(frame.track_ids[rows][near], *started(uvs_px[near], T_world_imu, rig))

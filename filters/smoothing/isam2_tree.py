@@ -210,10 +210,7 @@ class Isam2Tree:
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> Recovery:
-        """Add a frame whose new state has the given keys; return the recoveries.
-
-        Raises EstimatorError where the system stays indeterminate after all recoveries.
-        """
+        """Add a frame with the keys of its new state; return the recoveries, or raise EstimatorError if none helps."""
         has_landmarks = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
         self._frozen.add_frame(factors.keyVector())
@@ -505,10 +502,7 @@ class Isam2Tree:
 
 
 def state_thresholds(motion: MotionModel, baseline_m: float) -> dict[str, Array]:
-    """Return how far a state's variables may move from their linearisation points, (6,) or (3,) by kind.
-
-    In GTSAM's tangent spaces.
-    """
+    """Return how far a state's variables may move from where they are linearised, (6,) or (3,) by kind, as in GTSAM."""
     pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * baseline_m], 3)
     at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
     return {kind: at_most[kind][-size:] for kind, size in motion.variable_sizes.items()}

@@ -95,10 +95,7 @@ class KnownLandmarks:
 
 
 def relative_to_its_map(belief: Belief) -> Belief:
-    """Return the belief with a pose covariance of zero.
-
-    Landmarks were estimated from the pose and share its error; no sighting depends on the common error.
-    """
+    """Return the belief with no error of its pose: landmarks were estimated from it and share that error."""
     cov = belief.cov.copy()
     cov[POSE], cov[:, POSE] = 0.0, 0.0
     return replace(belief, cov=cov)

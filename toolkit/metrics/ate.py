@@ -111,10 +111,7 @@ def position_rmse(matched: Matched, alignment: Alignment) -> float:
 
 
 def rotation_rmse_deg(matched: Matched, alignment: Alignment) -> float:
-    """Return the root mean square of the angles between true and aligned rotations, in degrees.
-
-    Raises Unavailable where the alignment does not determine a rotation.
-    """
+    """Return the RMSE of the rotation angles (deg); raise Unavailable where the alignment leaves them open."""
     if not alignment.rotation_is_unique:
         raise Unavailable(_ON_A_LINE)
     aligned = alignment.apply(matched.estimate)

@@ -104,10 +104,7 @@ def score(evaluation: AgainstTruth) -> Scores:
 
 
 def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
-    """Return the times (n,) s of pairs, and which are no farther from their neighbours than the usual step allows.
-
-    Raises Unavailable where there are too few.
-    """
+    """Return the times (n,) s of pairs, and which are no farther apart than usual; raise Unavailable where few are."""
     t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
     wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
     usable = ~(np.append(wide, False) | np.insert(wide, 0, False))
@@ -117,10 +114,7 @@ def _usable(pairs: Matched) -> tuple[Array, BoolArray]:
 
 
 def _fit(pairs: Matched, with_rate: bool) -> _Fit:
-    """Fit a clock by Gauss-Newton: with a rate over more and more of the pairs, from the middle of the time outwards.
-
-    Raises Unavailable where it is not determined.
-    """
+    """Fit a clock by Gauss-Newton, a rate from the middle of the time outwards; raise Unavailable where none fits."""
     from scipy.interpolate import CubicSpline  # slow to import, and most processes do not need it
 
     true, estimated = pairs.positions

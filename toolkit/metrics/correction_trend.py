@@ -52,10 +52,7 @@ METRICS = (
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score the corrections of a causal output.
-
-    Raises Unavailable where there are none: no covariance of the whole state, or no second with a correction.
-    """
+    """Score the corrections of a causal output; raise Unavailable where there are none to test."""
     tests = [test for test in _tests(evaluation) if test.dof]
     if not tests:
         raise Unavailable(NOTHING_CORRECTED)

@@ -72,10 +72,7 @@ def of_stated(stated: StatedErrors) -> Scores:
 
 
 def energy_scores(errors: Array, covs: Array) -> Array:
-    """Return E|X - e| - E|X - X'| / 2 (n,) of errors e (n, d), X and X' being N(0, covariance (n, d, d)).
-
-    Gneiting & Raftery (2007), eq. 22.
-    """
+    """Return E|X - e| - E|X - X'| / 2 (n,) of errors (n, d), X and X' as stated (Gneiting & Raftery 2007, eq. 22)."""
     variances, axes = np.linalg.eigh(covs)
     along = np.einsum("nij,ni->nj", axes, errors)
     return _mean_length(along, variances) - 0.5 * _mean_length(np.zeros_like(along), 2.0 * variances)

@@ -61,10 +61,7 @@ class CameraMotion(NamedTuple):
 
 
 class Neighbours(NamedTuple):
-    """Rows into the observations: ``before`` (P,) seen in frame k, ``after`` (P,) the same track in k + 1.
-
-    Sorted by frame; ``interval`` (P,) is k.
-    """
+    """Rows of observations: ``before`` (P,) in frame ``interval`` (P,), ascending, ``after`` (P,) in the next one."""
 
     before: IntArray
     after: IntArray

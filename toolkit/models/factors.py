@@ -52,10 +52,7 @@ def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def points_of(values: gtsam.Values, track_ids: Iterable[int]) -> dict[int, Array]:
-    """Return the points (3,) of landmarks, by track: rows of one array, read at once.
-
-    Raises RuntimeError, as GTSAM does, where one has no value.
-    """
+    """Return the points (3,) of landmarks by track, rows of one array; raise RuntimeError where one has no value."""
     ascending = sorted(track_ids)
     points = gtsam.utilities.extractPoint3(values.extract(landmark_keys(ascending)))
     return dict(zip(ascending, points, strict=True))
@@ -109,10 +106,7 @@ def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> g
 
 
 def joint_prior(at: gtsam.Values, keys: list[int], cov: Array) -> gtsam.NonlinearFactorGraph:
-    """Return a joint prior on several variables at their values.
-
-    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces, in the order of the keys.
-    """
+    """Return a prior on variables at their values, of a joint covariance (d, d) in GTSAM's tangent spaces."""
     root_information = np.linalg.inv(np.linalg.cholesky(cov))
     sizes = at.dims()
     columns = np.split(root_information, np.cumsum([sizes[key] for key in keys])[:-1], axis=1)

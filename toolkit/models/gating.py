@@ -122,10 +122,7 @@ class FrameGate:
         return _table(self.probability, _bits(dof))
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
-        """Test innovations of NIS (N,) and ``dof`` (N,), and count them; return which pass (N,).
-
-        A point that is not ``in_front`` of the camera does not pass.
-        """
+        """Test and count innovations of NIS (N,) and ``dof`` (N,); return which pass (N,) and are ``in_front``."""
         accepted = np.asarray((nis < self._table(dof).bound[dof]) & in_front)
         self.count(nis, dof, accepted)
         return accepted

@@ -420,10 +420,7 @@ class Ending:
 
 
 def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> SolvedWindow:
-    """Return the window at its minimum, by Levenberg-Marquardt.
-
-    Raises EstimatorError where the error is not a number or the states are not determined.
-    """
+    """Return the window at its minimum, by Levenberg-Marquardt; raise EstimatorError where it has none."""
     here, damping = Evaluated.of(window, camera), 0.0
     if not np.isfinite(here.error):
         raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")

@@ -71,10 +71,7 @@ class Filming:
 
 
 def check_filmable(scenario: Scenario, directory: Path) -> None:
-    """Raise SettingsError where a scenario has no surfaces.
-
-    Raises OutputError where the directory holds anything else, or has no room for the images.
-    """
+    """Raise SettingsError for a scenario without surfaces, OutputError for a directory not ours or without room."""
     if not (scenario.has_surfaces and isinstance(scenario.motion, Imu)):
         raise SettingsError(f"{scenario.name} has landmarks and no surfaces to take images of; flight has")
     if scenario.varied:

@@ -424,10 +424,7 @@ def _wrapped(x: Floats, period: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Sensor noise: standard deviation in the dark (grey values), and variance for each grey value of light.
-
-    The variance grows with the light, as photon noise does.
-    """
+    """Standard deviation in the dark (grey values), and variance for each grey value of light, as photon noise has."""
 
     dark_sigma: float = 1.2
     variance_per_grey: float = 0.02

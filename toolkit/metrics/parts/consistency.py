@@ -223,10 +223,7 @@ def stated_errors(evaluation: Evaluation) -> StatedErrors:
 
 
 def with_covariances(errors: BodyErrors, cov: Array) -> StatedErrors:
-    """Return the errors whose pose has a covariance, of those (N, d, d) of all poses of the estimate.
-
-    Raises Unavailable as :func:`stated_errors`.
-    """
+    """Return the errors whose pose has a covariance, of those (N, d, d) of all; raises as :func:`stated_errors`."""
     of_pose = cov[errors.rows, :POSE_DOF, :POSE_DOF]
     stated = np.asarray(np.isfinite(np.stack([of_pose[:, :3, :3], of_pose[:, 3:, 3:]])).all(axis=(0, 2, 3)))
     if not stated.any():
@@ -239,10 +236,7 @@ def with_covariances(errors: BodyErrors, cov: Array) -> StatedErrors:
 
 
 def nees_over_time(evaluation: Evaluation) -> Nees:
-    """Return the NEES of every pose that has a covariance and a true pose.
-
-    Raises as :func:`stated_errors`, and where the covariance of the whole pose is not stated.
-    """
+    """Return the NEES of every pose; raises as :func:`stated_errors`, and where a pose's blocks are stated apart."""
     nees = nees_of(stated_errors(evaluation))
     if not nees.is_coupled:
         raise Unavailable(UNCOUPLED)

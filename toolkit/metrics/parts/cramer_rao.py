@@ -74,10 +74,7 @@ def efficient(sequence: Sequence, output: Output) -> Efficient:
 
 @lru_cache(maxsize=2)
 def claimed_bound(sequence: Sequence, at: Trajectory, output: Output) -> Array:
-    """Return the bound (K, d, d) that the model claims, linearised at estimated states.
-
-    Raises Unavailable where a frame has no estimate of the whole state.
-    """
+    """Return the bound (K, d, d) that the model claims at estimated states; raise Unavailable if a frame has none."""
     return _efficient(_problem_at_estimate(sequence, at), output).covs
 
 

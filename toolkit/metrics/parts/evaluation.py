@@ -24,10 +24,7 @@ from toolkit.sequence import Sequence
 
 @dataclass(frozen=True, eq=False)
 class Evaluation(AgainstTruth):
-    """One output of a run and the sequence it was made from.
-
-    The properties that need the truth, or a matched pair, raise Unavailable where there is none.
-    """
+    """One output of a run and its sequence; properties raise Unavailable where truth or pairs are missing."""
 
     run: Run
     output: Output
@@ -66,10 +63,7 @@ class Evaluation(AgainstTruth):
 
     @cached_property
     def held_out_errors(self) -> tuple[IntArray, Array]:
-        """Which sightings (M,) of withheld tracks have enough views with a pose, and their errors (M,) px.
-
-        They are in the order of tracks, each track's by frame.
-        """
+        """Which sightings (M,) of withheld tracks have views enough, by track, and their errors (M,) px."""
         return errors_left_out(self.sequence.held_out, self.poses_of_frames, self.sequence.rig)
 
     @cached_property

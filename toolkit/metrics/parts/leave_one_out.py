@@ -92,10 +92,7 @@ class Views:
         return PredictedSightings(self.pixels(seen).T, seen.in_front)
 
     def contributions(self, points: Array) -> Array:
-        """Return each view's part (10, N) of its track's problem: H, g and cost, linearised at the point (3, M).
-
-        The weights are Huber's.
-        """
+        """Return each view's part (10, N) of its track's robust problem at the point (3, M): H, g and cost."""
         seen = self.project(np.take(points, self.track, axis=1))
         residual = self._whitened(stereo.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
         length = np.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)

@@ -75,10 +75,7 @@ def change_under_each(stated: StatedCovariances, T_world_imu: Array) -> Mapping[
 
 
 def likelier_reading(stated: StatedCovariances, T_world_imu: Array, errors: Errors) -> str:
-    """Return in words under which conventions the covariances fit, where another than theirs, or none, is stated.
-
-    Nothing where theirs fits as well as any.
-    """
+    """Say under which conventions the covariances fit, where theirs does not fit as well as any, or none is stated."""
     under = nees_under_each(stated, T_world_imu, errors)
     if not under:
         return ""

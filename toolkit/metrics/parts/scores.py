@@ -54,10 +54,7 @@ class Unavailable(Exception):  # noqa: N818 - not an error: the run or the seque
 
 @dataclass(frozen=True)
 class Scores:
-    """Values by metric key, None where there is none, and notes by key: reasons and remarks.
-
-    A value that is not finite becomes None, with that as its reason.
-    """
+    """Values by metric key, None where there is none or it is not finite, and notes by key: reasons and remarks."""
 
     values: dict[str, float | None]
     notes: dict[str, str] = field(default_factory=dict)
