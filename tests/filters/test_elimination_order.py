@@ -1,17 +1,14 @@
-"""A smoother eliminates in the order of fewer operations, and its answer does not depend on which that is."""
+"""A smoother eliminates in the order of fewer operations."""
 
 from dataclasses import replace
 
 import gtsam
-import numpy as np
 import pytest
 
 from filters.smoothing import elimination_order
 from filters.smoothing.elimination_order import by_colamd, cheaper_order, in_time
-from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.measurements import StereoFrame
-from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.factors import StereoFactors
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
@@ -43,25 +40,13 @@ def test_where_the_order_of_time_takes_more_operations_it_is_colamds(scenario, m
     assert cheaper_order(*_problem(simulate(replace(scenario, duration_s=10.0), 1))) is by_colamd
 
 
-def test_both_orders_have_every_variable_once_and_lead_to_one_solution():
-    sequence = _standing(8.0)
-    graph, frames = _problem(sequence)
-    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
-    maker, truth = StereoFactors(sequence.rig), sequence.truth
+def test_both_orders_have_every_variable_once():
+    graph, frames = _problem(_standing(8.0))
+    maker = StereoFactors(DRIVE.rig)
     for k, frame in enumerate(frames):
-        values.insert(X(k), gtsam.Pose3(truth.T_world_imu[k]))
-        values.insert(model.keys(k)[1], np.zeros(3))
         for factor in maker.of(frame, k):
             graph.add(factor)
-        points = stereo.triangulate_world(frame.uvs_px, truth.T_world_imu[k], sequence.rig)
-        for track_id, point in zip(frame.track_ids.tolist(), points, strict=True):
-            if not values.exists(L(track_id)):
-                values.insert(L(track_id), point)
     orders = [by_colamd(graph, frames), in_time(graph, frames)]
     keys = [[order.at(i) for i in range(order.size())] for order in orders]
     assert keys[0] != keys[1]
     assert sorted(keys[0]) == sorted(keys[1]) == sorted(graph.keyVector())
-    solved = [solve(graph, values, Stopping(1e-12), ordering=order) for order in orders]
-    first, second = (np.array([s.values.atPose3(X(k)).translation() for k in range(len(frames))]) for s in solved)
-    assert all(solution.converged for solution in solved)
-    np.testing.assert_allclose(first, second, atol=1e-6)  # m; both within what the relative decrease leaves

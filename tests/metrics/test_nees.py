@@ -145,18 +145,6 @@ def of_states(run, sequence):
     return [scores.values[key] for key in BLOCKS], [scores.notes.get(key, "") for key in BLOCKS]
 
 
-@pytest.mark.parametrize("key", BLOCKS)
-def test_each_block_is_checked_by_its_own_covariance(sequence, key):
-    """One block stated four times too small in variance shows in its own figure alone."""
-    run, cov, block = drawn(sequence), COV.copy(), BLOCKS[key]
-    cov[block] *= 0.5
-    cov[:, block] *= 0.5
-    stated = replace(run.final, cov=np.broadcast_to(cov, (POSES, 15, 15)))
-    before, after = of_states(run, sequence)[0], of_states(replace(run, final=stated), sequence)[0]
-    factor = np.where([one == key for one in BLOCKS], 4.0, 1.0)
-    np.testing.assert_allclose(after, factor * before, rtol=1e-9)
-
-
 def test_a_state_without_them_says_so(sequence):
     """A state of nine has a gyro bias; one of six nothing but the pose; a truth may have poses alone."""
     run = drawn(sequence)

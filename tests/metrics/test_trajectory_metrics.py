@@ -34,17 +34,6 @@ def test_every_error_is_zero_on_truth(score, motion):
     assert values["coverage_percent"] == 100.0
 
 
-def test_no_error_depends_on_the_estimators_world(score):
-    sequence = make_sequence(drive_poses(400), track_count=3)
-    estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)
-    moved = se3_exp(np.array([0.5, -0.3, 1.9, 40.0, 5.0, -8.0])) @ estimate
-    here, there = score(sequence, estimate).values, score(sequence, moved).values
-    for key in ERRORS:
-        if key != "ate_yaw_m":  # a tilted world is an error that a fit of heading alone must show
-            assert there[key] == pytest.approx(here[key], rel=1e-9), key  # rounding of 400 m turned about
-    assert there["ate_yaw_m"] > 2.0 * here["ate_yaw_m"]
-
-
 def test_with_an_imu_a_heading_is_free_and_a_tilt_is_an_error(score):
     sequence = make_sequence(drive_poses(400), track_count=3, motion="imu")
     estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)

@@ -46,16 +46,6 @@ def test_pose_follows_the_exponential_of_each_twist(drive):
     assert compared == drive.frame_count - 1
 
 
-def test_bias_jacobian_is_the_derivative(motion):
-    step = twist.integrate(motion, BIAS, NOISE)
-
-    def moved(delta: Array) -> Array:
-        return se3_log(se3_inverse(step.T_start_end) @ twist.integrate(motion, BIAS + delta, NOISE).T_start_end)
-
-    # Entries of the order of 1 over values of the order of 1.
-    np.testing.assert_allclose(step.d_step_d_bias, numerical_jacobian(moved, 3), atol=1e-9)
-
-
 def test_covariance_carries_each_samples_noise_to_the_end(motion):
     """J Q J^T with the whole Jacobian of the end in all samples, found numerically."""
     step = twist.integrate(motion, BIAS, NOISE)

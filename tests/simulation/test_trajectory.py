@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log
+from toolkit.geometry import Array, se3_inverse, se3_log, so3_log
 from toolkit.simulation.scenes import hall, road
 from toolkit.simulation.trajectory import (
-    RotationSpline,
     SmoothTrajectory,
-    UniformKnots,
-    VectorSpline,
     blending_matrix,
 )
 
@@ -38,24 +35,6 @@ def test_blending_weights_sum_to_one_and_cubic_is_the_textbook_matrix() -> None:
     np.testing.assert_allclose(blending_matrix(4), cubic, atol=1e-15)
     for order in (4, 5, 6):
         np.testing.assert_allclose(blending_matrix(order).sum(axis=0), np.eye(order)[0], atol=1e-14)
-
-
-@pytest.mark.parametrize("order", [4, 6])
-def test_a_straight_line_of_control_points_is_a_straight_line(order: int) -> None:
-    knots = UniformKnots(-2.0, 0.5, order)
-    control = np.outer(-2.0 + 0.5 * np.arange(20), [1.0, -2.0, 3.0])
-    t_s = np.linspace(0.0, 4.0, 33)
-    np.testing.assert_allclose(VectorSpline(knots, control).at(t_s), np.outer(t_s, [1.0, -2.0, 3.0]), atol=1e-13)
-
-
-@pytest.mark.parametrize("order", [4, 6])
-def test_a_steady_turn_of_control_rotations_is_a_steady_turn(order: int) -> None:
-    knots, w = UniformKnots(-2.0, 0.5, order), np.array([0.3, -0.5, 0.8])
-    spline = RotationSpline(knots, so3_exp(np.outer(-2.0 + 0.5 * np.arange(20), w)))
-    t_s = np.linspace(0.0, 4.0, 33)
-    rotation, w_body = spline.at(t_s)
-    np.testing.assert_allclose(rotation, so3_exp(np.outer(t_s, w)), atol=1e-13)
-    np.testing.assert_allclose(w_body, np.broadcast_to(w, w_body.shape), atol=1e-13)
 
 
 def test_a_car_moves_where_it_points() -> None:
