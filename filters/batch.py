@@ -33,9 +33,7 @@ from filters.kalman.landmark_map import KnownPoseMapper
 from filters.kalman.online_output import Filter
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.indeterminate import with_covariances
-from filters.smoothing.landmark_steps import FirstImages
-from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
-from filters.smoothing.mixed_graph import MixedGraph
+from filters.smoothing.levenberg_marquardt import FirstImages, MixedGraph, Solution, Stopping, solve
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform

@@ -23,8 +23,7 @@ import numpy as np
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, with_covariances
 from filters.smoothing.isam2_tree import Isam2Tree, linearised_badly
-from filters.smoothing.landmark_steps import FirstImages
-from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.levenberg_marquardt import FirstImages, Stopping, solve
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array

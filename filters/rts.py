@@ -11,9 +11,7 @@ import gtsam
 from filters import ekf_slam
 from filters.batch import Batch, Smoothed, only_seen, placed_by_stereo, with_sightings, without_those_behind
 from filters.smoothing.elimination_order import cheaper_order
-from filters.smoothing.landmark_steps import FirstImages
-from filters.smoothing.levenberg_marquardt import Solution
-from filters.smoothing.mixed_graph import MixedGraph
+from filters.smoothing.levenberg_marquardt import FirstImages, MixedGraph, Solution
 from toolkit.estimate import Estimate
 from toolkit.estimator import Estimator, Setup
 from toolkit.measurements import Packet, StereoFrame

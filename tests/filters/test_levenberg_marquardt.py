@@ -1,4 +1,7 @@
-"""The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is reported."""
+"""The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is reported.
+
+With Python factors a solver sees the same, together or one by one; and landmarks move in the image that saw them first.
+"""
 
 from dataclasses import replace
 
@@ -6,10 +9,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing import levenberg_marquardt
+from filters.smoothing.levenberg_marquardt import FirstImages, MixedGraph, Solution, Stopping, TwistFactors, solve
 from tests.filters.conftest import Problem
 from toolkit.errors import EstimatorError
-from toolkit.models.factors import L, StereoFactors, X
+from toolkit.geometry import Array, se3_exp, transform
+from toolkit.measurements import StereoFrame, TwistMotion, TwistNoise
+from toolkit.models import stereo
+from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.models.twist import TwistIncrement, TwistModel, twist_factor
 from toolkit.simulation import DRIVE, FLIGHT
 
 EXACT, ONE = Stopping(relative_decrease=1e-12, max_iterations=100), Stopping(1e-12, 1)
@@ -75,3 +83,219 @@ def test_a_direction_nothing_measures_is_left_alone():
     assert solution.converged
     assert solution.error == pytest.approx(0.0, abs=1e-12)
     assert np.abs(solution.values.atPose3(X(0)).matrix() - np.eye(4)).max() < 0.5
+
+
+NOISE = TwistNoise(np.array([0.01, 0.02, 0.03]), np.array([0.1, 0.2, 0.3]), np.full(3, 1e-5))
+STATES = 7
+
+
+def test_errors_and_linearisations_are_the_graphs_own():
+    problem = Problem(DRIVE)
+    graph, start, increments = problem.graph, problem.start, problem.increments
+    expected = graph.linearize(start)
+    step = start.zeroVectors().scale(0.0)
+    for together in ({}, increments):
+        mixed = MixedGraph(graph, together)
+        assert mixed.error(start) == pytest.approx(graph.error(start), rel=1e-10)
+        linear = mixed.linear(start)
+        assert linear.error(step) == pytest.approx(expected.error(step), rel=1e-10)
+        found, own = linear.gradientAtZero(), expected.gradientAtZero()
+        for key in start.keys():  # noqa: SIM118 - not a mapping
+            np.testing.assert_allclose(found.at(key), own.at(key), atol=1e-8 * np.abs(own.at(X(0))).max())
+
+
+def test_a_factor_that_is_on_arrays_is_never_called():
+    problem = Problem(DRIVE)
+    graph, start, increments = problem.graph, problem.start, problem.increments
+    called: list[int] = []
+
+    def counted(_this: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        called.append(1)
+        for i in range(3 if jacobians is not None else 0):
+            jacobians[i] = np.zeros((6, (6, 6, 3)[i]))
+        return np.zeros(6)
+
+    for k in increments:
+        keys = [X(k - 1), X(k), B(k - 1)]
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, counted))
+    solve(MixedGraph(graph, increments), start, Stopping(1e-3, 2))
+    assert not called
+    solve(MixedGraph(graph), start, Stopping(1e-3, 1))
+    assert called
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-2, 0.7])
+def test_twists_together_have_the_errors_and_linearisations_of_their_factors(size):
+    """At states that are off what the steps predict by about a size (rad, m)."""
+    rng, model, steps = np.random.default_rng(3), TwistModel(NOISE), dict[int, TwistIncrement]()
+    values, pose = gtsam.Values(), se3_exp(rng.standard_normal(6))
+    for k in range(STATES):
+        if k:
+            motion = TwistMotion(np.array([0.04, 0.07]), 8.0 * rng.standard_normal((2, 3)), rng.standard_normal((2, 3)))
+            steps[k] = model.integrate(motion, 0.1 * rng.standard_normal(6))
+            pose = pose @ steps[k].step.T_start_end
+        values.insert(X(k), gtsam.Pose3(pose @ se3_exp(size * rng.standard_normal(6))))
+        values.insert(B(k), 0.1 * rng.standard_normal(3))
+    single = [twist_factor(increment.step, increment.gyro_bias, k) for k, increment in steps.items()]
+    together = TwistFactors.of(steps)
+    assert together.keys == [tuple(factor.keys()) for factor in single]
+    errors = 0.5 * np.square(together.residuals(values)).sum(axis=1)
+    # Twelve digits of squares that the smallest sigma makes a million times the residuals'.
+    np.testing.assert_allclose(errors, [factor.error(values) for factor in single], rtol=1e-9, atol=1e-16)
+    for found, factor in zip(together.linear(values), single, strict=True):
+        expected = factor.linearize(values).augmentedInformation()
+        np.testing.assert_allclose(found.augmentedInformation(), expected, atol=1e-9 * np.abs(expected).max())
+
+
+RIG, SEEN = DRIVE.rig, 6
+TO_THE_END = Stopping(0.0, 40, decrease=1e-9)
+
+
+def frame_of(k: int, rows: list[tuple[int, Array]]) -> StereoFrame:
+    ids, seen_px = zip(*rows, strict=True) if rows else ((), ())
+    return StereoFrame(k, np.array(ids, dtype=np.int64), np.array(seen_px).reshape(-1, 3))
+
+
+def bent_drive(seed: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FirstImages]:
+    """Return 200 m straight ahead, told by five tracks a frame and a vague twist, and a start that turns by 0.4 rad."""
+    rng, count = np.random.default_rng(seed), 200
+    ahead, up = RIG.T_imu_cam[:3, 2], RIG.T_imu_cam[:3, 1]
+    step, turn = se3_exp(np.concatenate([np.zeros(3), ahead])), se3_exp(np.concatenate([0.002 * up, np.zeros(3)]))
+    poses, bent = [np.eye(4)], [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ step)
+        bent.append(bent[-1] @ step @ turn)
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    rows: list[list[tuple[int, Array]]] = [[] for _ in poses]
+    for i in range(5 * count // SEEN):
+        begins = rng.integers(0, count - SEEN) if i >= count // 3 else min(3 * i, count - SEEN)
+        in_camera = np.array([*(rng.uniform(-1.0, 1.0, 2) * [6.0, 2.0]), rng.uniform(12.0, 40.0)])
+        point, start_point = (transform(path[begins] @ RIG.T_imu_cam, in_camera[None])[0] for path in (poses, bent))
+        for age in range(SEEN):
+            seen_px = stereo.predict(point[None], poses[begins + age], RIG).uv_px[0] + rng.normal(0.0, 0.5, 3)
+            rows[begins + age].append((i, seen_px))
+        start.insert(L(i), start_point)
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    twist, frames = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.05, 0.5], 3)), list[StereoFrame]()
+    for k, row in enumerate(rows):
+        start.insert(X(k), gtsam.Pose3(bent[k]))
+        if k:
+            graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(step), twist))
+        frames.append(frame_of(k, row))
+        for factor in StereoFactors(RIG).of(frames[k], k):
+            graph.add(factor)
+    return graph, start, FirstImages.of(frames, RIG)
+
+
+def test_a_solve_whose_last_iteration_gained_little_enough_has_converged_without_an_end():
+    graph, start, images = bent_drive(0)
+    for enough, converged in ((1e-3, False), (10.0, True)):
+        solution = solve(graph, start, Stopping(0.0, 3, enough=enough), landmarks=images)
+        assert solution.iterations == 3
+        assert solution.converged == converged
+
+
+def test_a_start_that_drifts_comes_to_the_minimum_in_few_iterations():
+    """With landmarks that move in metres, this took 60 (the most allowed), and ended 10 m off."""
+    graph, start, images = bent_drive(0)
+    solution = solve(graph, start, Stopping(1e-4, 10), landmarks=images)
+    assert solution.converged
+    assert solution.overshot
+    longer = solve(graph, start, TO_THE_END, landmarks=images)
+    ends = [it.values.atPose3(X(199)).translation() for it in (solution, longer)]
+    # A thousandth of what it drifts by at the start: that the error falls by less than 1e-4 of it leaves some.
+    assert np.linalg.norm(ends[0] - ends[1]) < 0.1
+    assert solution.error == pytest.approx(graph.error(solution.values), rel=1e-12)
+
+
+def test_a_step_that_was_damped_because_it_raised_the_error_is_not_the_last(monkeypatch):
+    graph, start, images = bent_drive(0)
+    any_gain_is_little = Stopping(1e9, 10)
+    assert solve(graph, start, any_gain_is_little, landmarks=images).iterations == 2
+    # Held back from the first, it does not overshoot.
+    monkeypatch.setattr(levenberg_marquardt, "_FIRST_DAMPING", 100.0)
+    held_back = solve(graph, start, any_gain_is_little, landmarks=images)
+    assert (held_back.iterations, held_back.overshot) == (1, False)
+
+
+def test_landmarks_that_move_in_images_at_once_take_no_step_in_metres_to_the_same_minimum():
+    graph, start, images = bent_drive(0)
+    late, early = (solve(graph, start, TO_THE_END, landmarks=it) for it in (images, replace(images, at_once=True)))
+    assert early.converged
+    assert late.overshot
+    assert not early.overshot
+    assert early.error == pytest.approx(late.error, rel=1e-9)
+
+
+def test_landmarks_move_to_first_order_by_the_graphs_own_step():
+    _, start, images = bent_drive(0)
+    rng, step, length = np.random.default_rng(0), gtsam.VectorValues(), 1e-6
+    for key, size in start.dims().items():
+        step.insert(key, rng.standard_normal(size))
+    there = images.taken(start, step.scale(length))
+    moved = start.localCoordinates(there)
+    for key in start.keys():  # noqa: SIM118 - not a mapping
+        # A landmark's second derivative by a step is below 300.
+        np.testing.assert_allclose(moved.at(key) / length, step.at(key), atol=1e-3)
+
+
+def test_a_landmark_whose_disparity_is_below_a_pixel_moves_in_its_image_all_the_same():
+    _, start, images = bent_drive(0)
+    far, first = L(int(images.track_ids[0])), X(int(images.first[0]))
+    in_camera = np.array([[1.0, 1.0, RIG.fx_px * RIG.baseline_m / 0.5]])
+    start.update(far, transform(start.atPose3(first).matrix() @ RIG.T_imu_cam, in_camera)[0])
+    step, turn = start.zeroVectors(), gtsam.VectorValues()
+    turn.insert(first, np.array([0.01, 0.02, 0.2, 0.0, 0.0, 0.0]))
+    step.update(turn)
+    there = images.taken(start, step)
+    before, after = (stereo.predict(it.atPoint3(far)[None], it.atPose3(first).matrix(), RIG) for it in (start, there))
+    np.testing.assert_allclose(after.uv_px[0], before.uv_px[0] + before.d_uv_d_pose[0] @ step.at(first), rtol=1e-9)
+
+
+def test_a_landmark_behind_its_camera_takes_its_metres():
+    _, start, images = bent_drive(0)
+    behind = L(int(images.track_ids[0]))
+    start.update(behind, -start.atPoint3(behind) - 100.0 * RIG.T_imu_cam[:3, 2])
+    by_m, own, step = np.array([1.0, 2.0, 3.0]), gtsam.VectorValues(), start.zeroVectors()
+    own.insert(behind, by_m)
+    step.update(own)
+    moved = images.taken(start, step).atPoint3(behind)
+    np.testing.assert_allclose(moved, start.atPoint3(behind) + by_m, rtol=1e-12)
+
+
+def test_the_images_of_a_graph_are_those_of_its_frames():
+    graph, _, images = bent_drive(0)
+    found = FirstImages.in_graph(graph, RIG)
+    np.testing.assert_array_equal(found.track_ids, images.track_ids)
+    np.testing.assert_array_equal(found.first, images.first)
+
+
+def errors_tried(stopping, monkeypatch) -> tuple[list[float], Solution]:
+    """Return the errors a solve of the bent drive with a Python factor looks at, and its answer."""
+    graph, start, _ = bent_drive(0)
+    here = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    graph.add(gtsam.CustomFactor(here, [X(0)], pose_error))
+    tried, error = list[float](), MixedGraph.error
+    monkeypatch.setattr(MixedGraph, "error", lambda self, values: tried.append(error(self, values)) or tried[-1])
+    return tried, solve(graph, start, stopping)
+
+
+def pose_error(_factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+    """Return how far the first pose is from the origin, (6,), with its derivative at the origin."""
+    if H is not None:
+        H[0] = np.eye(6)
+    return np.asarray(gtsam.Pose3.Logmap(values.atPose3(X(0))))
+
+
+def test_a_solve_that_needs_no_end_ends_at_the_first_step_that_raises_the_error_after_one_that_lowered_it(monkeypatch):
+    # Held back from the first, it lowers the error until damping has become small.
+    monkeypatch.setattr(levenberg_marquardt, "_FIRST_DAMPING", 100.0)
+    with monkeypatch.context() as counting:
+        tried, solution = errors_tried(Stopping(1e-4, 60, at_overshoot=True), counting)
+    with monkeypatch.context() as counting:
+        longer, patient = errors_tried(Stopping(1e-4, 60), counting)
+    assert min(tried) == solution.error == tried[-2] < tried[-1]
+    assert tried[:-1] == sorted(tried[:-1], reverse=True)
+    assert longer[: len(tried)] == tried
+    assert patient.error < solution.error
+    assert solution.overshot
