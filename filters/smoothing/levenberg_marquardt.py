@@ -10,9 +10,9 @@ then take as long as the thirty thousand stereo factors of the same graph. In a 
 derivatives are those of the factors one by one (:func:`~toolkit.models.twist.twist_factor`), on arrays.
 
 A step of GTSAM's turns a pose about itself and moves a landmark along a straight line, and the two separate where the
-step is long: where a stretch of road turns by 0.01 rad and shifts by 12 m, by 6 cm, which is pixels for a near landmark.
-A weakly determined direction, such as the drift of a long drive, is then damped as if it overshot. The measurement also
-depends on a far landmark's depth so nonlinearly that a step in metres overshoots, while the disparity is nearly linear
+step is long: by 6 cm where a stretch of road turns by 0.01 rad and shifts by 12 m, pixels for a near landmark. A weakly
+determined direction, such as the drift of a long drive, is then damped as if it overshot. The measurement also depends
+on a far landmark's depth so nonlinearly that a step in metres overshoots, while the disparity is nearly linear
 (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). From the first step on that raises
 the error, landmarks are therefore moved in the image of the camera that first saw each (:class:`FirstImages`), with
 hardly any damping.
