@@ -1,27 +1,30 @@
 """Short clean recordings of every kind, and the faults that can be planted in them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 import pytest
 
-from toolkit.audit import Audit, audit, fault
+from toolkit.audit import Audit, audit
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.sequence import Observations, Sequence, content_digest
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
-# Most faults show in a hundred frames; of a flight as short a gap of two seconds would leave too little.
-LENGTH_S = {"drive": 10.0, "drive-imu": 10.0, "flight": 6.0}
+# Long enough for faults that show in the second half alone, or beside turns.
+LONGER_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
 
 
 @cache
+def recording(scenario: str, seed: int = 1, duration_s: float | None = None, varied: bool = False) -> Sequence:
+    """Return a simulated recording of any scenario."""
+    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s or LONGER_S[scenario], varied=varied), seed)
+
+
 def clean_recording(scenario: str = "drive", seed: int = 0, duration_s: float | None = None) -> Sequence:
-    """Return a simulated recording."""
-    length_s = LENGTH_S[scenario] if duration_s is None else duration_s
-    return simulate(replace(SCENARIOS[scenario], duration_s=length_s), seed)
+    """Return a short one: most faults show in a hundred frames; of a flight as short a gap would leave too little."""
+    return recording(scenario, seed, duration_s or min(LONGER_S[scenario], 10.0))
 
 
 @dataclass(frozen=True)
@@ -172,56 +175,9 @@ def plant(request: pytest.FixtureRequest) -> Plant:
     return PLANTS[name](clean_recording(scenario, duration_s=30.0 if name == "twist-lag" else None))
 
 
-def _once(function: Callable[..., Any], content: Callable[[Sequence], str]) -> Callable[..., Any]:
-    """Return a function of a sequence, and of what follows from it, that remembers what came of the same content."""
-    kept: dict[str, Any] = {}
-
-    def remembered(sequence: Sequence, *derived: Any) -> Any:
-        key = content(sequence)
-        if key not in kept:
-            kept[key] = function(sequence, *derived)
-        return kept[key]
-
-    return remembered
-
-
-def _tracks(sequence: Sequence) -> str:
-    return content_digest((sequence.observations, sequence.frames_t_ns, sequence.rig))
-
-
-def _tracks_and_truth(sequence: Sequence) -> str:
-    seen = (sequence.observations, sequence.frames_t_ns, sequence.rig)
-    return content_digest((*seen, sequence.truth, sequence.motion_kind))
-
-
-@pytest.fixture(scope="package", autouse=True)
-def _derived_once() -> Iterator[None]:
-    """Derive what several faults look at once of the same tracks, or of the same recording, for all tests of a worker.
-
-    Most faults are planted in few recordings, many of them beside the tracks, and are audited more than once.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("camera_motion", "step_correlation"):
-            patch.setattr(fault, name, _once(getattr(fault, name), _tracks))
-        for name in ("agreement", "self_calibration"):
-            patch.setattr(fault, name, _once(getattr(fault, name), Sequence.content_hash))
-        patch.setattr(fault, "truth_clock", _once(fault.truth_clock, _tracks_and_truth))
-        yield
-
-
 def planted(name: str, sequence: Sequence) -> Sequence:
     """Plant a fault, by its name, in a recording."""
     return PLANTS[name](sequence).planted
-
-
-# Long enough for faults that show in the second half alone, or beside turns.
-LONGER_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
-
-
-@cache
-def recording(scenario: str, seed: int = 1, duration_s: float | None = None, varied: bool = False) -> Sequence:
-    """Return a simulated recording of any scenario."""
-    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s or LONGER_S[scenario], varied=varied), seed)
 
 
 def details(outcome: Audit) -> dict[str, str]:

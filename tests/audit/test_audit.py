@@ -14,6 +14,7 @@ from tests.audit.conftest import clean_recording
 from toolkit.audit import audit, faults
 from toolkit.errors import UnknownNameError
 from toolkit.sequence import Observations, Sequence, check_runnable
+from toolkit.simulation import SCENARIOS
 from toolkit.simulation.faults import identity_intrinsics, zero_intrinsics
 
 AUDIT_PAGE = Path(__file__).parents[2] / "docs/audit.md"
@@ -24,10 +25,10 @@ def beyond_single_precision(sequence: Sequence) -> Sequence:
     return replace(sequence, observations=Observations(seen.frame, seen.track_id, seen.uv_px * 1e200))
 
 
-@pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_clean_recording_raises_no_finding_and_is_left_as_it_is(scenario: str, seed: int) -> None:
-    sequence = clean_recording(scenario, seed, 30.0)
+@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize(("seed", "duration_s"), [(0, 30.0), (11, 8.0)])
+def test_a_clean_recording_raises_no_finding_and_is_left_as_it_is(scenario: str, seed: int, duration_s: float) -> None:
+    sequence = clean_recording(scenario, seed, duration_s)
     outcome = audit(sequence)
     assert outcome.findings == ()
     assert outcome.sequence is sequence

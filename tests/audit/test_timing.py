@@ -195,9 +195,3 @@ def test_an_offset_beyond_chance_is_reported_though_it_is_known_badly() -> None:
     assert found is not None
     assert LARGEST_ERROR_S < found.error < abs(found.value) / OFFSET_SIGMAS
     assert "frames are stamped early" in details(audit(late))["time-offset"]
-
-
-def test_samples_that_are_rarer_than_frames_are_reported() -> None:
-    reported = details(audit(faults.thinned_motion(recording("drive"))))["sparse-motion"]
-    assert "every 1 s and frames every 0.1 s" in reported
-    assert "sparse-motion" not in details(audit(faults.thinned_motion(recording("drive"), 3.0)))

@@ -1,11 +1,11 @@
 """A truth of another motion, unit or clock, and gravity elsewhere in its world: told where planted, nowhere else."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
+from tests.audit.conftest import recording as recorded
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.truth import truth_clock, truth_mismatch
@@ -13,12 +13,11 @@ from toolkit.datasets.trajectories.belonging import exchanges
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.measurements import NS_PER_S
 from toolkit.sequence import Sequence, Truth
-from toolkit.simulation import SCENARIOS, faults, simulate
+from toolkit.simulation import faults
 
 
-@cache
 def recording(scenario: str, seed: int = 0, duration_s: float = 6.0, varied: bool = False) -> Sequence:
-    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=varied), seed)
+    return recorded(scenario, seed, duration_s, varied)
 
 
 def truth_of(sequence: Sequence) -> Truth:
@@ -96,13 +95,6 @@ def test_a_truth_that_runs_backwards_or_in_exchanged_axes_is_reported_with_those
     assert f"only for a truth with {words}" in with_poses(recording("flight"), exchange.reread(poses))
     backwards = with_poses(recording("drive"), truth_of(recording("drive")).T_world_imu[::-1])
     assert "only for a truth whose poses run backwards" in backwards
-
-
-def test_a_truth_of_other_times_or_none_is_not_checked() -> None:
-    drive = recording("drive")
-    assert with_truth(drive, None) is None
-    elsewhen = replace(truth_of(drive), t_ns=truth_of(drive).t_ns + 1000 * NS_PER_S)
-    assert isinstance(with_truth(drive, elsewhen), Undecided)
 
 
 def test_a_clock_is_reported_once_either_by_its_offset_or_by_its_pace() -> None:
