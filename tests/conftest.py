@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402 - the number of threads must be set before NumPy is imported
 
-import ctypes
 import fcntl
 import gc
 import json
@@ -13,8 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +31,11 @@ from toolkit import runner
 from toolkit.answers import Run
 from toolkit.audit import Audit, Finding
 from toolkit.experiment import pipeline, recording, workers
-from toolkit.experiment.recording import WHOLE, Recording
 from toolkit.measurements import Prior
-from toolkit.progress import SILENT, Progress
+from toolkit.progress import SILENT
 from toolkit.registry import find
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings
-from toolkit.simulation import SCENARIOS, Scenario
 
 PROJECT = Path(__file__).parents[1]
 # Of the rendered drive: images, (width, height) px, and how far it goes from one to the next.
@@ -59,23 +54,6 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
     gc.disable()  # until the tests are found: all that is made meanwhile stays
-    _keep_freed_memory()
-
-
-# Numbers of mallopt's options in glibc's malloc.h, and what is asked of each in bytes.
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-_NEVER_TRIMMED, _LARGEST_FROM_HEAP = 1 << 30, 1 << 25
-
-
-def _keep_freed_memory() -> None:
-    """Have memory that was freed kept for what comes next, where the C library can be told to.
-
-    Large arrays would be mapped, cleared and given back to the system each time: a tenth of the time of audits.
-    """
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):
-        library.mallopt(_M_TRIM_THRESHOLD, _NEVER_TRIMMED)
-        library.mallopt(_M_MMAP_THRESHOLD, _LARGEST_FROM_HEAP)
 
 
 # What takes longest comes first, or one worker would still be at it when all others have ended. What stays together
@@ -226,45 +204,6 @@ def _remembers_audits() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recording, "audit", remembered)
-        yield
-
-
-_audited_recording = recording.audited_recording
-
-
-@cache
-def _audited(_audit: Callable[..., Audit], requested: Recording, _changed_ns: int) -> Audit:
-    """Return a recording audited; a test that puts another audit in gets what that one says."""
-    return _audited_recording(requested)
-
-
-def _is_beginning(requested: Recording, scenario: Scenario) -> bool:
-    """Say whether no more is run of a simulation than its beginning that tells as much as the whole."""
-    enough = 0 if scenario.audited_s is None else scenario.audited_s * scenario.camera.rate_hz
-    return requested.part == WHOLE and requested.max_frames is not None and requested.max_frames <= enough
-
-
-@pytest.fixture(scope="module")
-def audited_once() -> Iterator[None]:
-    """Load and audit each built-in recording, and each file, once for all tests of a worker that run some of it.
-
-    As outside of tests, what tells as much as the whole is audited of a simulation of which no more is run.
-    """
-
-    def remembered(requested: Recording, progress: Progress = SILENT) -> Audit:
-        plain = Recording(requested.source, requested.seed, keep=requested.keep)
-        given = (requested.truth, requested.duration_s, requested.frontend, requested.vary)
-        if isinstance(requested.source, str) and given == (None, None, plain.frontend, plain.vary):
-            if requested.source in SCENARIOS:
-                begins = _is_beginning(requested, SCENARIOS[requested.source])
-                return _audited(recording.audit, replace(plain, max_frames=2 if begins else None), 0)
-            file = Path(requested.source).absolute()
-            if file.is_file():
-                return _audited(recording.audit, replace(plain, source=str(file)), file.stat().st_mtime_ns)
-        return _audited_recording(requested, progress)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording, "audited_recording", remembered)
         yield
 
 

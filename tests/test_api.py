@@ -27,8 +27,6 @@ from toolkit.report.comparison_table import comparison_table
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
 
-pytestmark = pytest.mark.usefixtures("audited_once")
-
 FRAMES = 20
 RECORDING = Path(__file__).parents[1] / "data" / "drive_small"
 
@@ -48,12 +46,12 @@ PROGRAM = textwrap.dedent(f"""
 
 
 @pytest.fixture(scope="module")
-def result(audited_once: None) -> Result:
+def result() -> Result:
     return toolkit.compare("drive", ["dead-reckoning", "ekf"], max_frames=FRAMES, workers=1)
 
 
 @pytest.fixture(scope="module")
-def over(audited_once: None) -> Result:
+def over() -> Result:
     return toolkit.compare("drive", "dead-reckoning", max_frames=FRAMES, seed=1, seeds=2, workers=1)
 
 

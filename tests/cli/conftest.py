@@ -11,11 +11,6 @@ Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _audited_once(audited_once: None) -> None:
-    """Most of these tests run ten frames of the drive, under seeds 0 to 3 where they name one."""
-
-
 @pytest.fixture
 def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_process: None) -> Vislam:
     """Return a function that runs ``vislam`` with the given words and returns its exit status.

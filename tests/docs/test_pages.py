@@ -90,9 +90,7 @@ def as_a_stranger(command: str, folder: Path) -> str:
 
 
 @pytest.fixture
-def alone(
-    audited_once: None, one_process: None, unrendered: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Path:
+def alone(one_process: None, unrendered: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return an empty directory, the current one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -14,7 +14,7 @@ COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames",
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_once) -> Path:
+def bundle(tmp_path_factory: pytest.TempPathFactory, without_pixels) -> Path:
     root = tmp_path_factory.mktemp("bundle")
     with without_pixels():
         assert main([*COMPARE, "--set", "noise.motion_scale=1.25", "--out", str(root / "run")]) == 0
@@ -23,7 +23,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_onc
 
 
 @pytest.fixture
-def reproduce(tmp_path: Path, monkeypatch, capsys, without_pixels, audited_once) -> Callable[..., tuple[int, str, str]]:
+def reproduce(tmp_path: Path, monkeypatch, capsys, without_pixels) -> Callable[..., tuple[int, str, str]]:
     """Reproduce a bundle in an empty folder; return the exit status and what was said."""
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()

@@ -54,7 +54,7 @@ def other_recordings(seeds: dict, manifest: dict) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_once) -> Path:
+def runs(tmp_path_factory: pytest.TempPathFactory, without_pixels) -> Path:
     """Three comparisons over the same three seeds, and one of one seed."""
     root = tmp_path_factory.mktemp("runs")
     write_run(root / "seeds")

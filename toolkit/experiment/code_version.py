@@ -19,7 +19,7 @@ NUMERIC_PACKAGES = {
     "numba": "numba",
 }
 # The toolkit's layers above the experiment, which it cannot import: they change no result.
-_ABOVE = ("api.py", "cli", "evaluation", "gate", "report", "verify")
+_ABOVE = ("api.py", "cli", "evaluation", "gate", "report", "verify.py")
 _CODE = (".py", ".so", ".pyd")
 _ANNOUNCED = (registry.ENTRY_POINT_GROUP, metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP)
 
