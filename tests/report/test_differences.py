@@ -51,6 +51,8 @@ def other_recordings(seeds: dict, manifest: dict) -> None:
     seeds["runs"][2]["status"][0] = seeds["runs"][3]["status"][0] = "failed"
     for run in seeds["runs"][2:]:
         run["counts"] = {"ok": 2, "diverged": 0, "failed": 1}
+        for metric in run["metrics"].values():
+            metric["n"] = sum(value is not None for value in metric["values"][1:])
 
 
 @pytest.fixture(scope="module")
