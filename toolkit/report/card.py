@@ -53,7 +53,6 @@ read_card = reader(CardRecord, "repeat vislam card")
 
 
 def card_lines(card: Card) -> Iterator[str]:
-    """Yield the statements of the card, one or two sentences each."""
     few, middle, many = card.seen_frames
     yield (
         f"{card.a_frame:.0f} visible tracks a frame, seen in {middle:.0f} frames in the median ({few:.0f} to "
@@ -105,7 +104,6 @@ def _scale(card: Card) -> Iterator[str]:
 
 
 def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
-    """Return the card as plain text: what it says, and the residuals along tracks as a table."""
     headings = (("lag",), ("column",), ("disparity",), ("row",))
     cells = [[f"{one:.2f}" if np.isfinite(one) else MISSING for one in each] for each in card.correlation]
     rows = tuple((str(lag), *each) for lag, each in enumerate(cells, start=1))
@@ -117,7 +115,6 @@ def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
 
 
 def card_record(card: Card) -> CardRecord:
-    """Return the card as a record; what is not finite becomes null."""
     scale = card.scale
     return CardRecord(
         schema="vislam.card/2",

@@ -50,7 +50,6 @@ def bibtex(cited: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def _meant(name: str, known: Mapping[str, FoundModule]) -> list[tuple[str, FoundModule]]:
-    """Return the modules that a name stands for: several for a run directory."""
     if name in known:
         return [(name, known[name])]
     path = Path(name)
@@ -79,7 +78,6 @@ def _entries(module: FoundModule) -> dict[str, str]:
 
 @cache
 def references() -> dict[str, str]:
-    """Return the entries of references.bib by key."""
     return _parsed(files("toolkit.report").joinpath("references.bib").read_text(encoding="utf-8"))
 
 

@@ -104,7 +104,6 @@ def usual_metrics(valued: list[Metric], *, real: bool) -> list[Metric]:
 
 
 def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
-    """Return the metrics whose missing values a reader of the table wants explained."""
     if columns is None and comparison.over_seeds:
         return tuple(metric for metric in known_metrics() if metric.over_seeds)
     if columns is None:
@@ -136,7 +135,6 @@ def _values(comparison: Comparison, metric: Metric) -> list[float | None]:
 
 
 def sequence_line(sequence: Sequence) -> str:
-    """Return the recording in one line: size, duration, true path, motion."""
     path_m = path_length_m(sequence)
     count = len(sequence.observations)
     sightings = f"{count} stereo observations" if count else "no image features"
@@ -177,7 +175,6 @@ _MOTION_NOISE = {"twist": "odometry", "imu": "IMU", "none": "motion"}
 
 
 def noise_line(comparison: Comparison) -> str:
-    """Return the noise that every estimator assumed: of sightings and motion, as stated or as measured."""
     rig, settings, measured = comparison.sequence.rig, comparison.settings.noise, comparison.measured
     tracks = motion = ""
     if measured is not None:

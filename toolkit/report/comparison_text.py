@@ -129,7 +129,6 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
 
 
 def audit_text(audited: Audit, width: Width = WIDTH) -> str:
-    """Return what the audit found as plain text: fault, count, outcome, the details below each, and the facts."""
     findings = audited.findings
     lines = [printable(sequence_line(audited.sequence)), ""]
     if findings:

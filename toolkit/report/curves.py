@@ -81,7 +81,6 @@ def reference_estimate(comparison: Comparison) -> ReferenceEstimate | None:
 
 
 def truth_during(sequence: Sequence) -> Truth | None:
-    """Return the truth while the camera ran, or None where there is none."""
     if sequence.truth is None:
         return None
     t_ns = sequence.truth.t_ns
@@ -106,7 +105,6 @@ def from_start(run: Run, output: Output, sequence: Sequence) -> Alignment:
 
 
 def alignment_text(sequence: Sequence) -> str:
-    """Say how a figure's estimates are aligned."""
     if sequence.truth is None:
         return "There is no truth; every estimator starts from the same pose and nothing is aligned."
     fit = "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"

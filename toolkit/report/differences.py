@@ -70,7 +70,6 @@ class DiffRecord(Struct, frozen=True, kw_only=True):
 
 
 def differences(before: Files, after: Files) -> DiffRecord:
-    """Compare two run directories."""
     lines = [_lines(files) for files in (before, after)]
     both = [key for key in lines[0] if key in lines[1] and not all(_repeats_causal(side, key) for side in lines)]
     paired = _reads_the_same(before, after)
@@ -144,7 +143,6 @@ class _Line:
 
 
 def _hashes(files: Files) -> dict[int, str | None]:
-    """Return the hash of what was read under each seed."""
     if isinstance(files, SeedsFiles):
         return dict(zip(files.scores.seeds, files.scores.hashes, strict=True))
     return {files.manifest.seeds.sequence: files.scores.sequence.hash}

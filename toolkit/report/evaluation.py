@@ -139,7 +139,6 @@ def _best(medians: list[float | None], metric: Metric) -> set[int]:
 
 
 def sequences_table(evaluation: EvaluatedSystems) -> Table:
-    """Return a row a sequence and a column a system: the median over the runs of the metric that ranks."""
     metric, systems = evaluation.ranked_by, [standing.estimator for standing in evaluation.leaderboard]
     unit = unit_of(metric, (one.median(metric) for one in evaluation.cells.values()))
     heads = (("sequence", "", ""), *((system, "", unit.name) for system in systems))
@@ -195,7 +194,6 @@ def _over_runs(runs: Sequence[Mapping[str, float | int | None]], key: str) -> st
 
 
 def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
-    """Yield what is evaluated and on which terms."""
     truths = evaluation.truths
     if len(truths) == 1:
         ((name, truth),) = truths.items()
@@ -214,7 +212,6 @@ def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
 
 
 def paired_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
-    """Yield how the systems differ over the sequences, the leader against each other, and what is more than chance."""
     tests = evaluation.paired
     leader = evaluation.leaderboard[0].estimator
     for test in tests:
@@ -236,7 +233,6 @@ def _paired_line(test: PairedRecord, pairs: int, metric: Metric) -> str:
 
 
 def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURES) -> Iterator[str]:
-    """Yield each run that failed, with the reason; no more than ``most``."""
     failed = [run for run in evaluation.runs if run.status != "ok"]
     shown = failed if most is None else failed[:most]
     for run in shown:
@@ -285,13 +281,11 @@ def _parts(
 
 
 def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
-    """Return an evaluation as plain text."""
     lines = [filled(line, width) for line in header_lines(evaluation)]
     return "\n".join([*lines, "", *parts_as_text(_parts(evaluation, columns), width)]).rstrip()
 
 
 def evaluation_markdown(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
-    """Return the same as Markdown, the best of each column in bold."""
     heads = (f"{in_markdown(line)}." for line in header_lines(evaluation))
     return "\n\n".join([*heads, *parts_as_markdown(_parts(evaluation, columns))]) + "\n"
 
@@ -318,7 +312,6 @@ def evaluation_csv(evaluation: EvaluatedSystems) -> str:
 
 
 def check_evaluation_directory(target: Path) -> None:
-    """Raise OutputError unless an evaluation can be written at ``target`` without the loss of anybody's files."""
     check_replaceable(target, _ours)
 
 

@@ -57,7 +57,6 @@ class FactorRecord(Struct, frozen=True, kw_only=True):
 
     @property
     def is_off(self) -> bool:
-        """Say whether the interval excludes that nothing changes."""
         return not self.low <= 1.0 <= self.high
 
     def inverse(self) -> "FactorRecord":
@@ -65,7 +64,6 @@ class FactorRecord(Struct, frozen=True, kw_only=True):
         return FactorRecord(factor=1.0 / self.factor, low=1.0 / self.high, high=1.0 / self.low)
 
     def range(self) -> str:
-        """Return the interval in words."""
         return f"{number(self.low, _DIGITS)} to {number(self.high, _DIGITS)}"
 
 
@@ -84,7 +82,6 @@ class ContributionRecord(Struct, frozen=True, kw_only=True):
     also_shown: Annotated[tuple[Other, ...] | UnsetType, Meta(description="of the others, those beyond chance")] = UNSET
 
     def shows(self, measure: str) -> bool:
-        """Say whether a measure differs by more than chance."""
         return self.shown if measure == "error" else measure in (self.also_shown or ())
 
 
@@ -203,19 +200,16 @@ def _gap(found: ExplanationRecord) -> str:
 
 
 def over(found: ExplanationRecord) -> str:
-    """Return what the intervals are over, in words."""
     return f"{found.seeds.count} seeds" if found.intervals == "seeds" else "stretches of the one recording"
 
 
 def error_of(found: ExplanationRecord) -> str:
-    """Return what the error is, in words."""
     if found.metric == HELD_OUT:
         return "the error of withheld tracks, for there is no truth"
     return metrics_called((found.metric,))[0].column if found.intervals == "seeds" else "drift"
 
 
 def _shown(found: ExplanationRecord) -> Iterator[str]:
-    """Yield a sentence for each ingredient that changes the error by more than chance, what brings most first."""
     parts = [part for part in found.parts if _is_shown(part)]
     for i, part in enumerate(parts):
         name = part.ingredient.capitalize() + (", the largest effect" if i == 0 and len(parts) > 1 else "")
@@ -238,7 +232,6 @@ def placed(found: ExplanationRecord, part: IngredientRecord) -> Iterator[tuple[b
 
 
 def where(kind: Kind, effect: ContributionRecord) -> str:
-    """Return what is done with an ingredient, and where."""
     return f"added to {effect.less}" if kind == "added" else f"taken from {effect.more}"
 
 
@@ -312,7 +305,6 @@ def _beside(found: ExplanationRecord) -> Iterator[str]:
 
 
 def _helps(part: IngredientRecord) -> bool:
-    """Say whether what looks like more than chance of an ingredient makes the error smaller with it."""
     return any(one.error is not None and one.error.low > 1.0 for one in part.effects)
 
 

@@ -141,7 +141,6 @@ def write_bundle(directory: Path, target: Path) -> str:
 
 
 def installed_packages() -> dict[str, str]:
-    """Return the release of every installed package, by its name."""
     found = {str(one.metadata["Name"]).lower().replace("_", "-"): one.version for one in distributions()}
     return dict(sorted(found.items()))
 

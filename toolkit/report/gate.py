@@ -40,12 +40,10 @@ _NUMBERS = (
 
 
 def gate_table(check: Check) -> Table:
-    """Return every verdict of a check."""
     return Table((*_LABELS, *_NUMBERS), tuple(map(_row, check.verdicts)), labels=len(_LABELS))
 
 
 def failures_table(check: Check) -> Table:
-    """Return what the check fails for, with the reason in words."""
     rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failures)
     headings = (*_LABELS, *_NUMBERS, ("why", "", ""))
     return Table(headings, rows, labels=len(_LABELS))
@@ -111,12 +109,10 @@ def _percent(value: float | None, sign: str = "") -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return text that cannot end a Markdown cell."""
     return " ".join(text.replace("|", "/").split())
 
 
 def headline(check: Check) -> str:
-    """Return the verdict in one line."""
     tested = len(check.verdicts)
     if check.passed:
         return f"the gate passes: nothing got worse than {check.baseline} ({tested} comparisons)"
@@ -126,13 +122,11 @@ def headline(check: Check) -> str:
 
 
 def failure_lines(check: Check) -> Iterator[str]:
-    """Yield what the check fails for, a line each."""
     for verdict in check.failures:
         yield f"{about(verdict)}: {verdict.words}"
 
 
 def about(verdict: Verdict) -> str:
-    """Return what a verdict is about, in words."""
     what = _name(verdict.metric)
     found = _FAILED.get(verdict.finding, "")
     return f"{_of(verdict)}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
@@ -144,7 +138,6 @@ def _of(verdict: Verdict) -> str:
 
 
 def note_lines(check: Check) -> Iterator[str]:
-    """Yield what a reader must know beside the verdicts."""
     yield from check.notes
     if check.tests:
         yield (
@@ -193,7 +186,6 @@ def plan_table(plan: Sequence[Planned]) -> Table:
 
 
 def plan_text(plan: Sequence[Planned], width: Width = WIDTH) -> str:
-    """Return the plan as plain text: the table, and how it is to be read."""
     bounds = ", ".join(f"{percent:g} %" for percent in sorted({one.bound_percent for one in plan}))
     notes = (
         "a growth of an error by so much is found with this chance in a check of as many runs a sequence as there are "
@@ -205,7 +197,6 @@ def plan_text(plan: Sequence[Planned], width: Width = WIDTH) -> str:
 
 
 def gate_text(check: Check, width: Width = WIDTH, *, verbose: bool = False) -> str:
-    """Return a check as plain text: a table of what fails or of everything, the notes, and last what it comes to."""
     shown = check.verdicts if verbose else check.failures
     lines = [*printed_lines(shown), ""] if shown else []
     lines += section("notes", note_lines(check), width)
@@ -279,6 +270,5 @@ BEGINNINGS: Mapping[str, str] = {"junit": "<", "markdown": "#", "json": "{"}
 
 
 def write_check(check: Check, files: Mapping[str, Path]) -> None:
-    """Write a check in each of the kinds of WRITERS that has a file; raise OutputError where one cannot be written."""
     for kind, path in files.items():
         write_text(path, WRITERS[kind](check))

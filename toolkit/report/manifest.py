@@ -81,7 +81,6 @@ read_manifest = reader(Manifest, "repeat the comparison", older={"vislam.manifes
 
 
 def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:
-    """Return the manifest of a comparison: made by a command, that came to be asked for this."""
     from_files = {run.estimator for run in comparison.runs if run.timings is None}
     here = tuple(name for name in comparison.estimators if name not in from_files)
     variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
@@ -123,7 +122,6 @@ def _now() -> str:
 
 
 def recording_record(sequence: Sequence) -> RecordingRecord:
-    """Return the record of a recording."""
     return RecordingRecord(
         name=sequence.name,
         hash=sequence.content_hash(),

@@ -50,7 +50,6 @@ _BLIND = "the recording has no image features: every estimator can only integrat
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each finding of the audit, or that there is none, then the faults it could not decide."""
     if not comparison.findings:
         yield "no fault found in the recording"
     for finding in comparison.findings:
@@ -59,7 +58,6 @@ def finding_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason why faults could not be decided, behind their names."""
     by_reason: dict[str, list[str]] = {}
     for fault, why in undecided.items():
         by_reason.setdefault(why, []).append(fault)
@@ -68,7 +66,6 @@ def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
 
 
 def outcome(finding: Finding) -> str:
-    """Return the outcome of a finding in one or two words."""
     if finding.repaired:
         return "too much lost" if finding.blocking else "repaired"
     if finding.blocking:
@@ -102,7 +99,6 @@ def _ends(comparison: Comparison) -> Iterator[str]:
 
 
 def _faults(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each fault that is left in the recording and may spoil results, with its times."""
     summaries, elapsed_s = faults(), comparison.sequence.elapsed_s
     for found in sorted(comparison.findings, key=lambda finding: not finding.blocking):
         if not (found.blocking or found.warning):
@@ -320,7 +316,6 @@ _VERDICT_ABOUT: tuple[Question, ...] = ("accuracy in the end", "accuracy at each
 
 
 def verdict(comparison: Comparison) -> str:
-    """Return the verdict on a comparison in a few sentences."""
     by_question = {contest.question: contest for contest in comparison.contests}
     contest = next((by_question[about] for about in _VERDICT_ABOUT if about in by_question), None)
     if contest is None:
@@ -343,7 +338,6 @@ def _of_few(comparison: Comparison) -> str:
 
 
 def contest_record(contest: Contest) -> ContestRecord:
-    """Return a contest as report.json has it."""
     found = (None, *contest.advantages)
     return ContestRecord(
         question=contest.question,

@@ -64,7 +64,6 @@ read_check = reader(CheckDocument, "repeat vislam check", older=OLDER_CHECKS)
 
 
 def schema_files() -> dict[str, str]:
-    """Return the text of every schema by the name of its file."""
     return {f"{name}.json": json.dumps(schema(record), indent=2) + "\n" for name, record in RECORDS.items()}
 
 

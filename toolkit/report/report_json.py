@@ -260,7 +260,6 @@ def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, 
 
 
 def report_document(comparison: Comparison) -> Report:
-    """Return what the report of a comparison draws and says; what is not finite becomes null."""
     curves = error_curves(comparison)
     return Report(
         schema="vislam.report/1",
@@ -282,7 +281,6 @@ def report_document(comparison: Comparison) -> Report:
 
 
 def seeds_report_document(over: Comparison) -> SeedsReport:
-    """Return what the report over seeds draws and says; its runs are those of seeds.json, in its order."""
     return SeedsReport(
         schema="vislam.report/1",
         t_s=tuple(map(rounded, over.sequence.frames_s.tolist())),

@@ -49,7 +49,6 @@ def own_files(directory: Path, written: Callable[[Path], Iterable[str]]) -> froz
 
 
 def take_over(file: Path, place: Path) -> None:
-    """Have a file in another place, too."""
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
         place.hardlink_to(file)
@@ -78,7 +77,6 @@ class Results(Generic[Record]):
     shown: Callable[[Record], Shown]
 
     def is_in(self, directory: Path) -> bool:
-        """Say whether a folder has the document."""
         return (directory / self.document).is_file()
 
     def check(self, target: Path) -> None:
@@ -92,12 +90,10 @@ class Results(Generic[Record]):
         return own_files(directory, written)
 
     def text(self, record: Record, width: Width = None) -> str:
-        """Return the results as they are printed."""
         shown = self.shown(record)
         return f"{filled(shown.words, width, further='')}\n\n{as_text(shown.table)}"
 
     def as_markdown(self, record: Record) -> str:
-        """Return the results as Markdown, figures by the names of their files."""
         shown = self.shown(record)
         figures = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in shown.figures.items())
         parts = (f"# {in_markdown(shown.title)}", in_markdown(shown.words), as_markdown(shown.table), *figures)

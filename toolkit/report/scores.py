@@ -29,7 +29,6 @@ Notes = Annotated[dict[str, str], Meta(description="by metric key, why there is 
 
 
 def check_promised(metrics: dict[str, object]) -> None:
-    """Raise ValueError where one of the keys is missing that every document has."""
     missing = next((key for key in CONTRACT_KEYS if key not in metrics), None)
     if missing is not None:
         raise ValueError(f"metrics.{missing} is missing")
@@ -218,7 +217,6 @@ def metrics_document(comparison: Comparison) -> MetricsDocument:
 
 
 def seeds_document(over: Comparison) -> Seeds:
-    """Return the scores of a comparison over seeds."""
     return Seeds(
         schema="vislam.seeds/1",
         sequence=SequenceOfSeeds(
@@ -238,7 +236,6 @@ def seeds_document(over: Comparison) -> Seeds:
 
 
 def scores_document(comparison: Comparison) -> MetricsDocument | Seeds:
-    """Return the scores of a comparison, of one seed or over many."""
     return seeds_document(comparison) if comparison.over_seeds else metrics_document(comparison)
 
 

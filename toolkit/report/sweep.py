@@ -143,7 +143,6 @@ def sweep_table(sweep: SweepRecord) -> Table:
 
 
 def metric_of(sweep: Sweep | SweepRecord) -> Metric:
-    """Return the metric of a sweep's error."""
     return next(metric for metric in known_metrics() if metric.key == sweep.metric)
 
 
@@ -152,7 +151,6 @@ def _named(at: Mapping[str, Scalar]) -> tuple[str, str]:
 
 
 def shown_value(value: Scalar) -> str:
-    """Return a value of an axis as text."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

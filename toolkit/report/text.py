@@ -61,7 +61,6 @@ def width_of_output() -> Width:
 
 
 def filled(text: str, width: Width, first: str = "", further: str = "  ") -> str:
-    """Return a text in lines no wider than ``width``, behind what its first line and the others begin with."""
     text = printable(text)
     if width is None:
         return first + text
@@ -107,7 +106,6 @@ def parts_as_markdown(parts: Iterable[TextPart]) -> Iterator[str]:
 
 
 def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
-    """Yield entries under a title that stands before the first."""
     for i, entry in enumerate(entries):
         label = f"{title}:" if i == 0 else ""
         yield filled(entry, width, f"{label:<{_LABEL}}", " " * (_LABEL + 2))
@@ -153,7 +151,6 @@ def unit_of(metric: Metric, values: Iterable[float | None]) -> ShownUnit:
 
 
 def heading(metric: Metric, unit: ShownUnit) -> tuple[str, str, str]:
-    """Return the lines above a metric's column: what, which, unit."""
     return (*metric.heading, unit.name)
 
 
@@ -263,7 +260,6 @@ def _cells(table: Table, escaped: Callable[[str], str], bold: str) -> list[list[
 
 
 def in_html(text: str) -> str:
-    """Return a text that HTML shows as it is."""
     return html.escape(printable(text))
 
 

@@ -5,7 +5,6 @@ from toolkit.verify import VerificationRecord
 
 
 def verification_text(verification: VerificationRecord, width: Width = WIDTH) -> str:
-    """Return the table of what passed and failed, then each failure with what to do, then the verdict."""
     rows = tuple((check.name, check.result) for check in verification.checks)
     lines = [as_text(Table((("promise",), ("result",)), rows, labels=2)), ""]
     for check in verification.checks:

@@ -49,7 +49,6 @@ class Normalised(NamedTuple):
 
     @property
     def in_band_percent(self) -> float:
-        """Return the share of the values that are in the band."""
         known = ~np.isnan(self.value)
         return 100.0 * float(np.mean(((self.value >= self.low) & (self.value <= self.high))[known]))
 
@@ -76,8 +75,6 @@ def _figure(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], wha
 
 
 def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure of the NEES where there is an independent truth."""
-
     def of(evaluation: Evaluation) -> Normalised:
         nees = nees_over_time(evaluation)
         low, high = (np.full(nees.pose.size, side) for side in nees_band(POSE_DOF))
@@ -88,8 +85,6 @@ def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure of the NIS where any estimator reports innovations."""
-
     def of(evaluation: Evaluation) -> Normalised:
         nis = nis_over_time(evaluation)
         t_s = comparison.sequence.elapsed_s(evaluation.estimate.t_ns[nis.rows])

@@ -44,12 +44,10 @@ class View(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Return the height over the width."""
         width, height = self.high - self.low
         return float(height / width)
 
     def show(self, axes: Axes) -> None:
-        """Have axes show this, in equal scale."""
         axes.set_xlim(self.low[0], self.high[0])
         axes.set_ylim(self.low[1], self.high[1])
         axes.set_aspect("equal", adjustable="box")

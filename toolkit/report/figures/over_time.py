@@ -109,7 +109,6 @@ def draw_telling_components(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def draw_other_components(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield a figure for each other estimator with a trajectory that has something to be compared with."""
     for run in comparison.runs:
         if run.estimator not in _telling(comparison):
             yield from _components_of(comparison, run.estimator)
@@ -189,7 +188,6 @@ _LEAST_SHARE, _STATED_WIDTH = 1e-3, 0.7
 
 
 def draw_bound(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure where the bound was asked for and the recording has one."""
     if not comparison.settings.metrics.bound:
         return
     found = [

@@ -54,12 +54,10 @@ class NamedFigure(NamedTuple):
 
 
 def colour_at(place: int) -> str:
-    """Return a colour by its place; with more than there are they begin again."""
     return _COLOURS[place % len(_COLOURS)]
 
 
 def colour_of(comparison: "Comparison", estimator: str) -> str:
-    """Return the colour an estimator has in every figure of every run."""
     return stroke_of(comparison.estimators, estimator)["color"]
 
 
@@ -100,12 +98,10 @@ def width_of(comparison: "Comparison", estimator: str) -> float:
 
 
 def new_figure(height_in: float) -> Figure:
-    """Return an empty figure that arranges its own margins."""
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
 
 
 def add_title(figure: Figure, text: str) -> None:
-    """Put a title above all panels, to the left."""
     figure.suptitle(text, fontsize=TITLE_PT, x=0.01, ha="left")
 
 
@@ -128,7 +124,6 @@ class Entry(NamedTuple):
 
     @classmethod
     def of_line(cls, label: str, colour: str, dashes: Dashes = "-", width: float = 1.5) -> Self:
-        """Return the entry of a line."""
         return cls(label, Line2D([], [], color=colour, linestyle=dashes, linewidth=width))
 
 
@@ -155,7 +150,6 @@ def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **p
 
 
 def legend_below(figure: Figure, entries: Sequence[Entry]) -> None:
-    """Put a legend under all panels, over the whole width."""
     legend(figure, entries, loc="outside lower center")
 
 
@@ -180,14 +174,12 @@ def panels_of(
 
 
 def columns_for(count: int) -> int:
-    """Return in how many columns a number of panels is laid out."""
     if count >= _MANY:
         return 4
     return 2 if count in (2, 4) else min(3, count)
 
 
 def say(axes: Axes, text: str) -> None:
-    """Write in the middle of axes without data."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
 
 
@@ -227,7 +219,6 @@ def scale_errors(axes: Axes, sizes: Sequence[float], most: float) -> None:
 
 
 def annotate(axes: Axes, text: str) -> None:
-    """Write above a panel, to the right."""
     axes.set_title(text, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
 
 

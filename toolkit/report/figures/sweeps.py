@@ -22,7 +22,6 @@ _HEIGHT_IN = 2.9
 
 
 def draw_sweep(sweep: Sweep) -> Iterator[NamedFigure]:
-    """Yield the figures of a sweep: one an axis, and that of error against time where settings vary."""
     for axis in sweep.axes:
         yield _curves(sweep, axis)
     for axis in sweep.axes:

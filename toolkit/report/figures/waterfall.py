@@ -40,7 +40,6 @@ class _Bar(NamedTuple):
 
     @property
     def ends(self) -> tuple[float, float, float]:
-        """Return where the bar ends, and its interval."""
         one, sign = self.effect.error, -1.0 if self.kind == "taken" else 1.0
         assert one is not None
         end, *interval = (self.start + sign * math.log(value) for value in (one.factor, one.low, one.high))

@@ -92,5 +92,4 @@ def json_in_html(value: object) -> str:
 
 
 def source(name: str) -> str:
-    """Return the text of a file of this folder."""
     return files("toolkit.report.html").joinpath(name).read_text(encoding="utf-8")

@@ -38,7 +38,6 @@ _TITLES = {
 
 
 def payload_of(runs: Sequence[Files]) -> Json:
-    """Return what the page shows of run directories, side by side in this order."""
     titles = _titles(runs)
     colours = look_numbers(run.estimator for files in runs for run in files.scores.runs)
     return {
@@ -51,7 +50,6 @@ def payload_of(runs: Sequence[Files]) -> Json:
 
 
 def _titles(runs: Sequence[Files]) -> list[str]:
-    """Return the sequences' names, with the directory's where several share one."""
     names = [one.scores.sequence.name for one in runs]
     return [
         name if names.count(name) == 1 else f"{name} ({one.directory})" for name, one in zip(names, runs, strict=True)
