@@ -36,7 +36,6 @@ RUNS = {
 FIGURES = {
     "kitti00.png": ("kitti00", "figures/top_all.png"),
     "errors_over_time.png": ("realistic", "figures/errors_over_time.png"),
-    "trajectory_error.png": ("realistic", "figures/trajectory_error.png"),
     "components_ekf.png": ("realistic", "figures/components_ekf.png"),
     "components_batch.png": ("realistic", "figures/components_batch.png"),
     "against_bound.png": ("bound", "figures/against_bound.png"),

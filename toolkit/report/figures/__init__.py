@@ -43,7 +43,6 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
     )
     more = (
         bands.draw_nis,
-        from_above.draw_trajectories,
         over_time.draw_other_components,
         from_above.draw_each,
     )
