@@ -31,8 +31,8 @@ def make_evaluation() -> Callable[..., Evaluation]:
     return make
 
 
-def run_of(nees: float | None = None, nis: float | None = None, dof: float | None = None) -> Scored:
-    return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis}), NOTHING, NOTHING, dof)
+def run_of(nees: float | None = None, nis: float | None = None, dof: float | None = None, **values: float) -> Scored:
+    return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis, **values}), NOTHING, NOTHING, dof)
 
 
 def leaning(trend: float, **values: float) -> Scored:
@@ -61,6 +61,9 @@ VERDICTS = [
     ([run_of(nis=0.8, dof=900.0)], "timid"),
     ([run_of(nis=1.05, dof=900.0)], "consistent"),
     ([run_of(nis=1.5, dof=6.0)], "consistent"),
+    # Small innovations behind a gate that refused many are no timid estimator's.
+    ([run_of(nis=0.4, dof=900.0, gate_accepted_percent=95.0)], "timid"),
+    ([run_of(nis=0.4, dof=900.0, gate_accepted_percent=88.0)], "heavy-tailed"),
     ([run_of()], None),
     # Corrections that lean one way are reported, unless errors tell of too much certainty; over seeds by their mean.
     ([leaning(5.1)], "contradicted"),

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,7 @@ from tests.report.conftest import compared, rescored
 from toolkit.answers import Run
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
-from toolkit.evaluation import against_baseline
-from toolkit.experiment.comparison import Comparison, Row, consistency_of
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import configuration, read_configuration
 from toolkit.files.documents import parse, read, to_line, to_text
 from toolkit.gate import baseline
@@ -36,33 +34,10 @@ Document = dict[str, Any]
 # by the first command that made one of its version.
 OLD = Path(__file__).parent / "documents"
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
-CASES = {
-    "metrics.json": "metrics-1",
-    "seeds.json": "seeds-1",
-    "report.json": "report-1",
-    "report-over-seeds.json": "report-over-seeds-1",
-    "manifest.json": "manifest-1",
-    "manifest-over-seeds.json": "manifest-1",
-    "baseline.json": "baseline-1",
-    "trajectory-baseline.json": "trajectory-baseline-1",
-    "check.json": "check-2",
-    "card.json": "card-2",
-    "evaluation.json": "evaluation-1",
-    "verification.json": "verification-1",
-    "diff.json": "diff-1",
-    "bundle.json": "bundle-1",
-    "sweep.json": "sweep-1",
-    "explain.json": "explain-1",
-}
-
-
+OF_KIND = {name.rpartition("-")[0]: name for name in RECORDS} | {"manifest-over-seeds": "manifest-1"}
+CASES = {path.name: OF_KIND[path.stem] for path in sorted(OLD.iterdir())}
 # Baselines are made to be reviewed, and laid out otherwise than other documents.
-REVIEWED = {
-    "baseline.json": lambda path: baseline.to_text(baseline.load_baseline(path)),
-    "trajectory-baseline.json": lambda path: against_baseline.to_text(against_baseline.load_trajectory_baseline(path)),
-}
-
-
+REVIEWED = {"baseline.json", "trajectory-baseline.json"}
 OPTIONAL = {"references", "track_weight", "track_weight_error"}
 
 
@@ -80,7 +55,6 @@ def refused(name: str, document: object) -> str:
 
 
 def test_there_is_an_old_document_of_each_kind() -> None:
-    assert {path.name for path in OLD.iterdir()} == CASES.keys()
     assert set(CASES.values()) == RECORDS.keys()
 
 
@@ -138,46 +112,22 @@ def test_a_document_without_any_one_of_its_fields_is_refused(name: str) -> None:
         assert field in refused(name, lacking)
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("document", [None, 3, [], {}, {"runs": [3]}, {"schema": 3}, "text"])
-def test_what_is_no_document_is_reported(name: str, document: object) -> None:
-    assert "has not the schema vislam." in refused(name, document)
-
-
 def test_the_published_schemas_are_those_of_the_records() -> None:
     reported = "docs/schemas differs from the records: python -m toolkit.report.records docs/schemas renews it"
     assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), reported
 
 
-def _second_run(document: Document) -> Document:
-    run: Document = document["runs"][1]
-    return run
-
-
+# What the records check beyond their types: those are msgspec's, and tests/files has how it words them.
 BROKEN: dict[str, list[tuple[Callable[[Document], object], str]]] = {
     "metrics.json": [
-        (lambda d: _second_run(d)["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
-        (lambda d: _second_run(d)["notes"].clear(), "is null, and notes does not say why"),
-        (
-            lambda d: _second_run(d)["metrics"].update(ate_se3_m="0.2"),
-            "runs[1].metrics.ate_se3_m: expected number or null, got string",
-        ),
-        (
-            lambda d: _second_run(d)["metrics"].update(ate_se3_m=float("nan")),
-            "runs[1].metrics.ate_se3_m: expected number or null, got NaN or infinity",
-        ),
-        (lambda d: d["sequence"].update(frames=True), "sequence.frames: expected integer, got true or false"),
-        (lambda d: d["sequence"].update(frames=-1), "sequence.frames: expected integer >= 0"),
-        (lambda d: _second_run(d).update(status="fine"), "runs[1].status: cannot be 'fine', only diverged, failed, ok"),
-        (lambda d: d.update(schema="vislam.metrics/2"), "its schema is 'vislam.metrics/2'"),
-        (lambda d: d["audit"].append({"fault": "gap", "count": 1, "repaired": True}), "audit[0]: lacks detail"),
-        (lambda d: d.pop("runs"), "the document: lacks runs"),
+        (lambda d: d["runs"][1]["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
+        (lambda d: d["runs"][1]["notes"].clear(), "is null, and notes does not say why"),
     ],
     "report.json": [
         (lambda d: d["runs"][0]["nees"]["pose"].pop(), "runs[0].nees: pose has 11 entries, t_s has 12"),
-        (lambda d: d["runs"][0]["rotation"].pop(), "runs[0].rotation: expected list of length 3, got 2"),
         (lambda d: d["steps"][0]["t_s"].pop(), "steps[0]: step_ms has 12 entries, t_s has 11"),
     ],
+    "seeds.json": [(lambda d: d["runs"][0].update(counts={}), "counts does not count status")],
     "check.json": [
         (lambda d: d.update(passed=False), "the document: passed does not fit failures"),
         (lambda d: d.update(failures=1), "the document: failures does not count the verdicts that fail"),
@@ -233,17 +183,6 @@ def test_a_doubt_is_in_the_document_and_in_a_note_with_its_figures(
     assert "consistency" not in runs[-1]  # it failed without an answer
     notes = [line for line in note_lines(doubted) if line.startswith(("timid", "contradicted", "the outlier gate"))]
     assert [all(word in line for word in words) for line in notes[:1]] == ([True] if words else [])
-
-
-def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimator(comparison: Comparison) -> None:
-    def mark(accepted: float) -> str:
-        one = replace(comparison.lines[0].outcomes[0].outputs["causal"], nis_dof=900.0)
-        values = {"nis_mean": 0.4, "gate_accepted_percent": accepted}
-        checked = consistency_of([replace(one, scores=Scores(values, {}))])
-        assert checked is not None
-        return checked.verdict
-
-    assert (mark(95.0), mark(88.0)) == ("timid", "heavy-tailed")
 
 
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(comparison: Comparison) -> None:
@@ -311,17 +250,3 @@ def test_components_and_their_deviations_are_those_of_the_figure(scored: Compari
     assert run["components"]["z_m"] == pytest.approx(found.error[:, 5], rel=1e-5, abs=1e-12)  # six digits are kept
     assert run["components"]["sigma_about_x_deg"] == pytest.approx(found.sigma[:, 0], rel=1e-5)
     assert "components" not in run_of(build(scored), "ekf", "final")
-
-
-def test_truth_and_trajectories_are_where_the_document_says(run_directory: Path) -> None:
-    document = json.loads((run_directory / "report.json").read_text())
-    files = [document["truth"], *(run["trajectory"] for run in document["runs"] if run["trajectory"])]
-    files += [one["landmarks"] for one in document["maps"]]
-    assert len(files) == len(set(files)) > 5
-    assert all((run_directory / name).is_file() for name in files)
-
-
-def test_counts_over_seeds_are_of_every_status() -> None:
-    document = json.loads((OLD / "seeds.json").read_text())
-    document["runs"][0]["counts"] = {}
-    assert "counts does not count status" in refused("seeds.json", document)

@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import UNSET, to_builtins
 from msgspec.structs import asdict
 
+from toolkit.answers import STATUS_MEANING
 from toolkit.files import documents
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric, known_metrics
@@ -42,6 +43,7 @@ def payload_of(runs: Sequence[Files]) -> Json:
     colours = look_numbers(run.estimator for files in runs for run in files.scores.runs)
     return {
         "title": " / ".join(titles) or "Experiments",
+        "statuses": STATUS_MEANING,
         "columns": columns_of(_values(runs), real=any(one.manifest.sequence.format != "simulated" for one in runs)),
         "cases": [
             _case(files, f"c{i}", title, colours) for i, (files, title) in enumerate(zip(runs, titles, strict=True))

@@ -16,10 +16,10 @@ function glance(one) {
 
 /** Say in words, before any figure, who did not end well. */
 function troubles(one) {
-  const bad = new Map(one.rows.filter((row) => STATUS_WORDS[row.status]).map((row) => [row.estimator, row]));
+  const bad = new Map(one.rows.filter((row) => row.status !== "ok" && row.status in payload.statuses).map((row) => [row.estimator, row]));
   if (!bad.size) return null;
   return el("div", { class: "card trouble", role: "note" }, el("ul", {}, [...bad.values()].map((row) =>
-    el("li", {}, el("b", { text: row.estimator }), ` ${STATUS_WORDS[row.status]}${row.log?.length ? ` (${row.log[row.status === "failed" ? 0 : row.log.length - 1]})` : ""}.`))));
+    el("li", {}, el("b", { text: row.estimator }), ` ${row.status}: it ${payload.statuses[row.status]}${row.log?.length ? ` (${row.log[row.status === "failed" ? 0 : row.log.length - 1]})` : ""}.`))));
 }
 
 function highlightTiles(one) {

@@ -9,7 +9,7 @@ function summaryTable(cases, columns, title) {
     { name: "estimator", text: (row) => row.estimator },
     ...(cases.length > 1 ? [{ name: "recording", text: (row) => row.case.title }] : []),
     { name: "output", text: (row) => row.output, meaning: OUTPUT_MEANING },
-    { name: "status", text: (row) => row.status, meaning: STATUS_MEANING },
+    { name: "status", text: (row) => row.status, meaning: statusMeaning() },
     ...(rows.some((row) => row.change) ? [{ name: "change", text: (row) => row.change }] : []),
   ];
   let everything = false;

@@ -1,11 +1,11 @@
 const OUTPUT_MEANING = "causal: what was estimated at each frame; final: what was estimated from the whole recording; both: the two are the same";
-const STATUS_MEANING = "ok: ran to the end; diverged: ran to the end with implausible estimates; failed: could not go on. overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that rejected many; contradicted: corrections by the tracks that have one direction, by more than the stated uncertainty allows; the notes have the figures";
+const MARKS_MEANING = "overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that rejected many; contradicted: corrections by the tracks that have one direction, by more than the stated uncertainty allows; the notes have the figures";
 const TABLE_NOTE = "The best of each recording is set off; point at a dash, or read the notes below, for why a value is missing. Compare causal with causal and final with final.";
 
-const STATUS_WORDS = {
-  diverged: "diverged: it ran to the end with implausible estimates",
-  failed: "failed: it could not go on; what it had estimated until then is kept",
-};
+/** Return what a status means, and what a mark beside it does. */
+function statusMeaning() {
+  return `${Object.entries(payload.statuses).map((one) => one.join(": ")).join("; ")}. ${MARKS_MEANING}`;
+}
 
 /** What the case says in words: trouble first, then notes, the audit, the recording, how to repeat it. */
 function wordsOf(one) {
