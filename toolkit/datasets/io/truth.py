@@ -17,7 +17,15 @@ from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.tables import columns_of_file, headings_of
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order, turned
+from toolkit.datasets.trajectories.belonging import (
+    Reference,
+    Steps,
+    check_clock,
+    check_turns,
+    in_other_order,
+    stamps_among,
+    turned,
+)
 from toolkit.datasets.trajectories.formats import (
     POSITIONS_ALONE,
     check_order,
@@ -28,7 +36,7 @@ from toolkit.datasets.trajectories.formats import (
 )
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular
-from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse
 from toolkit.measurements import NS_PER_S
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Sequence, Truth
@@ -37,10 +45,8 @@ OF_POSITIONS = "the truth is of positions alone: its orientations are all one"
 _KIND = "a truth file is TUM text, one pose a line"
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
 _LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
-# Long enough that the noise of single truth poses is small, short enough that the gyro's mean gives the rotation.
-_STEP_NS = NS_PER_S // 10
-# The rotation of a step is unknown where poses around it are farther apart than this.
-_MOST_STEPS = 5
+# The rotation of a step is unknown where poses are farther apart than this: some truths have gaps of minutes.
+_LONGEST_STEP_S = 0.5
 # Rates of two unrelated motions differ by at least the gyro's rates; those of a noisy motion capture by half of that.
 # Differences below the first number are the noise of a good motion capture at a standstill.
 _MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
@@ -158,20 +164,20 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | No
     if not read:
         return None
     found = {path: one.truth for path, one in read.items()}
-    scatter = {path: _rate_scatter_radps(truth, imu) for path, truth in found.items()}
-    ranked = sorted(scatter.items(), key=lambda item: item[1])
-    best, least = ranked[0]
+    apart = {path: _rates_apart_radps(truth, imu) for path, truth in found.items()}
+    ranked = sorted(apart.items(), key=lambda item: item[1][0])
+    best, (least, turning) = ranked[0]
     if not np.isfinite(least):
         raise DataError(
-            f"{best}: the truth and the IMU overlap by less than 0.2 s; check that both are of one recording and clock"
+            f"{best}: it and the IMU have no time in common; check that both are of one recording and clock"
         )
-    scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
+    scatters = "; ".join(f"{path.relative_to(root)} by {off:.4f} rad/s" for path, (off, _) in ranked)
     among = "" if len(ranked) == 1 else ", the better of those in the folder"
-    stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * _turning_radps(found[best], imu)) else ""
+    stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * turning) else ""
     reason = f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters}){stranger}"
     # Orientations that are all one are what a body has that never turns.
-    turns = _turning_radps(found[best], imu) > _MOST_OFF_RADPS
-    reason = "; ".join((reason, *(fact for fact in read[best].facts if turns or fact != OF_POSITIONS)))
+    told = (fact for fact in read[best].facts if turning > _MOST_OFF_RADPS or fact != OF_POSITIONS)
+    reason = "; ".join((reason, *told))
     return TruthRead(found[best], (reason,))
 
 
@@ -216,37 +222,22 @@ def _read_csv(path: Path) -> TruthRead:
     return TruthRead(truth, (*facts, OF_POSITIONS) if is_of_positions(truth) else facts)
 
 
-def _rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
-    """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed."""
+def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
+    """Return how far a truth's rates of rotation are from the gyro's, and how far these vary: RMS about the median.
+
+    The first is infinite where the two share no time.
+    """
     sample_t_ns, gyro_radps = _usable(imu)
-    if not sample_t_ns.size:
-        return float("inf")
-    first, last = max(truth.t_ns[0], sample_t_ns[0]), min(truth.t_ns[-1], sample_t_ns[-1])
-    at_ns = np.arange(first, last + 1, _STEP_NS, dtype=np.int64)
-    if at_ns.size < 3:
-        return float("inf")
-    known = _without_gap(truth.t_ns, at_ns)
-    if not known.any():
-        return float("inf")
-    R_world_imu = interpolate_poses(truth.t_ns, truth.T_world_imu, at_ns)[:, :3, :3]
-    steps = so3_log(np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:])
-    rate_hz = NS_PER_S / _STEP_NS
-    off = (steps * rate_hz - np.diff(turned(sample_t_ns, gyro_radps, at_ns), axis=0) * rate_hz)[known]
-    return float(np.sqrt(((off - np.median(off, axis=0)) ** 2).mean()))
-
-
-def _turning_radps(truth: Truth, imu: ImuSamples) -> float:
-    """Return how much the gyro turns in the time of the truth, RMS about its median (rad/s)."""
-    t_ns, gyro_radps = _usable(imu)
-    shared = gyro_radps[(t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1])]
-    return float(np.sqrt(((shared - np.median(shared, axis=0)) ** 2).mean()))
-
-
-def _without_gap(t_ns: IntArray, at_ns: IntArray) -> BoolArray:
-    """Say of each step (N - 1,) between instants (N,) whether poses stand close about it: some have gaps of minutes."""
-    before = t_ns[np.searchsorted(t_ns, at_ns[:-1], side="right") - 1]
-    after = t_ns[np.minimum(np.searchsorted(t_ns, at_ns[1:]), t_ns.size - 1)]
-    return np.asarray(after - before <= _MOST_STEPS * _STEP_NS)
+    within = stamps_among(truth.t_ns, sample_t_ns)
+    steps = Steps.of(truth.t_ns[within])
+    known = steps.duration_s < _LONGEST_STEP_S
+    if known.sum() < 2:
+        return float("inf"), 0.0
+    turned_rad = turned(sample_t_ns, gyro_radps, steps.t_ns)
+    measured = ((turned_rad[steps.end] - turned_rad[steps.start]) / steps.duration_s[:, None])[known]
+    off = steps.rates(truth.T_world_imu[within, :3, :3])[known] - measured
+    of_gyro, apart = (float(np.sqrt(((x - np.median(x, axis=0)) ** 2).mean())) for x in (measured, off))
+    return apart, of_gyro
 
 
 def _usable(imu: ImuSamples) -> tuple[IntArray, Array]:

@@ -230,7 +230,7 @@ def _clock_difference(frames_t_ns: IntArray, t_ns: IntArray) -> str:
 
 def _check_length_unit(what: str, reference: Reference, t_ns: IntArray, positions: Array) -> None:
     """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
-    steps = _Steps.of(t_ns)
+    steps = Steps.of(t_ns)
     if reference.positions_t_ns.size > 1:
         measured_mps = steps.speeds(_at(reference.positions_t_ns, reference.positions, t_ns))
     elif reference.rates_t_ns.size > 1:
@@ -256,7 +256,7 @@ def _at(t_ns: IntArray, values: Array, at_ns: IntArray) -> Array:
 # Rates of rotation ---------------------------------------------------------------------------------------------------
 
 
-class _Steps(NamedTuple):
+class Steps(NamedTuple):
     """Steps between stamps (N,), of their indices (M,): from each one to the first that is far enough behind it."""
 
     t_ns: IntArray
@@ -265,7 +265,7 @@ class _Steps(NamedTuple):
     duration_s: Array
 
     @classmethod
-    def of(cls, t_ns: IntArray) -> "_Steps":
+    def of(cls, t_ns: IntArray) -> "Steps":
         """Return the steps that end within the stamps."""
         end = np.searchsorted(t_ns, t_ns + _STEP_NS)
         start = np.flatnonzero(end < t_ns.size)
@@ -300,8 +300,8 @@ def check_turns(
     Raises DataError where they agree under one of the readings, and not as given: misread rotations turn the other way
     and about other axes.
     """
-    within = _within(t_ns, reference.rates_t_ns)
-    steps, given = _Steps.of(t_ns[within]), R_world_imu[within]
+    within = stamps_among(t_ns, reference.rates_t_ns)
+    steps, given = Steps.of(t_ns[within]), R_world_imu[within]
     if steps.start.size < 2:
         return False
     measured = steps.mean_rates(reference)
@@ -321,8 +321,8 @@ def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> A
     Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
     they are. A camera's poses beside an IMU's are the usual case.
     """
-    within = _within(t_ns, reference.rates_t_ns)
-    steps = _Steps.of(t_ns[within])
+    within = stamps_among(t_ns, reference.rates_t_ns)
+    steps = Steps.of(t_ns[within])
     if steps.start.size < _FEWEST_STEPS:
         return None
     both = steps.mean_rates(reference), steps.rates(R_world_body[within])
@@ -333,7 +333,7 @@ def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> A
     return turn if is_other and _angle_rad(turn) > _OTHER_AXES_RAD else None
 
 
-def _within(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
+def stamps_among(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
     """Say which stamps (N,) lie between the first and the last of samples (S,); none where there are fewer than two."""
     if sample_t_ns.size < 2:
         return np.zeros(t_ns.size, dtype=bool)
