@@ -558,7 +558,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (check("--tracks", "simulated"), "leave --tracks simulated out"),
         (say("check-data", "@/../drive_imgs.npy"), "name the file beside it without _imgs"),
-        (put(extR_T_imu=T_REGULAR_OPTICAL @ se3_exp(0.3 * np.ones(6))), "is not; rectify the recording"),
+        (put(extR_T_imu=T_REGULAR_OPTICAL @ se3_exp(0.3 * np.ones(6))), "no pair; rectify the recording"),
         (put(extR_T_imu=T_REGULAR_OPTICAL), "and so without a baseline; correct one"),
         (put(cam_imgs_L=[np.zeros((4, 4))] * FRAMES), "save the images as grey ones"),
         (
@@ -741,7 +741,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     "odometry": [
         (edit("calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
         (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "missing P0"),
-        (text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 5 images"),
+        (text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 5 images; cut both alike, or take its own"),
         (text("times.txt", "0\n0.1\nx\n"), "times.txt: line 3 is not numeric"),
         (text("times.txt", "".join(f"{k}00000000\n" for k in range(FRAMES))), "look like nanoseconds: divide by 1e9"),
         (text("times.txt", ""), "times.txt has one number a line, in seconds"),

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.datasets.io.fields import (
+    NO_SIGHTINGS,
     Fields,
     camera_matrix,
     check_frame_count,
@@ -66,13 +67,11 @@ def load(path: Path) -> Sequence:
     """
     parts = _parts(path)
     features = parts.stored.get(_FEATURES)
-    left = parts.K[0]
-    pinhole_px = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
-    rig = StereoRig(*pinhole_px, parts.baseline_m, parts.T_imu_left, pixel_covariance(2))
+    K = parts.K[0]
+    rig = StereoRig(K[0, 0], K[1, 1], K[0, 2], K[1, 2], parts.baseline_m, parts.T_imu_left, pixel_covariance(2))
     if isinstance(features, np.ndarray):
         return _sequence(parts, rig, *_sightings(parts, features))
-    nothing = np.empty(0, dtype=np.int64)
-    return _sequence(parts, rig, Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,))
+    return _sequence(parts, rig, NO_SIGHTINGS, (NO_FEATURES,))
 
 
 def uses_images(path: Path, tracks: Tracks) -> bool:
@@ -131,10 +130,7 @@ def _parts(path: Path) -> _Parts:
     turned_rad = float(np.linalg.norm(so3_log(left[:3, :3].T @ right[:3, :3])))
     turned = f"{np.rad2deg(turned_rad):.2f} deg"
     if turned_rad > _MOST_TURNED_RAD:
-        raise DataError(
-            f"{path}: extL_T_imu and extR_T_imu are turned by {turned}, and a rectified pair is not; rectify the "
-            "recording"
-        )
+        raise DataError(f"{path}: extL_T_imu and extR_T_imu are turned by {turned}: no pair; rectify the recording")
     # The same number in whatever direction and axes the extrinsics are.
     baseline_m = float(np.linalg.norm(left[:3, 3] - right[:3, 3]))
     if not baseline_m > 0.0:
@@ -195,9 +191,7 @@ def _spooled(parts: _Parts, spool: ImageSpool, progress: Progress) -> tuple[tupl
         for place, image in enumerate(images):
             is_image = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
             if not is_image or 0 in image.shape:
-                raise DataError(
-                    f"{path}: {key}[{place}] is no array (height, width) of uint8; save the images as grey ones"
-                )
+                raise DataError(f"{path}: {key}[{place}] is no array (H, W) of uint8; save the images as grey ones")
         sides.append(images)
     pairs = []
     for place, (left, right) in enumerate(zip(*sides, strict=True)):

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
+from toolkit.datasets.io.fields import (
+    NO_SIGHTINGS,
+    Fields,
+    camera_matrix,
+    check_frame_count,
+    rectified_observations,
+    stamps_ns,
+)
 from toolkit.datasets.io.numpy_files import NpzArchive, holds_arrays, opened
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
@@ -90,7 +97,6 @@ def _check_alike(fields: Fields, one: str, of_one: Array, other: str, of_other: 
 
 def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> tuple[Observations, tuple[str, ...]]:
     if "features" not in archive.keys:
-        nothing = np.empty(0, dtype=np.int64)
-        return Observations(nothing, nothing, np.empty((0, 3))), (NO_FEATURES,)
+        return NO_SIGHTINGS, (NO_FEATURES,)
     frame, track, corners_px, facts = archive.corners("features", frame_count)
     return rectified_observations(path, frame, track, corners_px), facts

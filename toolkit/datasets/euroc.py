@@ -164,14 +164,14 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
     truth = truth_at(choice.truth, frames_t_ns)
-    _check_room(layout.root, truth.T_world_imu[:, :3, 3])
+    points = _room_around(layout.root, truth.T_world_imu[:, :3, 3])
     camera = CameraLimits(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
     return Sequence(
         name=f"{layout.root.name} (simulated stereo)",
         rig=calibration.rig,
         noise=calibration.noise,
         frames_t_ns=frames_t_ns,
-        observations=_tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed),
+        observations=_tracks_of(points, truth.T_world_imu, calibration.rig, camera, seed),
         motion=imu,
         provenance=Provenance(
             "euroc",
@@ -294,35 +294,21 @@ def _how_simulated(layout: _Layout) -> str:
     return f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU"
 
 
-def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> Observations:
-    """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance."""
+def _tracks_of(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> Observations:
+    """Simulate what a tracker sees of points (N, 3) m from poses (K, 4, 4), with the noise of the rig's covariance."""
     tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
-    points = _room_around(T_world_imu[:, :3, 3])
     tracks = sensors.follow(sensors.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
     exact = sensors.sightings(tracks, points, T_world_imu, rig)
     # Track ids grow with time and a frame's places keep their order, so the rows are sorted already.
     return sensors.with_pixel_noise(exact, 1.0, rig.cov_uv_px2, camera.step_px, pixels_rng)
 
 
-def _check_room(root: Path, positions: Array) -> None:
-    if not _surface_m2(*_corners(positions)) < _MOST_SURFACE_M2:
-        raise DataError(
-            f"{root}: the truth spans {np.ptp(positions, axis=0).max():.3g} m, and tracks are simulated in a room; "
-            "check its unit, or take the tracks of images"
-        )
-
-
-def _room_around(positions: Array) -> Array:
-    lower, upper = _corners(positions)
-    count = round(_LANDMARKS_PER_M2 * _surface_m2(lower, upper))
-    return scenes.room(lower, upper, count, np.random.default_rng(_WORLD_SEED))
-
-
-def _corners(positions: Array) -> tuple[Array, Array]:
-    """Return the two corners (3,) m of the room around positions (K, 3)."""
-    return positions.min(axis=0) - _MARGIN_LOWER_M, positions.max(axis=0) + _MARGIN_UPPER_M
-
-
-def _surface_m2(lower: Array, upper: Array) -> float:
-    size = upper - lower
-    return 2.0 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+def _room_around(root: Path, positions: Array) -> Array:
+    """Return landmarks (N, 3) m on the walls of a room around positions (K, 3); raises DataError where it is a hall."""
+    lower, upper = positions.min(axis=0) - _MARGIN_LOWER_M, positions.max(axis=0) + _MARGIN_UPPER_M
+    x, y, z = upper - lower
+    surface_m2 = 2.0 * float(x * y + y * z + z * x)
+    if not surface_m2 < _MOST_SURFACE_M2:
+        span, remedy = f"{np.ptp(positions, axis=0).max():.3g} m", "check its unit, or take the tracks of images"
+        raise DataError(f"{root}: the truth spans {span}, and tracks are simulated in a room; {remedy}")
+    return scenes.room(lower, upper, round(_LANDMARKS_PER_M2 * surface_m2), np.random.default_rng(_WORLD_SEED))

@@ -158,19 +158,17 @@ def _listed(layout: _Layout) -> Listed:
 
 def _rectified_pair(file: Path, names: list[str], P: tuple[Array, Array], size_px: tuple[int, int]) -> RectifiedPair:
     """Return the pair of two projections (3, 4), by these names in a file; raises DataError where they are none."""
-    left, right = P
+    (left, right), both = P, " and ".join(names)
     for name, projection in zip(names, P, strict=True):
         if not (np.isfinite(projection).all() and projection[0, 0] > 0.0 and projection[1, 1] > 0.0):
             raise DataError(f"{file}: {name} is no projection: its focal lengths must be positive")
     if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6):
-        raise DataError(f"{file}: {names[0]} and {names[1]} differ in more than the baseline; they are not rectified")
+        raise DataError(f"{file}: {both} differ in more than the baseline; they are not rectified")
     baseline_m = float((left[0, 3] - right[0, 3]) / left[0, 0])
     if baseline_m == 0.0:
-        raise DataError(f"{file}: {names[0]} and {names[1]} are the same, so there is no baseline; give each its own")
+        raise DataError(f"{file}: {both} are the same, so there is no baseline; give each its own")
     if not baseline_m > 0.0:
-        raise DataError(
-            f"{file}: by {names[0]} and {names[1]} the right camera is not to the right of the left; exchange them"
-        )
+        raise DataError(f"{file}: by {both} the right camera is not to the right of the left; exchange them")
     return already_rectified(pinhole_of(left), baseline_m, size_px)
 
 
@@ -216,10 +214,8 @@ def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
     centre, size = f"{pair.cx_px:g} {pair.cy_px:g}", f"{size_px[0]}x{size_px[1]} px"
     places = [c / length for c, length in zip((pair.cx_px, pair.cy_px), size_px, strict=True)]
     if not all(_BORDER < place < 1.0 - _BORDER for place in places):
-        raise DataError(
-            f"{file}: its principal point, {centre}, is not that of images of {size}; where these were scaled or cut, "
-            "do the same to P0 to P3"
-        )
+        remedy = "where these were scaled or cut, do the same to P0 to P3"
+        raise DataError(f"{file}: its principal point, {centre}, is not that of images of {size}; {remedy}")
     facts = (
         f"the principal point, {centre}, is far from the middle of images of {size}: check that calib.txt is of images "
         "of this size",
@@ -280,10 +276,7 @@ def _poses(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
         )
     T_world_cam = poses.T_world_imu
     if len(T_world_cam) not in (stamps.size, _count(layout)):
-        raise DataError(
-            f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence, or not cut "
-            "as the images are"
-        )
+        raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; cut both alike, or take its own")
     T_cam_flu = np.linalg.inv(T_FLU_CAM)
     posed = stamps[: len(T_world_cam)]
     used = np.flatnonzero(np.isin(posed, t_ns))
@@ -425,9 +418,7 @@ def _read_stamps(file: Path) -> dict[int, int]:
         try:
             stamps[row] = int(np.datetime64(text if _STAMP.fullmatch(text) else "no stamp", "ns").astype(np.int64))
         except ValueError as error:
-            raise DataError(
-                f"{file}: line {row + 1} is no date and time; write it as 2011-09-26 13:02:25.96"
-            ) from error
+            raise DataError(f"{file}: line {row + 1} is no time; write it as 2011-09-26 13:02:25.96") from error
     if not stamps:
         raise DataError(f"{file}: holds no stamps; copy it again")
     return stamps

@@ -175,9 +175,8 @@ def _motion(
         return TwistSamples(t_ns, values[:, :3], values[:, 3:]), _twist_noise(place, t_ns, values, noise), ()
     missing = [key for key in known if key not in noise]
     if missing:
-        raise DataError(
-            f"{place}: missing {', '.join(f'{_NOISE}.{key}' for key in missing)}; an IMU's data sheet has them"
-        )
+        lacking = ", ".join(f"{_NOISE}.{key}" for key in missing)
+        raise DataError(f"{place}: missing {lacking}; an IMU's data sheet has them")
     fields = _fields(place, noise)
     samples, facts = _imu_samples(table, t_ns, columns)
     return samples, ImuNoise(**{key: fields.positive(key) for key in known}), facts

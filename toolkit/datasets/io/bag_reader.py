@@ -309,9 +309,7 @@ def _rows(message: Any, what: str, height: int, width: int, channels: int, dtype
     step, row = int(message.step), width * channels * dtype.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if not (height > 0 and width > 0 and step >= row and data.size >= height * step):
-        raise DataError(
-            f"{what}: an image of {width}x{height} px has {data.size} bytes in rows of {step}; it is cut off"
-        )
+        raise DataError(f"{what}: {width}x{height} px have {data.size} bytes in rows of {step}; it is cut off")
     pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     return pixels.view(dtype.newbyteorder(">" if message.is_bigendian else "<")).reshape(height, width, channels)
 

@@ -289,9 +289,7 @@ def _camera_of(fields: Fields) -> Camera:
     fx, fy, cx, cy = _pinhole_of(fields)
     width, height = fields.constant("resolution", 2).tolist()
     if not (fx > 0.0 and fy > 0.0 and 0.0 < cx < width and 0.0 < cy < height):
-        raise DataError(
-            f"{fields.path}: intrinsics {fx:g} {fy:g} {cx:g} {cy:g} are not of a {width:g}x{height:g} image"
-        )
+        raise DataError(f"{fields.path}: intrinsics {fx:g} {fy:g} {cx:g} {cy:g} are not of {width:g}x{height:g} px")
     name = str(fields.arrays["distortion_model"])
     given = next((key for key in _COEFFICIENTS if key in fields), None)
     if given is None and name != "none" and name in _LENSES:

@@ -58,6 +58,7 @@ _UNITS_OF_NS = (
     (1.6e3, "milliseconds: multiply by 1e6"),
     (5e5, "microseconds: multiply by 1e3"),
 )
+NO_SIGHTINGS = Observations(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 _DIALECT = "%YAML:"
 # A calibration of a rig of many cameras takes some thousand characters.
 _MOST_CHARACTERS = 1_000_000
@@ -162,9 +163,7 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     unit = _unit_of(stamps_s)
     coarse_s = (1.0 if unit is None else unit[0]) * float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
     if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s):
-        raise DataError(
-            f"{path}: {key} went through single precision, whose steps are {coarse_s:g} s there: write it in double"
-        )
+        raise DataError(f"{path}: {key} went through single precision, in steps of {coarse_s:g} s: write it in double")
     if unit is not None:
         raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit[1]}")
     return np.rint(stamps_s * NS_PER_S).astype(np.int64)
@@ -281,9 +280,7 @@ def camera_matrix(path: Path, key: str, K: Array) -> Array:
         raise DataError(f"{path}: the last row of {key} is {K[2].tolist()}, expected 0, 0, 1; {remedy}")
     skew_px = max(abs(float(K[0, 1])), abs(float(K[1, 0])))
     if skew_px > _MOST_SKEW * abs(float(K[0, 0])):
-        raise DataError(
-            f"{path}: {key} has a skew of {skew_px:g} px, and a rectified pair has none; rectify the images"
-        )
+        raise DataError(f"{path}: {key} has a skew of {skew_px:g} px, a rectified pair has none; rectify the images")
     for axis, name in enumerate(("fx", "fy")):
         if not K[axis, axis] > 0.0:
             raise DataError(f"{path}: {name} in {key} is {K[axis, axis]:g}, expected a positive number; correct {key}")

@@ -286,11 +286,9 @@ def check_both_cameras(root: Path, left: Path, right: Path) -> None:
     """Raise DataError where one of two folders of a recording, its cameras' images, has none."""
     there, lacking = (left, right) if images_in(left) else (right, left)
     if not images_in(lacking):
-        names = [str(folder.relative_to(root)) for folder in (there, lacking)]
-        raise DataError(
-            f"{root}: {names[0]} has images and {names[1]} has none, and stereo needs both cameras; add those of "
-            f"{names[1]}"
-        )
+        with_images, without = (str(folder.relative_to(root)) for folder in (there, lacking))
+        why = "and stereo needs both cameras; add those of"
+        raise DataError(f"{root}: {with_images} has images and {without} has none, {why} {without}")
 
 
 def check_one_trigger(mav0: Path, listed: Listed) -> None:

@@ -207,16 +207,12 @@ def read_dict(path: Path) -> dict[str, Plain]:
     with open_input(path) as file:
         layout = _header(file, f"{path}:")
         if layout.dtype.kind != "O":
-            raise DataError(
-                f"{path}: one array of shape {layout.shape}, expected a dict of arrays by name, saved with numpy.save"
-            )
+            raise DataError(f"{path}: one array of shape {layout.shape}, expected a dict saved with numpy.save")
         try:
             content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
             found = _PlainUnpickler(path, _Mapped(content, file.tell())).load()
         except _DAMAGED_PICKLE as error:
-            raise DataError(
-                f"{path}: damaged or truncated npy ({_first_line(error)}); copy or save it again"
-            ) from error
+            raise DataError(f"{path}: damaged or truncated npy ({_first_line(error)}); save it again") from error
     inner = found[0] if isinstance(found, list) and len(found) == 1 else found
     if not (isinstance(inner, dict) and all(isinstance(key, str) for key in inner)):
         raise DataError(f"{path}: holds no dict of named values; save the recording as one with numpy.save")
