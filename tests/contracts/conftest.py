@@ -43,7 +43,7 @@ def valid_files(workshop: Path) -> dict[str, Files]:
         **_course(drive),
         "own tables": _contents(written(flight, workshop / "own")),
         "utias": _utias(drive),
-        "openvins": _openvins(flight),
+        "openvins": openvins_files(flight),
         "lean euroc": _lean(flight),
     }
 
@@ -95,7 +95,8 @@ def _utias(sequence: Sequence) -> Files:
     return {"": out.getvalue()}
 
 
-def _openvins(sequence: Sequence) -> Files:
+def openvins_files(sequence: Sequence) -> Files:
+    """Return a simulation as an export of OpenVINS' simulator, by the names of its files."""
     rig, seen = sequence.rig, sequence.observations
     pinhole = {"fx": rig.fx_px, "fy": rig.fy_px, "cx": rig.cx_px, "cy": rig.cy_px, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
     right = rig.T_imu_cam.copy()

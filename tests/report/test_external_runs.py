@@ -1,6 +1,5 @@
 """Another system's trajectory is a run beside those that ran here, or one line says why it cannot be."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.contracts.conftest import openvins_files
 from toolkit.answers import Run
 from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import FORMATS, read_poses
@@ -20,8 +20,8 @@ from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.references import ExternalFile, external_runs, reference_runs
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
+from toolkit.measurements import NS_PER_S
 from toolkit.metrics import cost, score_run
-from toolkit.motion_samples import TwistSamples
 from toolkit.report.comparison_text import report_text
 from toolkit.report.figures import over_time
 from toolkit.report.records import read_metrics
@@ -91,26 +91,13 @@ def test_poses_at_other_stamps_are_taken_to_the_frames(tmp_path: Path, recording
     assert scores["pairs"] == recording.frame_count - 2
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence, seed: int) -> None:
-    truth, rng = truth_of(recording), np.random.default_rng(seed)
+def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence) -> None:
+    truth, rng = truth_of(recording), np.random.default_rng(0)
     jitter = se3_exp(rng.normal(0.0, [0.02] * 3 + [0.2] * 3, (len(truth), 6)))
     drift = se3_exp(np.linspace(0.0, 1.0, len(truth))[:, None] * rng.normal(0.0, [0.3] * 3 + [20.0] * 3))
     run = read_as_run(tmp_path, Trajectory(truth.t_ns, drift @ truth.T_world_imu @ jitter), recording)
     assert run.final is not None
     assert len(run.final) == recording.frame_count
-
-
-def test_a_straight_drive_w_first_is_named_though_no_gyro_decides(tmp_path: Path) -> None:
-    recording = simulate(replace(DRIVE, duration_s=10.0), seed=2)
-    assert isinstance(recording.motion, TwistSamples)
-    still = replace(recording.motion, w_radps=np.zeros_like(recording.motion.w_radps))
-    straight = replace(recording, motion=still)
-    forward = np.zeros((recording.frame_count, 3))
-    forward[:, 0] = np.arange(recording.frame_count)
-    upside_down = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (recording.frame_count, 3, 3))
-    mistaken = Trajectory(recording.frames_t_ns, se3(upside_down, forward))
-    assert "the quaternions look w first" in refusal(tmp_path, mistaken, straight)
 
 
 def test_kitti_rows_are_the_frames_all_of_them_or_those_compared(tmp_path: Path, recording: Sequence) -> None:
@@ -142,17 +129,13 @@ def _turned(trajectory: Trajectory, rotations: Array) -> Trajectory:
     return Trajectory(trajectory.t_ns, se3(rotations, trajectory.positions))
 
 
-def _rolled(given: Trajectory, places: int) -> Trajectory:
-    quaternions = np.roll(quaternion_from_rotation(given.T_world_imu[:, :3, :3]), places, axis=1)
+def _rolled(given: Trajectory) -> Trajectory:
+    quaternions = np.roll(quaternion_from_rotation(given.T_world_imu[:, :3, :3]), -1, axis=1)
     return _turned(given, rotation_from_quaternion(quaternions))
 
 
-def _later(given: Trajectory, shift_s: float) -> Trajectory:
-    return Trajectory(given.t_ns + round(shift_s * 1e9), given.T_world_imu)
-
-
 MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str]] = {
-    "w last": (lambda given, _: _rolled(given, -1), "euroc", "the quaternions look w last"),
+    "w last": (lambda given, _: _rolled(given), "euroc", "the quaternions look w last"),
     "world to IMU": (
         lambda given, _: _turned(given, np.swapaxes(given.T_world_imu[:, :3, :3], 1, 2)),
         "openvins",
@@ -163,7 +146,11 @@ MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str
         "kitti",
         "the poses look like the left camera's",
     ),
-    "another drive": (lambda given, _: _later(given, 5000.0), "tum", "another drive or clock"),
+    "another drive": (
+        lambda given, _: Trajectory(given.t_ns + 5000 * NS_PER_S, given.T_world_imu),
+        "tum",
+        "another drive or clock",
+    ),
 }
 
 
@@ -171,13 +158,6 @@ MISTAKES: dict[str, tuple[Callable[[Trajectory, Sequence], Trajectory], str, str
 def test_a_mistake_is_named_with_its_remedy(tmp_path: Path, recording: Sequence, mistake: str) -> None:
     make, name, expected = MISTAKES[mistake]
     assert expected in refusal(tmp_path, make(truth_of(recording), recording), recording, name)
-
-
-def test_poses_in_exchanged_axes_are_named_where_a_truth_shows_them(tmp_path: Path) -> None:
-    recording = simulate(replace(FLIGHT, duration_s=10.0), seed=2)
-    truth = truth_of(recording)
-    exchanged = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], truth.positions[:, [0, 2, 1]]))
-    assert "with y and z exchanged (positions alone)" in refusal(tmp_path, exchanged, recording)
 
 
 pytestmark = pytest.mark.usefixtures("unrendered")
@@ -196,55 +176,21 @@ def export(flight: Sequence, tmp_path: Path) -> Path:
     """Return a simulated flight as an export of OpenVINS, whose estimate rises to an error of 0.25 m in height."""
     folder = tmp_path / "flight"
     folder.mkdir()
-    rig, motion, seen, truth = flight.rig, flight.motion, flight.observations, flight.truth
-    assert truth is not None
-    right = rig.T_imu_cam.copy()
-    right[:3, 3] += rig.baseline_m * right[:3, 0]
-    pinhole = {"fx": rig.fx_px, "fy": rig.fy_px, "cx": rig.cx_px, "cy": rig.cy_px, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
-    calibration = {
-        "cam0": {**pinhole, "T_imu_cam": rig.T_imu_cam.tolist()},
-        "cam1": {**pinhole, "T_imu_cam": right.tolist()},
-        "imu": {key: float(value) for key, value in vars(flight.noise).items()},
-        "pixel_noise_sigma": 1.0,
-        "gravity_world": flight.gravity_world.tolist(),
-    }
-    (folder / "calib.json").write_text(json.dumps(calibration))
-    stamps_s = motion.t_ns / 1e9
-    write_csv(folder / "imu.csv", "timestamp,ax,ay,az,gx,gy,gz", np.column_stack([stamps_s, motion.values]))
-    t_s = flight.frames_t_ns[seen.frame] / 1e9
-    both = np.ones((len(seen), 2))
-    rows = np.column_stack([t_s, seen.frame, seen.track_id, seen.uv_px[:, [0, 2, 1, 2]], both])
-    write_csv(folder / "features.csv", "timestamp,frame,feature_id,uL,vL,uR,vR,in_left,in_right", rows)
-    quaternions = quaternion_from_rotation(truth.T_world_imu[:, :3, :3])
-    positions, t_s = truth.T_world_imu[:, :3, 3], truth.t_ns / 1e9
-    head = "timestamp,px,py,pz,qx,qy,qz,qw,vx,vy,vz,bax,bay,baz,bgx,bgy,bgz"
-    nine = np.zeros((t_s.size, 9))
-    write_csv(folder / "truth_cam.csv", head, np.column_stack([t_s, positions, quaternions, nine]))
-    risen = positions + np.linspace(0.0, OFFSET_M, t_s.size)[:, None] * [0.0, 0.0, 1.0]
-    # printed as OpenVINS prints: 16 digits, which is rounded to the microsecond
-    states = [
-        " ".join(f"{value:.16g}" for value in row) for row in np.column_stack([t_s + 3e-7, quaternions, risen, nine])
-    ]
-    (folder / "est.txt").write_text("\n".join(["# t q_GtoI(x y z w, JPL) p_IinG v_IinG bg ba", *states]) + "\n")
+    truth = truth_of(flight)
+    rise_m = np.linspace(0.0, OFFSET_M, len(truth))[:, None] * [0.0, 0.0, 1.0]
+    risen = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], truth.positions + rise_m))
+    for name, content in openvins_files(flight).items():
+        (folder / name).write_bytes(content)
+    (folder / "est.txt").write_text(FORMATS["openvins"].text(risen))
+    (tmp_path / "truth.csv").write_text(FORMATS["euroc"].text(truth))
     return folder
 
 
-def write_csv(path: Path, head: str, rows: Array) -> None:
-    np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt="%.9f")
-
-
-def compared(export: Path, max_frames: int | None = None) -> tuple[Comparison, Path]:
+def compared(export: Path) -> tuple[Comparison, Path]:
     out = export.parent / "run"
-    (comparison,) = run(Plan((str(export),), ("dead-reckoning",), max_frames=max_frames, workers=1))
+    (comparison,) = run(Plan((str(export),), ("dead-reckoning",), truth=export.parent / "truth.csv", workers=1))
     write_run(comparison, out, MadeBy("vislam compare", Configuration()))
     return comparison, out
-
-
-def entry(directory: Path) -> dict[str, dict[str, object]]:
-    read_metrics(directory / "metrics.json")
-    document = json.loads((directory / "metrics.json").read_text())
-    (found,) = (run for run in document["runs"] if run["estimator"] == NAME)
-    return found
 
 
 def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> None:
@@ -252,7 +198,8 @@ def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> 
     assert [(row.estimator, row.output, row.status) for row in comparison.rows if row.estimator == NAME] == [
         (NAME, "causal", "ok")
     ]
-    metrics, notes = entry(directory)["metrics"], entry(directory)["notes"]
+    (found,) = (one for one in read_metrics(directory / "metrics.json").runs if one.estimator == NAME)
+    metrics, notes = found.metrics, found.notes
     risen_m = np.linspace(0.0, OFFSET_M, comparison.sequence.frame_count)
     assert metrics["ate_yaw_m"] == pytest.approx(risen_m.std(), rel=1e-3)
     assert metrics["coverage_percent"] == 100.0
