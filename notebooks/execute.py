@@ -11,7 +11,6 @@ from pathlib import Path
 
 import jupytext
 import nbformat
-from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 from PIL import Image
 
@@ -38,14 +37,11 @@ def read_source(source: Path) -> nbformat.NotebookNode:
     return notebook
 
 
-def execute(source: Path, kernel: KernelManager | None = None) -> nbformat.NotebookNode:
-    """Return the notebook executed in a kernel that runs, or in one of its own.
-
-    Raises nbclient's CellExecutionError where a cell fails.
-    """
+def execute(source: Path) -> nbformat.NotebookNode:
+    """Return the notebook executed; raises nbclient's CellExecutionError where a cell fails."""
     notebook = read_source(source)
     resources = {"metadata": {"path": str(FOLDER)}}
-    NotebookClient(notebook, km=kernel, timeout=TIMEOUT_S, record_timing=False, resources=resources).execute()
+    NotebookClient(notebook, timeout=TIMEOUT_S, record_timing=False, resources=resources).execute()
     notebook.metadata.pop("language_info", None)
     for cell in notebook.cells:
         for output in cell.get("outputs", []):

@@ -11,21 +11,16 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
-from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 
 from toolkit import cli
-from toolkit.audit import audit
 from toolkit.cli import main
 from toolkit.cli.compare import SEQUENCES
-from toolkit.datasets import load_sequence
 from toolkit.errors import VislamError
-from toolkit.geometry import se3_exp
 from toolkit.registry import defaults
 
 PROJECT = Path(__file__).parents[2]
@@ -37,6 +32,7 @@ PAGES = (
     PROJECT / ".github/CONTRIBUTING.md",
 )
 
+_NUMBER = re.compile(r"(?<!\w)-?\d+(?:\.\d+)?")
 _FENCE = re.compile(r"^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?\n(?P<text>.*?)^```$", re.M | re.S)
 
 
@@ -221,30 +217,10 @@ def test_everything_the_page_for_the_course_shows_runs_and_prints_what_is_shown(
     printed = dict(zip(steps, carry_out(steps), strict=True))
     assert_tables_are_those_shown(COURSE, printed)
     program, shown = next(pair for pair in pairwise(blocks(COURSE)) if pair[0].language == "python")
-    lines, fresh_lines = shown.text.splitlines(), printed[program].splitlines()
-    assert len(lines) == len(fresh_lines)
-    for line, fresh in zip(lines, fresh_lines, strict=True):
-        words, now = line.split(), fresh.split()
-        assert words[:2] == now[:2]
-        for word, of_now in zip(words, now, strict=True):
-            if re.match(r"-?\d", word):
-                # Metres, after 1.3 km; other versions of the libraries round another way.
-                assert float(word.strip(",")) == pytest.approx(float(of_now.strip(",")), abs=2.0), line
-            else:
-                assert word == of_now
-
-
-def test_the_page_for_the_course_says_of_dataset_10_what_its_velocities_say(real: Callable[[str], Path]) -> None:
-    page = " ".join(COURSE.read_text(encoding="utf-8").split())
-    sequence = load_sequence(str(real("ucsd/10_imu_only.npz")))
-    (bias,) = [finding.detail for finding in audit(sequence).findings if finding.fault == "gyro-bias"]
-    (standing,) = re.findall(r"(\d+) samples at standstill", bias)
-    assert f"stands still in {standing} of {sequence.frame_count} samples" in page
-    dt_s = np.diff(sequence.motion.t_ns)[:, None] / 1e9
-    v_mps, w_radps = np.split(sequence.motion.values[:-1], 2, axis=1)
-    end = reduce(np.matmul, se3_exp(dt_s * np.hstack([w_radps, v_mps])))
-    (height_m,) = re.findall(r"ends (\d+) m above its start", page)
-    assert float(height_m) == pytest.approx(end[2, 3], abs=1.0)
+    for line, fresh in zip(shown.text.splitlines(), printed[program].splitlines(), strict=True):
+        assert _NUMBER.sub("", line) == _NUMBER.sub("", fresh)
+        # Metres, after 1.3 km; other versions of the libraries round another way.
+        assert [*map(float, _NUMBER.findall(line))] == pytest.approx([*map(float, _NUMBER.findall(fresh))], abs=2.0)
 
 
 def assert_tables_are_those_shown(page: Path, printed: Mapping[str | Block, str]) -> None:
@@ -337,17 +313,6 @@ def test_lines_are_short_and_no_path_is_that_of_one_machine(
     assert f"{PROJECT}/" not in text
     prose = [line for line in text.splitlines() if not line.startswith("|")]
     assert max(map(len, prose)) <= 120
-
-
-def test_every_page_is_reached_from_the_readme() -> None:
-    reached, waiting = set[Path](), [PROJECT / "README.md"]
-    while waiting:
-        page = waiting.pop()
-        reached.add(page)
-        links = re.findall(r"\]\(([^)#\s]+\.md)", page.read_text(encoding="utf-8"))
-        found = {(page.parent / link).resolve() for link in links if not link.startswith("https:")}
-        waiting += found - reached - set(waiting)
-    assert set(PAGES) <= reached
 
 
 def test_every_exit_status_is_in_the_docs() -> None:

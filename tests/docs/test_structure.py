@@ -1,4 +1,4 @@
-"""The tree can be read: one name for one class, and a folder's __init__ that names what lives there.
+"""One name stands for one class; what estimators import is what the page on extending names.
 
 What import-linter proves, it proves of the modules that its contracts name: these are all there are.
 """
@@ -8,12 +8,8 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
-
 PROJECT = Path(__file__).parents[2]
 FILES = sorted(path for package in ("toolkit", "filters") for path in (PROJECT / package).rglob("*.py"))
-# Their modules are found by being there, and any may be taken away: the docstring says where to begin.
-FOUND_BY_BEING_THERE = ("filters", "toolkit/datasets", "toolkit/metrics")
 
 
 def test_the_name_of_a_class_stands_for_one_thing() -> None:
@@ -23,16 +19,6 @@ def test_the_name_of_a_class_stands_for_one_thing() -> None:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places.setdefault(node.name, []).append(path.relative_to(PROJECT).as_posix())
     assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}
-
-
-@pytest.mark.parametrize("init", [path for path in FILES if path.name == "__init__.py"], ids=lambda p: p.parent.name)
-def test_a_folder_names_every_module_in_it(init: Path) -> None:
-    text = init.read_text(encoding="utf-8")
-    assert ast.get_docstring(ast.parse(text))
-    if init.parent.relative_to(PROJECT).as_posix() not in FOUND_BY_BEING_THERE:
-        inside = {path.stem for path in init.parent.glob("*.py")} - {"__init__", "__main__"}
-        inside |= {path.parent.name for path in init.parent.glob("*/__init__.py")}
-        assert {name for name in inside if not re.search(rf"\b{name}\b", text)} == set()
 
 
 def imports(path: Path) -> set[str]:

@@ -9,38 +9,17 @@ import subprocess
 import sysconfig
 import tempfile
 import venv
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import nbformat
 import pytest
-from jupyter_client.manager import KernelManager
-from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = ROOT / "notebooks"
 SOURCES = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.py"))
 MOST_BYTES = 300_000
-
-# Notebooks compare a recording several times, and each time it is loaded and audited anew: here that is done once.
-AUDITED_ONCE = """
-def audited_once():
-    from dataclasses import replace
-    from functools import cache
-    from toolkit.experiment import recording
-    from toolkit.settings import DEFAULTS
-
-    # All that neither loading nor auditing looks at is left at its default.
-    unread = {"start": "measurements", "noise": DEFAULTS.noise, "tracks": DEFAULTS.tracks, "card": False}
-    audited = cache(recording.audited_recording)
-    recording.audited_recording = lambda requested, progress=None: audited(replace(requested, **unread))
-
-audited_once()
-"""
-# What a figure shows is tested elsewhere: here it is drawn, and encoded with few pixels.
-FEW_PIXELS = "%config InlineBackend.print_figure_kwargs = {'dpi': 20, 'bbox_inches': None}"
 
 each = pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
 
@@ -96,48 +75,13 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not [target for target in linked if not (NOTEBOOKS / target).exists()]
 
 
-@pytest.fixture(scope="module")
-def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
-    """Start a kernel in which notebooks run one after the other, on one processor, without real recordings.
-
-    To start one and to import the packages takes three seconds. What is kept was executed in a kernel for each.
-    """
-    manager = KernelManager()
-    # Tests run side by side: what starts threads or processes of its own would only fight for the cores.
-    variables = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "VISLAM_DATA": str(tmp_path_factory.mktemp("no"))}
-    with _one_processor():
-        manager.start_kernel(cwd=str(NOTEBOOKS), env={**os.environ, **variables})
-    run(AUDITED_ONCE, manager)
-    run(FEW_PIXELS, manager)
-    yield manager
-    manager.shutdown_kernel(now=True)
-
-
-def run(cell: str, kernel: KernelManager) -> None:
-    """Run a cell in a kernel; raises nbclient's CellExecutionError where it fails."""
-    NotebookClient(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell)]), km=kernel).execute()
-
-
-@contextmanager
-def _one_processor() -> Iterator[None]:
-    """Let what is started meanwhile use one processor, another one for each worker that runs tests."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    every = os.sched_getaffinity(0)
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    os.sched_setaffinity(0, {sorted(every)[worker % len(every)]})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, every)
-
-
 @pytest.mark.notebooks
 @each
-def test_it_runs_where_no_real_recording_is(source: Path, execution: ModuleType, kernel: KernelManager) -> None:
-    run("%reset -f", kernel)
-    executed = execution.execute(source, kernel)  # raises where a cell fails
+def test_it_runs_where_no_real_recording_is(
+    source: Path, execution: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("VISLAM_DATA", str(tmp_path))
+    executed = execution.execute(source)  # raises where a cell fails
     reported = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
     assert "the real" not in reported
 
