@@ -22,19 +22,13 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["ExplainResult", "Result", "Settings", "SweepResult", "compare", "explain", "load_sequence", "save", "sweep"]
-
 _HOME = {
-    "ExplainResult": "toolkit.api",
-    "Result": "toolkit.api",
-    "Settings": "toolkit.settings",
-    "SweepResult": "toolkit.api",
-    "compare": "toolkit.api",
-    "explain": "toolkit.api",
-    "load_sequence": "toolkit.datasets",
-    "save": "toolkit.datasets.own_tables",
-    "sweep": "toolkit.api",
+    "toolkit.api": ("ExplainResult", "Result", "SweepResult", "compare", "explain", "sweep"),
+    "toolkit.settings": ("Settings",),
+    "toolkit.datasets": ("load_sequence",),
+    "toolkit.datasets.own_tables": ("save",),
 }
+__all__ = ["ExplainResult", "Result", "Settings", "SweepResult", "compare", "explain", "load_sequence", "save", "sweep"]
 
 
 def __getattr__(name: str) -> Any:
@@ -42,12 +36,13 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("vislam-toolkit")
-    if name not in _HOME:
+    home = next((module for module, names in _HOME.items() if name in names), None)
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_HOME]
+    return [*globals(), *__all__]

@@ -46,6 +46,7 @@ from toolkit.report.text import WIDTH, Table, as_markdown, as_text, in_markdown
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values
 from toolkit.settings.reading import settings_of
+from toolkit.threads import MOST_WORKERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,7 +63,7 @@ class _Asked(Request, frozen=True):
 
     seed: Annotated[int, Meta(ge=0)] | None = None
     seeds: Annotated[int, Meta(ge=1)] | None = None
-    workers: int | None = None
+    workers: Annotated[int, Meta(ge=1, le=MOST_WORKERS)] | None = None
     scheduler: str | None = None
     resume: str | None = None
 

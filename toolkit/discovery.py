@@ -9,7 +9,6 @@ import importlib
 import importlib.machinery
 import importlib.util
 import pkgutil
-import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -120,23 +119,10 @@ def announced(group: str) -> list[FoundModule]:
     return found
 
 
-def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
-    """Return what installed distributions announce under a group.
-
-    The metadata files are read again only when Python's path, or a folder on it, has changed.
-    """
-    return _entry_points(group, tuple((folder, _changed_ns(Path(folder))) for folder in sys.path))
-
-
 @lru_cache(maxsize=8)
-def _entry_points(group: str, _path: tuple[tuple[str, int], ...]) -> tuple[metadata.EntryPoint, ...]:
+def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
+    """Return what installed distributions announce under a group; what is installed later is found by a new process."""
     return tuple(metadata.entry_points(group=group))
-
-
-def _changed_ns(path: Path) -> int:
-    with suppress(OSError):
-        return path.stat().st_mtime_ns
-    return 0
 
 
 def _spec(package: str) -> importlib.machinery.ModuleSpec | None:

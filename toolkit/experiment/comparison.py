@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from toolkit.experiment.contests import Contest, contests_of
-from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean_nees, quantiles_of_all, spread_of
+from toolkit.experiment.statistics import MeanNees, QuantilesAll, Spread, mean_nees, quantiles_of_all, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
 from toolkit.metrics.correction_trend import LIMIT, TREND
@@ -175,7 +175,7 @@ class Row:
         """Return mean, median and spread of a metric over the runs that are ok, or None where there is no value."""
         return spread_of(_known(self.good, key))
 
-    def quantiles_of_all(self, metric: Metric) -> QuantilesOfAll | None:
+    def quantiles_of_all(self, metric: Metric) -> QuantilesAll | None:
         """Return a metric's quartiles over all runs, one that is not ok counted as infinitely bad.
 
         Returns None where runs are ok and none of them has a value, or no value is better than another.

@@ -29,7 +29,6 @@ from toolkit.registry import LADDER, EstimatorEntry, check_options, find_all
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings, SettingsError
 from toolkit.simulation.faults import Doses
-from toolkit.threads import MOST_WORKERS
 
 # What does units of work side by side: processes here, or those of a cluster.
 Pool = Workers | Cluster
@@ -65,10 +64,6 @@ class Plan:
     def __post_init__(self) -> None:
         if not (self.estimators or self.own or self.trajectories):
             raise SettingsError("there is nothing to compare: name an estimator, or a trajectory of another system")
-        if self.max_frames is not None and not self.max_frames >= 2:
-            raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
-        if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:
-            raise SettingsError(f"workers is {self.workers}; it is a number of processes, 1 to {MOST_WORKERS}")
         if self.workers is not None and self.scheduler is not None:
             raise SettingsError("scheduler and workers exclude each other: a cluster has its own workers")
         for what, given in {"truth": self.truth is not None, "a trajectory": bool(self.trajectories)}.items():

@@ -12,9 +12,10 @@ over N independent runs the mean NEES of a consistent estimator stays within the
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
 from scipy.special import stdtr, stdtrit
 
 from toolkit.geometry import Array, IntArray
@@ -37,24 +38,16 @@ class Spread:
     most: float
 
 
-@dataclass(frozen=True)
-class QuantilesOfAll:
-    """Quartiles over n runs of which ``bad`` did not end well; None where those decide it.
+class QuantilesAll(Struct, frozen=True, kw_only=True):
+    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it.
 
-    A run that did not end well counts as infinitely bad: its score until then does not show how it would have gone on.
+    Its score until then does not show how it would have gone on.
     """
 
-    n: int
-    bad: int
     lower_quartile: float | None
     median: float | None
     upper_quartile: float | None
-
-    @property
-    def reason(self) -> str:
-        """Return why a quartile is None, nothing where none is."""
-        lacking = None in (self.lower_quartile, self.median, self.upper_quartile)
-        return f"{self.bad} of {self.n} runs did not end well, and each counts as infinitely bad" if lacking else ""
+    reason: Annotated[str, Meta(description="why a quartile is null")] | UnsetType = UNSET
 
 
 # Level of the test: false alarms for equal estimators.
@@ -193,7 +186,7 @@ def spread_of(values: Iterable[float]) -> Spread | None:
     return Spread(given.size, float(given.mean()), median, std, least, lower, upper, most)
 
 
-def quantiles_of_all(good: Iterable[float], bad: int, best: Best) -> QuantilesOfAll | None:
+def quantiles_of_all(good: Iterable[float], bad: int, best: Best) -> QuantilesAll | None:
     """Return the quartiles over the values of the good runs and as many bad ones as there are, each infinitely bad.
 
     Infinitely large, or infinitely small for a metric whose most is best. Returns None where there are no runs, or no
@@ -206,7 +199,10 @@ def quantiles_of_all(good: Iterable[float], bad: int, best: Best) -> QuantilesOf
     ordered = sorted([sign * value for value in given] + [np.inf] * bad)
     parts = (0.75, 0.5, 0.25) if best == "most" else (0.25, 0.5, 0.75)
     lower, median, upper = (_quantile(ordered, part) for part in parts)
-    return QuantilesOfAll(len(ordered), bad, *(None if q is None else sign * q for q in (lower, median, upper)))
+    lower, median, upper = (None if q is None else sign * q for q in (lower, median, upper))
+    why = f"{bad} of {len(ordered)} runs did not end well, and each counts as infinitely bad"
+    reason = why if None in (lower, median, upper) else UNSET
+    return QuantilesAll(lower_quartile=lower, median=median, upper_quartile=upper, reason=reason)
 
 
 def _quantile(ordered: list[float], part: float) -> float | None:

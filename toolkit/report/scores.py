@@ -13,7 +13,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.answers import STATUS_MEANING, Output, Status
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.statistics import Spread
+from toolkit.experiment.statistics import QuantilesAll, Spread
 from toolkit.files.documents import Count, Value, of_attributes, reader
 from toolkit.metrics import CONTRACT_KEYS, Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
@@ -110,15 +110,6 @@ class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
     frames: Annotated[Count, Meta(description="camera frames")]
     duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
     motion: Motion
-
-
-class QuantilesAll(Struct, frozen=True, kw_only=True):
-    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it."""
-
-    lower_quartile: float | None
-    median: float | None
-    upper_quartile: float | None
-    reason: Annotated[str, Meta(description="why a quartile is null")] | UnsetType = UNSET
 
 
 class MetricOverSeeds(Struct, frozen=True, kw_only=True):
@@ -314,7 +305,7 @@ def _metric(group: Row, metric: Metric) -> MetricOverSeeds:
         dict.fromkeys((field.name for field in fields(Spread)), None) | {"n": 0} if spread is None else asdict(spread)
     )
     found = group.quantiles_of_all(metric)
-    of_all = UNSET if found is None else of_attributes(QuantilesAll, found, reason=found.reason or UNSET)
+    of_all = UNSET if found is None else found
     return MetricOverSeeds(**described, values=tuple(group.values(metric.key)), quantiles_all=of_all)
 
 
