@@ -122,9 +122,9 @@ def first_belief(recording: Recording) -> Belief:
 
 
 def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
-    """Compare two covariances (d, d) in units of the standard deviations: their entries span many orders."""
-    sigma = np.sqrt(np.diag(other))
-    assert np.abs((one - other) / np.outer(sigma, sigma)).max() < relative
+    """Compare covariances (..., d, d) in units of the standard deviations: their entries span many orders."""
+    sigma = np.sqrt(np.diagonal(other, axis1=-2, axis2=-1))
+    assert np.abs((one - other) / (sigma[..., :, None] * sigma[..., None, :])).max() < relative
 
 
 def with_clones(
@@ -215,13 +215,17 @@ def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
 
 
 class Problem:
-    """Two seconds of a simulated recording as a graph, started from disturbed truth."""
+    """A simulated recording as a graph, started from disturbed truth."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        sequence = short(scenario, 2.0, seed=2)
+    def __init__(self, sequence: Sequence) -> None:
         self.rig, self.packets = sequence.rig, list(sequence.packets())
+        self.frames = [packet.frame for packet in self.packets]
         motion, maker = motion_model(sequence.noise, sequence.gravity_world), StereoFactors(sequence.rig)
-        self.graph, self.start = motion.hold(motion.initial_belief(sequence.prior), 0), gtsam.Values()
+        self.motion, self.graph, self.start = (
+            motion,
+            motion.hold(motion.initial_belief(sequence.prior), 0),
+            gtsam.Values(),
+        )
         self.increments: dict[int, GraphIncrement] = {}
         truth, rng = sequence.truth, np.random.default_rng(5)
         for k, packet in enumerate(self.packets):

@@ -11,7 +11,7 @@ import pytest
 
 from filters.smoothing import levenberg_marquardt
 from filters.smoothing.levenberg_marquardt import FirstImages, MixedGraph, Solution, Stopping, TwistFactors, solve
-from tests.filters.conftest import Problem
+from tests.filters.conftest import Problem, short
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, se3_exp, transform
 from toolkit.measurements import StereoFrame, TwistMotion, TwistNoise
@@ -25,7 +25,7 @@ EXACT, ONE = Stopping(relative_decrease=1e-12, max_iterations=100), Stopping(1e-
 
 @pytest.fixture(params=[DRIVE, FLIGHT], ids=["drive", "flight"])
 def problem(request) -> Problem:
-    return Problem(request.param)
+    return Problem(short(request.param, 2.0, seed=2))
 
 
 def test_it_reaches_the_minimum_of_gtsams_own_optimizer(problem):
@@ -90,7 +90,7 @@ STATES = 7
 
 
 def test_errors_and_linearisations_are_the_graphs_own():
-    problem = Problem(DRIVE)
+    problem = Problem(short(DRIVE, 2.0, seed=2))
     graph, start, increments = problem.graph, problem.start, problem.increments
     expected = graph.linearize(start)
     step = start.zeroVectors().scale(0.0)
@@ -105,7 +105,7 @@ def test_errors_and_linearisations_are_the_graphs_own():
 
 
 def test_a_factor_that_is_on_arrays_is_never_called():
-    problem = Problem(DRIVE)
+    problem = Problem(short(DRIVE, 2.0, seed=2))
     graph, start, increments = problem.graph, problem.start, problem.increments
     called: list[int] = []
 

@@ -11,7 +11,7 @@ from filters.fixed_lag import FixedLag
 from filters.smart import Smart
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
-from tests.filters.conftest import setup_of
+from tests.filters.conftest import assert_covariances_agree, setup_of
 from toolkit.errors import EstimatorError
 from toolkit.measurements import NS_PER_S
 from toolkit.models.motion import motion_model
@@ -54,13 +54,6 @@ def run_through(estimator, sequence):
     return estimator.finish().trajectory
 
 
-def assert_covs_agree(covs, expected, relative):
-    """Compare covariances (K, d, d) in units of the standard deviations: their entries span many orders."""
-    sigmas = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
-    scale = sigmas[:, :, None] * sigmas[:, None, :]
-    np.testing.assert_allclose(covs / scale, expected / scale, atol=relative)
-
-
 @every_change
 def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(scenario, changed, monkeypatch):
     sequence = changed(simulate(scenario, 3))
@@ -79,7 +72,7 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
     monkeypatch.setattr(FixedLagTree, "add", spied)
     final = run_through(FixedLag(setup_of(sequence), LAG_S), sequence)
     # Both invert the same normal equations, whose rounding grows with their condition.
-    assert_covs_agree(final.cov, np.array([last[k] for k in range(len(final))]), 1e-5)
+    assert_covariances_agree(final.cov, np.array([last[k] for k in range(len(final))]), 1e-5)
 
 
 @every_change
@@ -103,7 +96,7 @@ def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario
         to_body = np.tile(np.eye(15), (len(final), 1, 1))
         to_body[:, 6:9, 6:9] = np.swapaxes(final.T_world_imu[:, :3, :3], 1, 2)
         expected = to_body @ expected @ np.swapaxes(to_body, 1, 2)
-    assert_covs_agree(final.cov, expected, 1e-5)
+    assert_covariances_agree(final.cov, expected, 1e-5)
 
 
 def test_states_that_leave_together_leave_as_one_by_one(monkeypatch):

@@ -1,88 +1,37 @@
 """The covariances a smoother reports for all of its states are those of GTSAM's marginals."""
 
 from dataclasses import replace
-from functools import cache
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
 import pytest
 
-from filters.smoothing import indeterminate
-from toolkit.answers import Run
-from toolkit.estimate import Trajectory
-from toolkit.geometry import Array
+from tests.filters.conftest import Problem, assert_covariances_agree, short
 from toolkit.measurements import TwistNoise
 from toolkit.models import state_covariances
-from toolkit.models.factors import L, X, joint_cov, linear_factor
-from toolkit.models.graph_state import MotionModel
+from toolkit.models.factors import L, X, joint_cov, linear_factor, poses_of
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.models.twist import TwistModel
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-
-SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=5.0)}
 
 
 def _refused(*_given: object) -> gtsam.Ordering:
     raise RoundingError("not in this order")
 
 
-class Smoothed(NamedTuple):
-    """What `batch` makes of a short scenario: its run, the solution without covariances and what these are of."""
-
-    run: Run
-    solution: Trajectory
-    linear: gtsam.GaussianFactorGraph
-    motion: MotionModel
-    marginals: dict[int, Array]  # of GTSAM, of every fifth state
-
-    def covariances(self) -> tuple[Array | None, tuple[str, ...]]:
-        """Return the covariances of all states, or why there are none."""
-        trajectory, log = indeterminate.with_covariances(self.solution, self.linear, self.motion)
-        return trajectory.cov, log
-
-
-@pytest.fixture(scope="module")
-def smoothed(run_estimator):
-    """Return a function that runs `batch` over a scenario, once for all tests."""
-
-    @cache
-    def smooth(scenario: str) -> Smoothed:
-        calls = []
-
-        def spy(linear, motion, poses):
-            calls.append((linear, motion, poses))
-            return state_covs(linear, motion, poses)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(indeterminate, "state_covs", spy)
-            run = run_estimator("batch", simulate(SHORT[scenario], 3))
-        linear, motion, poses = calls[0]
-        tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-        marginals = {k: motion.state_cov(tree, k, poses[k, :3, :3]) for k in range(0, len(poses), 5)}
-        return Smoothed(run, replace(run.final, cov=None), linear, motion, marginals)
-
-    return smooth
-
-
-def assert_marginals(cov: Array, expected: dict[int, Array]) -> None:
-    for k, marginal in expected.items():
-        sigmas = np.sqrt(np.diag(marginal))
-        np.testing.assert_allclose(cov[k] / np.outer(sigmas, sigmas), marginal / np.outer(sigmas, sigmas), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("scenario", "refused", "most_tied"),
-    [("drive", "_dissected", 5), ("flight", "_dissected", 5), ("drive", "_in_time", 50), ("flight", "_in_time", 50)],
-)
-def test_every_state_has_gtsams_marginal_in_any_order(scenario, refused, most_tied, smoothed, monkeypatch):
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda scenario: scenario.name)
+@pytest.mark.parametrize(("refused", "most_tied"), [("_dissected", 5), ("_dissected", 50), ("_in_time", 50)])
+def test_every_state_has_gtsams_marginal_in_any_order(scenario, refused, most_tied, monkeypatch):
     """In the order of time, landmarks among the states or before them, and by nested dissection."""
-    problem = smoothed(scenario)
+    problem = Problem(short(scenario, 3.0, seed=3))
+    linear, motion = problem.graph.linearize(problem.start), problem.motion
+    poses = poses_of(problem.start, np.arange(len(problem.frames)))
     monkeypatch.setattr(state_covariances, "_MOST_TIED", most_tied)
     monkeypatch.setattr(state_covariances, refused, _refused)
-    cov, log = problem.covariances()
-    assert log == ()
-    assert_marginals(cov, problem.marginals)
+    covs = state_covs(linear, motion, poses)
+    tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
+    for k in range(0, len(poses), 5):
+        assert_covariances_agree(covs[k], motion.state_cov(tree, k, poses[k, :3, :3]), 1e-6)
 
 
 def test_covariances_that_rounding_spoils_are_not_shown(run_estimator, monkeypatch):
