@@ -166,16 +166,12 @@ every_case = pytest.mark.parametrize("case, kind", TOGETHER, ids=[" with ".join(
 
 @every_case
 @pytest.mark.parametrize("name", sorted(discover()))
-def test_it_goes_on_to_the_end(name, case, kind, answer):
-    assert gave_up(answer(name, case, kind), sequence_of(case, kind).frames_t_ns) == ""
-
-
-@every_case
-@pytest.mark.parametrize("name", [n for n, entry in discover().items() if (entry.rung() or 0) >= LOWEST_SOUND_RUNG])
-def test_a_sound_rung_recovers(name, case, kind, answer):
-    sequence = sequence_of(case, kind)
-    run, reckoned = answer(name, case, kind), answer("dead-reckoning", case, kind)
-    limit_m = CHANCE * error_since_recovery_m(reckoned.final, sequence)
+def test_it_goes_on_to_the_end_and_a_sound_rung_recovers(name, case, kind, answer):
+    sequence, run = sequence_of(case, kind), answer(name, case, kind)
+    assert gave_up(run, sequence.frames_t_ns) == ""
+    if (discover()[name].rung() or 0) < LOWEST_SOUND_RUNG:
+        return
+    limit_m = CHANCE * error_since_recovery_m(answer("dead-reckoning", case, kind).final, sequence)
     for trajectory in (run.causal, run.final):
         if trajectory is not None:
             assert error_since_recovery_m(trajectory, sequence) <= limit_m

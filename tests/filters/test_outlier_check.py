@@ -96,16 +96,6 @@ def told_by(sightings: int) -> np.ndarray:
     return landmarks.of([0])[1][0]
 
 
-def test_a_sighting_without_the_right_image_leaves_the_depth_known():
-    """Alone it determines no depth."""
-    landmarks, point = KnownLandmarks(RIG), landmarks_ahead()[:1]
-    both_px = stereo.predict(point, np.eye(4), RIG).uv_px
-    for uvs_px in (both_px, both_px * [1.0, np.nan, 1.0]):
-        landmarks.see(StereoFrame(0, IDS[:1], uvs_px), {0: point[0]}, np.eye(4))
-    once, (cov,) = told_by(1), landmarks.of([0])[1]
-    assert np.linalg.eigvalsh(once - cov).min() > -1e-9 * np.trace(once)
-
-
 def test_a_landmark_that_was_dropped_starts_anew():
     landmarks, point = KnownLandmarks(RIG), landmarks_ahead()[:1]
     frame = StereoFrame(0, IDS[:1], stereo.predict(point, np.eye(4), RIG).uv_px)
