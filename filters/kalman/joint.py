@@ -11,11 +11,12 @@ section 4).
 from copy import copy
 from dataclasses import replace
 from itertools import accumulate
-from typing import Any, Protocol, Self
+from typing import Self
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
+from scipy.sparse import csr_array
 
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
@@ -30,11 +31,8 @@ from toolkit.settings import Scalar
 _LEAST_INDEPENDENT = 1e-12
 
 
-class Jacobian(Protocol):
-    """A matrix (m, k) that is multiplied from the left, dense or sparse."""
-
-    def __matmul__(self, right: Any, /) -> Any:
-        """Return the product with an array (k, n)."""
+# A matrix (m, k) that is multiplied from the left.
+Jacobian = Array | csr_array
 
 
 class JointBelief:

@@ -58,7 +58,8 @@ class GraphBuilder:
         if self._begins_there:
             self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
         self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
-        self._add_values(packet, extension)
+        self.motion.insert(extension.values, self.belief.estimate(packet.frame.t_ns), packet.index)
+        extension.state_keys = list(extension.values.keys())
         self._add_sightings(sound, packet.index, extension)
         return extension
 
@@ -97,10 +98,6 @@ class GraphBuilder:
             self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
             extension.factors.push_back(increment.factors(packet.index))
         return expected
-
-    def _add_values(self, packet: Packet, extension: GraphExtension) -> None:
-        self.motion.insert(extension.values, self.belief.estimate(packet.frame.t_ns), packet.index)
-        extension.state_keys = list(extension.values.keys())
 
     def _add_sightings(self, frame: StereoFrame, k: int, extension: GraphExtension) -> None:
         near = stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX

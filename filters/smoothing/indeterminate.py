@@ -60,15 +60,8 @@ def variable_named(refusal: RuntimeError) -> int:
 def undetermined(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> list[int]:
     """Return the landmarks that their own factors do not determine; the graph must have no empty slots.
 
-    GTSAM names the first variable of a clique, which need not be the indeterminate one, and it names one at a time.
-    """
-    return [key for key, condition in landmark_conditions(factors, at).items() if not condition <= MOST_CONDITION]
-
-
-def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> dict[int, float]:
-    """Return the condition number of each landmark's information from its factors, scaled to a unit diagonal.
-
-    For a landmark thousands of baselines away it exceeds GTSAM's limit: its depth is not determined.
+    GTSAM names the first variable of a clique, which need not be the indeterminate one, and it names one at a time. The
+    depth of a landmark thousands of baselines away is not determined.
     """
     linear, information = factors.linearize(at), dict[int, Array]()
     size_of = {key: at.extract([key]).dim() for key in set(linear.keys())}
@@ -79,7 +72,7 @@ def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -
             for key, end in zip(keys, ends.tolist(), strict=True):
                 if kind_of(key) == "l":
                     information[key] = information.get(key, 0.0) + of_all[end - 3 : end, end - 3 : end]
-    return {key: float(np.linalg.cond(_scaled(information[key]))) for key in sorted(information)}
+    return [key for key in sorted(information) if not np.linalg.cond(_scaled(information[key])) <= MOST_CONDITION]
 
 
 def _scaled(information: Array) -> Array:
@@ -139,15 +132,9 @@ def with_covariances(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Return the trajectory with the covariance of every state, or unchanged with the reason."""
     try:
-        covs = state_covs(linear, motion, trajectory.T_world_imu)
+        return replace(trajectory, cov=state_covs(linear, motion, trajectory.T_world_imu)), ()
+    except RoundingError as refusal:
+        return trajectory, (f"no covariances of the final states: {refusal}",)
     except RuntimeError as refusal:
-        return trajectory, (no_covariances(refusal),)
-    return replace(trajectory, cov=covs), ()
-
-
-def no_covariances(refusal: RuntimeError) -> str:
-    """Return the reason for missing covariances if GTSAM refused them; any other error is raised again."""
-    if isinstance(refusal, RoundingError):
-        return f"no covariances of the final states: {refusal}"
-    name = gtsam.Symbol(variable_named(refusal)).string()
-    return f"no covariances of the final states: the graph leaves {name} undetermined"
+        name = gtsam.Symbol(variable_named(refusal)).string()
+        return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)

@@ -84,15 +84,6 @@ class CachedLinearisation:
         return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
 
 
-def with_linearisations(
-    factors: gtsam.NonlinearFactorGraph, cached: dict[int, CachedLinearisation]
-) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph(factors)
-    for place, factor in cached.items():
-        graph.replace(place, factor.container())
-    return graph
-
-
 class FrozenVariables:
     """Tracks which variables no recent frame has factors on; their linearisation points stay fixed.
 
@@ -216,7 +207,9 @@ class Isam2Tree:
         self._frozen.add_frame(factors.keyVector())
         self._to_relinearise = self._moved()
         cached, moved = self._linearisations(factors, values)
-        factors = with_linearisations(factors, cached)
+        factors = gtsam.NonlinearFactorGraph(factors)
+        for place, linearisation in cached.items():
+            factors.replace(place, linearisation.container())
         newest = {key: self._motion.variable_sizes[kind_of(key)] for key in state_keys}
         first_tie, old_ties = self._slot_count + factors.size(), self._tie_slots
         factors, values = with_the_last_tied(self.isam, factors, values, newest)

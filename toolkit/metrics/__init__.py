@@ -19,29 +19,12 @@ import numpy as np
 from toolkit.answers import Output, Run
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import ExtensionError, UnknownNameError, did_you_mean
-from toolkit.metrics.parts.evaluation import Evaluation
-from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.evaluation import Evaluation as Evaluation
+from toolkit.metrics.parts.scores import Metric as Metric
+from toolkit.metrics.parts.scores import Scores as Scores
+from toolkit.metrics.parts.scores import Unavailable as Unavailable
+from toolkit.metrics.parts.scores import evaluate as evaluate
 from toolkit.sequence import Sequence
-
-__all__ = [
-    "CONTRACT_KEYS",
-    "ENTRY_POINT_GROUP",
-    "Evaluation",
-    "Metric",
-    "Scores",
-    "Unavailable",
-    "describe",
-    "evaluate",
-    "is_on_request",
-    "known_metrics",
-    "metrics_called",
-    "repeated",
-    "requests_of",
-    "score_run",
-    "scores_of",
-    "unavailable",
-    "without_requests",
-]
 
 ENTRY_POINT_GROUP = "toolkit.metrics"
 # The keys that every ``vislam.metrics/1`` document has, whatever metrics were added since.

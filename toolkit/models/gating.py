@@ -110,16 +110,15 @@ class FrameGate:
 
     def limits(self, most: int) -> tuple[Array, Array]:
         """Return the bound of the NIS and Huber's threshold, infinite without that loss, at 0 to ``most`` degrees."""
-        bits = _bits(most)
-        thresholds = np.full(2**bits, np.inf) if self.huber is None else _thresholds(self.huber, bits)
-        return self._table(most).bound, thresholds
+        table = self._table(most)
+        return table.bound, table.threshold
 
     def bound(self, dof: IntArray | int) -> Array:
         """Return the gate's bound of the NIS at each number of degrees of freedom (N,)."""
         return np.asarray(self._table(dof).bound[dof])
 
     def _table(self, dof: IntArray | int) -> "_Table":
-        return _table(self.probability, _bits(dof))
+        return _table(self.probability, self.huber, _bits(dof))
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test and count innovations of NIS (N,) and ``dof`` (N,); return which pass (N,) and are ``in_front``."""
@@ -147,7 +146,7 @@ class FrameGate:
         """
         if self.huber is None:
             return self.track_weight * accepted.astype(float)
-        return np.where(accepted, self.track_weight * huber_weights(nis, _thresholds(self.huber, _bits(dof))[dof]), 0.0)
+        return np.where(accepted, self.track_weight * huber_weights(nis, self._table(dof).threshold[dof]), 0.0)
 
     def info(self) -> dict[str, float]:
         return {
@@ -161,10 +160,11 @@ class FrameGate:
 
 
 class _Table(NamedTuple):
-    """At each number of degrees of freedom, from 0 on: the gate's bound of the NIS, and the mean NIS below it."""
+    """At each number of degrees of freedom: the gate's bound of the NIS, the mean NIS below it, Huber's threshold."""
 
     bound: Array
     expected: Array
+    threshold: Array
 
 
 def _bits(dof: IntArray | int) -> int:
@@ -173,17 +173,12 @@ def _bits(dof: IntArray | int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _thresholds(sigma: float, bits: int) -> Array:
-    """Return Huber's threshold at each number of degrees of freedom of at most ``bits`` bits."""
-    return huber_threshold(np.arange(2**bits), sigma)
-
-
-@lru_cache(maxsize=64)
-def _table(probability: float | None, bits: int) -> _Table:
-    """Return bounds and means for all numbers of degrees of freedom of at most ``bits`` bits.
+def _table(probability: float | None, huber: float | None, bits: int) -> _Table:
+    """Return bounds, means and thresholds for all numbers of degrees of freedom of at most ``bits`` bits.
 
     Kept between calls: a filter needs the same few in every frame, and the quantiles take longer than the rest of the
     gate.
     """
     dof = np.arange(2**bits)
-    return _Table(chi2_bound(dof, probability), mean_below_bound(dof, probability))
+    threshold = np.full(dof.size, np.inf) if huber is None else huber_threshold(dof, huber)
+    return _Table(chi2_bound(dof, probability), mean_below_bound(dof, probability), threshold)

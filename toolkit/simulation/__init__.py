@@ -6,28 +6,13 @@ Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (traje
 errors of tracks made of them.
 """
 
-from toolkit.simulation import faults
-from toolkit.simulation.scenarios import (
-    DRIVE,
-    DRIVE_IMU,
-    DRIVE_REALISTIC,
-    FLIGHT,
-    FLIGHT_REALISTIC,
-    SCENARIOS,
-    Scenario,
-    noise_free,
-    simulate,
-)
-
-__all__ = [
-    "DRIVE",
-    "DRIVE_IMU",
-    "DRIVE_REALISTIC",
-    "FLIGHT",
-    "FLIGHT_REALISTIC",
-    "SCENARIOS",
-    "Scenario",
-    "faults",
-    "noise_free",
-    "simulate",
-]
+from toolkit.simulation import faults as faults
+from toolkit.simulation.scenarios import DRIVE as DRIVE
+from toolkit.simulation.scenarios import DRIVE_IMU as DRIVE_IMU
+from toolkit.simulation.scenarios import DRIVE_REALISTIC as DRIVE_REALISTIC
+from toolkit.simulation.scenarios import FLIGHT as FLIGHT
+from toolkit.simulation.scenarios import FLIGHT_REALISTIC as FLIGHT_REALISTIC
+from toolkit.simulation.scenarios import SCENARIOS as SCENARIOS
+from toolkit.simulation.scenarios import Scenario as Scenario
+from toolkit.simulation.scenarios import noise_free as noise_free
+from toolkit.simulation.scenarios import simulate as simulate
