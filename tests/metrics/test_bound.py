@@ -11,7 +11,7 @@ from toolkit.geometry import se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
 from toolkit.metrics.parts.cramer_rao import efficient
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, faults, simulate
 
 SHORT = {
     s.name: replace(s, duration_s=duration_s, camera=replace(s.camera, max_tracks=40))
@@ -20,8 +20,10 @@ SHORT = {
 KEYS = [metric.key for metric in metrics_called(["bound"])]
 
 
-@pytest.fixture(scope="module", params=SHORT)
+@pytest.fixture(scope="module", params=[*SHORT, "left-only"])
 def sequence(request):
+    if request.param == "left-only":
+        return faults.missing_right(simulate(SHORT["drive"], 3), 0.3, 3)
     return simulate(SHORT[request.param], 3)
 
 
