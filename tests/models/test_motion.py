@@ -101,6 +101,46 @@ def test_a_prediction_is_what_the_graph_of_the_same_increment_says(kind):
     assert np.abs((cov - after.cov) / np.outer(sigma, sigma)).max() < 1e-6
 
 
+def turning(sequence: Sequence) -> Belief:
+    """Return a belief that turns fast about all axes where it is told by its biases."""
+    return replace(some_belief(sequence), bias=np.r_[np.zeros(3), np.random.default_rng(8).standard_normal(3)])
+
+
+@pytest.mark.parametrize("kind", ["twist", "none"])
+@pytest.mark.parametrize("size", [0.0, 1e-4, 0.05, 0.5])
+def test_a_factor_has_the_derivatives_of_its_residual_away_from_the_prediction(kind, size):
+    """Of the factors that are not GTSAM's."""
+    sequence, packet = recorded(kind)
+    model, start = motion_model(sequence.noise, sequence.gravity_world), turning(sequence)
+    end, values = predicted(start, model, packet.motion), gtsam.Values()
+    end = end.moved(size * np.random.default_rng(5).standard_normal(len(end.cov)), end.cov)
+    model.insert(values, start.estimate(0), K - 1)
+    model.insert(values, end.estimate(0), K)
+    factor = model.integrate(packet.motion, start.bias).factors(K).at(0)
+    sizes = [values.extract([key]).dim() for key in factor.keys()]  # noqa: SIM118 - not a mapping
+
+    def residual(step):
+        delta = gtsam.VectorValues()
+        for key, part in zip(factor.keys(), np.split(step, np.cumsum(sizes)[:-1]), strict=True):
+            delta.insert(key, part)
+        return factor.linearize(values.retract(delta)).jacobian()[1]
+
+    derivatives, _ = factor.linearize(values).jacobian()
+    # The residual is whitened: divided by sigmas down to 0.002.
+    np.testing.assert_allclose(derivatives, -numerical_jacobian(residual, sum(sizes)), atol=1e-5)
+
+
+def test_where_no_motion_is_measured_a_body_keeps_its_twist():
+    sequence, packet = recorded("none")
+    model, start = motion_model(sequence.noise, sequence.gravity_world), turning(sequence)
+    end = predicted(predicted(start, model, packet.motion), model, packet.motion)
+    v_body = start.T_world_imu[:3, :3].T @ start.v_world
+    whole = se3_exp(2.0 * packet.motion.dt_s.sum() * np.concatenate([-start.bias[3:], v_body]))
+    np.testing.assert_allclose(end.T_world_imu, start.T_world_imu @ whole, atol=1e-12)
+    np.testing.assert_allclose(end.T_world_imu[:3, :3].T @ end.v_world, v_body, atol=1e-12)
+    np.testing.assert_array_equal(end.bias, start.bias)
+
+
 @each_motion
 def test_the_transition_between_a_prediction_and_its_own_start_is_the_predictions(kind):
     sequence, packet = recorded(kind)
@@ -129,6 +169,21 @@ def test_the_transition_is_the_derivative_of_the_prediction(kind):
 
     # Entries are of the order of 1; the differences are good to 1e-10.
     np.testing.assert_allclose(prediction.transition, numerical_jacobian(moved, model.layout.size), atol=1e-8)
+
+
+@pytest.mark.parametrize(("kind", "linear"), [("twist", "velocity_noise_density"), ("imu", "accel_noise_density")])
+def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(kind, linear):
+    """Factors of linear and angular noise (3, 2): the covariance is that of a noise stated so much larger."""
+    sequence, packet = recorded(kind)
+    start, noise = some_belief(sequence), sequence.noise
+    scaled = {linear: 3.0 * getattr(noise, linear), "gyro_noise_density": 2.0 * noise.gyro_noise_density}
+    bridged = replace(packet.motion, noise_scale=np.tile([3.0, 2.0], (packet.motion.dt_s.size, 1)))
+    one, other = (
+        motion_model(stated, sequence.gravity_world).integrate(motion, start.bias).predict(start)
+        for stated, motion in ((noise, bridged), (replace(noise, **scaled), packet.motion))
+    )
+    np.testing.assert_allclose(one.noise, other.noise, rtol=1e-12)
+    np.testing.assert_array_equal(one.T_world_imu, other.T_world_imu)
 
 
 @each_motion

@@ -4,9 +4,8 @@ Ours is measured - predicted; GTSAM's unwhitenedError is predicted - measured. I
 the prediction, as ours are, and only the residual changes its sign.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -21,7 +20,6 @@ from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
 from toolkit.models.camera_motion import triangulation_jacobian
 from toolkit.models.factors import L, StereoFactors, X
-from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT
 
 # Pixels are of the order of 1e3 and Jacobian entries of 1e4 (px / rad at 40 m): 1e-9 of the largest entry of a
@@ -82,68 +80,40 @@ def test_a_point_in_the_plane_of_the_camera_has_an_image_and_every_point_its_dep
     np.testing.assert_allclose(predicted.depth_m, [0.0, 4.0, -4.0], atol=1e-12)
 
 
-class Sighted(NamedTuple):
-    """A frame with the pose and the points (N, 3) its factors are evaluated at."""
-
-    frame: StereoFrame
-    T_world_imu: Array
-    points: Array
-
-
-def disturbed_sightings(sequence: Sequence, run: Run) -> Iterator[Sighted]:
-    """Yield every frame at the filter's pose, with each point half a metre off where stereo sees it.
+def test_model_equals_gtsams_factor_on_every_sighting_of_kitti00(run_estimator: Callable[..., Run]):
+    """From every frame at the filter's pose, each point half a metre off where stereo sees it.
 
     GTSAM gives a point behind the camera a residual of its own making; a sighting without disparity is therefore
     evaluated at 20 m.
     """
-    rng = np.random.default_rng(3)
+    sequence = load_sequence("kitti00")
+    run, rig = run_estimator("dead-reckoning", sequence, start_from_measurements(sequence)), sequence.rig
+    # GTSAM linearises whitened: with the rig's own noise that would be R r and R H, R^T R = cov^-1.
+    whitening = np.linalg.cholesky(np.linalg.inv(rig.cov_uv_px2)).T
+    maker, compared, rng = StereoFactors(rig), 0, np.random.default_rng(3)
     for packet, T_world_imu in zip(sequence.packets(), run.causal.T_world_imu, strict=True):
-        frame, rig = packet.frame, sequence.rig
+        frame, seen_px = packet.frame, packet.frame.uvs_px.copy()
         least_px = rig.fx_px * rig.baseline_m / 20.0
-        seen_px = frame.uvs_px.copy()
         seen_px[:, 1] = np.where(stereo.disparity_px(seen_px) > 2.0, seen_px[:, 1], seen_px[:, 0] - least_px)
         points_cam = stereo.triangulate(seen_px, rig)
         points_cam += 0.5 * rng.uniform(-1.0, 1.0, points_cam.shape) * np.minimum(1.0, 0.2 * points_cam[:, 2:])
-        yield Sighted(frame, T_world_imu, in_world(points_cam, T_world_imu, rig))
-
-
-def gtsam_says(sighted: Sighted, maker: StereoFactors) -> tuple[Array, Array]:
-    """Return GTSAM's residuals (N, 3) and Jacobians (N, 3, 9) of pose and point, both unwhitened."""
-    values = gtsam.Values()
-    values.insert(X(0), gtsam.Pose3(sighted.T_world_imu))
-    for track_id, point in zip(sighted.frame.track_ids.tolist(), sighted.points, strict=True):
-        values.insert(L(track_id), point)
-    errors, jacobians = [], []
-    for factor in maker.of(sighted.frame, 0):
-        jacobian, right_hand_side = factor.linearize(values).jacobian()
-        errors.append(-right_hand_side)
-        jacobians.append(jacobian)
-    return np.array(errors), np.array(jacobians)
-
-
-def assert_equal_on_every_sighting(sequence: Sequence, run: Run) -> None:
-    # GTSAM linearises whitened: with the rig's own noise that would be R r and R H, R^T R = cov^-1.
-    whitening = np.linalg.cholesky(np.linalg.inv(sequence.rig.cov_uv_px2)).T
-    maker, compared = StereoFactors(sequence.rig), 0
-    for sighted in disturbed_sightings(sequence, run):
-        if not len(sighted.points):
+        points = in_world(points_cam, T_world_imu, rig)
+        if not len(points):
             continue
-        predicted = stereo.predict(sighted.points, sighted.T_world_imu, sequence.rig)
+        predicted, values = stereo.predict(points, T_world_imu, rig), gtsam.Values()
         assert (predicted.depth_m > 0.0).all()
-        residuals = whitening @ (sighted.frame.uvs_px - predicted.uv_px)[..., None]
+        values.insert(X(0), gtsam.Pose3(T_world_imu))
+        for track_id, point in zip(frame.track_ids.tolist(), points, strict=True):
+            values.insert(L(track_id), point)
+        linear = [factor.linearize(values).jacobian() for factor in maker.of(frame, 0)]
+        jacobians, negative_errors = (np.array(parts) for parts in zip(*linear, strict=True))
+        residuals = whitening @ (frame.uvs_px - predicted.uv_px)[..., None]
         ours = whitening @ np.concatenate([predicted.d_uv_d_pose, predicted.d_uv_d_point], axis=2)
-        errors, jacobians = gtsam_says(sighted, maker)
-        np.testing.assert_allclose(residuals[..., 0], -errors, rtol=0.0, atol=TOLERANCE * 1e3)
+        np.testing.assert_allclose(residuals[..., 0], negative_errors, rtol=0.0, atol=TOLERANCE * 1e3)
         largest = np.abs(jacobians).max(axis=(1, 2))
         assert (np.abs(ours - jacobians).max(axis=(1, 2)) / largest).max() < TOLERANCE
-        compared += len(errors)
+        compared += len(points)
     assert compared == len(sequence.visible)
-
-
-def test_model_equals_gtsams_factor_on_every_sighting_of_kitti00(run_estimator: Callable[..., Run]):
-    sequence = load_sequence("kitti00")
-    run = run_estimator("dead-reckoning", sequence, start_from_measurements(sequence))
-    assert_equal_on_every_sighting(sequence, run)
 
 
 # Correlated, with a v that errs like uL: where v is the mean of two rows the left one alone errs more.
@@ -152,52 +122,30 @@ LEFT_RIG = replace(DRIVE.rig, cov_uv_px2=COV_PX2)
 BY_LEFT = np.array([True, False, True, False])
 
 
-@pytest.fixture(scope="module")
-def scene():
-    """Return a pose, points in the world, and their images half a pixel off, half of them by the left image alone."""
+def test_a_sighting_by_the_left_image_is_gtsams_factor_of_the_left_camera_whitened_or_not():
+    """Four points, half of them by the left image alone; its rows and noise say the same as whitened."""
     rng = np.random.default_rng(3)
-    pose = se3_exp(0.2 * rng.standard_normal(6))
+    pose, values, frame_ids = se3_exp(0.2 * rng.standard_normal(6)), gtsam.Values(), np.arange(4)
     points = transform(pose @ LEFT_RIG.T_imu_cam, np.column_stack([rng.uniform(-2, 2, (4, 2)), rng.uniform(4, 9, 4)]))
     uvs_px = stereo.predict(points, pose, LEFT_RIG).uv_px + 0.5 * rng.standard_normal((4, 3))
     uvs_px[BY_LEFT, 1] = np.nan
-    return pose, points, uvs_px
-
-
-def test_unwhitened_its_rows_and_noise_say_the_same(scene):
-    pose, points, uvs_px = scene
-    seen = stereo.predict(points, pose, LEFT_RIG)
-    H, residuals = stereo.seen_rows(uvs_px, seen.d_uv_d_pose), stereo.residuals_px(uvs_px, seen.uv_px)
-    precision = np.linalg.inv(stereo.noise_px2(uvs_px, LEFT_RIG))
-    whitened = stereo.whitener(uvs_px, LEFT_RIG) @ seen.d_uv_d_pose
-    np.testing.assert_allclose(np.swapaxes(H, 1, 2) @ precision @ H, np.swapaxes(whitened, 1, 2) @ whitened, rtol=1e-9)
-    of_residuals = np.square(stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)).sum(axis=1)
-    np.testing.assert_allclose(np.einsum("ni,nij,nj->n", residuals, precision, residuals), of_residuals, rtol=1e-9)
-    np.testing.assert_array_equal(stereo.degrees_of_freedom(uvs_px), [2, 3, 2, 3])
-
-
-def test_smoothers_have_gtsam_factors_of_the_left_camera_for_it(scene):
-    pose, points, uvs_px = scene
-    frame = StereoFrame(0, np.arange(4), uvs_px)
-    values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3(pose))
     for i, point in enumerate(points):
         values.insert(L(i), point)
-    seen = stereo.predict(points, pose, LEFT_RIG)
-    residuals = stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)
-    for i, factor in enumerate(StereoFactors(LEFT_RIG).of(frame, 0)):
+    seen, whitener = stereo.predict(points, pose, LEFT_RIG), stereo.whitener(uvs_px, LEFT_RIG)
+    whitened = stereo.whitened_residuals(uvs_px, seen.uv_px, LEFT_RIG)
+    H_whitened = whitener @ np.concatenate([seen.d_uv_d_pose, seen.d_uv_d_point], axis=2)
+    for i, factor in enumerate(StereoFactors(LEFT_RIG).of(StereoFrame(0, frame_ids, uvs_px), 0)):
         assert factor.dim() == 3 - BY_LEFT[i]
-        assert factor.error(values) == pytest.approx(0.5 * residuals[i] @ residuals[i], rel=1e-9)
-        H_gtsam, _ = factor.linearize(values).jacobian()
-        H = np.concatenate([seen.d_uv_d_pose[i], seen.d_uv_d_point[i]], axis=1)
-        H = stereo.whitener(uvs_px, LEFT_RIG)[i] @ H
-        np.testing.assert_allclose(H_gtsam.T @ H_gtsam, H.T @ H, atol=1e-9 * np.abs(H.T @ H).max())
-
-    def residuals_at(xi):
-        return stereo.whitened_residuals(uvs_px, stereo.predict(points, pose @ se3_exp(xi), LEFT_RIG).uv_px, LEFT_RIG)
-
-    numerical = -numerical_jacobian(residuals_at, 6)
-    H = stereo.whitener(uvs_px, LEFT_RIG) @ seen.d_uv_d_pose
-    np.testing.assert_allclose(H, numerical, atol=1e-7 * np.abs(H).max())
+        assert factor.error(values) == pytest.approx(0.5 * whitened[i] @ whitened[i], rel=1e-9)
+        H_gtsam, expected = factor.linearize(values).jacobian()[0], H_whitened[i].T @ H_whitened[i]
+        np.testing.assert_allclose(H_gtsam.T @ H_gtsam, expected, atol=1e-9 * np.abs(expected).max())
+    H, residuals = stereo.seen_rows(uvs_px, seen.d_uv_d_pose), stereo.residuals_px(uvs_px, seen.uv_px)
+    precision, of_pose = np.linalg.inv(stereo.noise_px2(uvs_px, LEFT_RIG)), H_whitened[..., :6]
+    np.testing.assert_allclose(np.swapaxes(H, 1, 2) @ precision @ H, np.swapaxes(of_pose, 1, 2) @ of_pose, rtol=1e-9)
+    squares = np.einsum("ni,nij,nj->n", residuals, precision, residuals)
+    np.testing.assert_allclose(squares, np.square(whitened).sum(axis=1), rtol=1e-9)
+    np.testing.assert_array_equal(stereo.degrees_of_freedom(uvs_px), [2, 3, 2, 3])
 
 
 def test_where_v_is_the_mean_of_two_rows_the_left_row_errs_as_the_left_column_does():
