@@ -21,6 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
 
+from toolkit import datasets
 from toolkit.cli import main
 from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import read_poses
@@ -204,8 +205,12 @@ def _load(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_what_is_not_mutated_is_read(original: Original, tmp_path: Path, name: str) -> None:
-    _load(write(original(name), tmp_path / "given"))
+def test_what_is_not_mutated_is_read_by_one_format_whatever_it_is_called(
+    original: Original, tmp_path: Path, name: str
+) -> None:
+    path = write(original(name), tmp_path / "given.npz")
+    assert sum(reader.recognises(path) for reader in datasets._readers().values()) == 1
+    _load(path)
 
 
 @mutating(RECORDINGS, KINDS, 80)

@@ -3,7 +3,6 @@
 import io
 import pickle
 import pickletools
-import tracemalloc
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -125,24 +124,6 @@ def test_cameras_that_differ_in_their_matrices_become_one(tmp_path: Path, small:
     small["features"][2:] = np.where(seen, moved, -1.0)
     read = load_sequence(str(saved(tmp_path, small))).observations
     np.testing.assert_allclose(read.uv_px, expected.uv_px, atol=1e-9)
-
-
-def test_a_large_recording_takes_hardly_any_memory(tmp_path: Path) -> None:
-    frames, tracks = 600, 2500
-    small = course_dict(drive().truncated(3), next(iter(CONVENTIONS)))
-    features = np.full((4, tracks, frames), -1.0, order="C")  # 48 MB
-    features[:, ::10, ::20] = 100.0
-    big = {**small, "features": features, "timestamps": np.arange(frames) / 30.0}
-    big |= {key: np.zeros((frames, 3)) for key in ("v_t", "w_t")}
-    path = saved(tmp_path, big)
-    del features, big
-    tracemalloc.start()
-    sequence = load_sequence(str(path))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert len(sequence.observations) == 250 * 30
-    # The sightings take some; the array they were taken from would take 48 MB.
-    assert peak < 8e6
 
 
 # What must not be run --------------------------------------------------------------------------------------------

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.datasets.test_course_npy import save_npy
 from toolkit.datasets import course_npz, load_sequence
-from toolkit.geometry import se3_inverse
+from toolkit.geometry import se3, se3_inverse
 from toolkit.measurements import is_left_only
 
 Course = dict[str, Any]
@@ -87,34 +88,35 @@ def test_both_generations_of_keys_mean_the_same(course: Course, tmp_path: Path) 
         np.testing.assert_array_equal(newer.motion.values, older.motion.values)
 
 
-@pytest.mark.parametrize(
-    ("name", "frames", "tracks", "observations"),
-    [("03", 1010, 5105, 66353), ("0022", 800, 3220, 58418), ("0027", 1106, 3950, 75647), ("10_imu_only", 3026, 0, 0)],
-)
-def test_real_recordings_have_their_known_size(
-    real: Callable[[str], Path], name: str, frames: int, tracks: int, observations: int
-) -> None:
-    sequence = load_sequence(str(real(f"ucsd/{name}.npz")))
-    assert sequence.frame_count == sequence.motion.t_ns.size == frames
-    assert np.unique(sequence.observations.track_id).size == tracks
-    assert len(sequence.observations) == observations
+def compressed(path: Path, arrays: Course) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
-def test_a_large_recording_takes_hardly_any_memory(course: Course, tmp_path: Path) -> None:
+def pickled(path: Path, arrays: Course) -> None:
+    """Write them as the course has since 2025."""
+    K, T = arrays["K"], arrays["imu_T_cam"]
+    now = {"timestamps": arrays["time_stamps"], "features": arrays["features"], **{"K_l": K, "K_r": K}}
+    now |= {"v_t": arrays["linear_velocity"].T, "w_t": arrays["angular_velocity"].T, "extL_T_imu": T}
+    save_npy(path, now | {"extR_T_imu": T @ se3(np.eye(3), np.array([0.5, 0.0, 0.0]))})
+
+
+@pytest.mark.parametrize("write", [compressed, pickled])
+def test_a_large_recording_takes_hardly_any_memory(course: Course, tmp_path: Path, write: Callable[..., None]) -> None:
     frames = 600
     features = np.full((4, 2500, frames), -1.0)  # 48 MB
     features[:, ::10, ::20] = 100.0
     course |= {"features": features, "time_stamps": 0.1 * np.arange(frames)[None]}
     course |= {key: np.zeros((3, frames)) for key in ("linear_velocity", "angular_velocity")}
-    path = tmp_path / "large.npz"
-    np.savez_compressed(path, **course)
+    write(tmp_path / "large.npy", course)
     course.clear()
     del features
     tracemalloc.start()
-    observations = course_npz.load(path).observations
+    observations = load_sequence(str(tmp_path / "large.npy")).observations
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(observations) == 250 * 30
+    # The sightings take some.
     assert peak < 8e6
 
 

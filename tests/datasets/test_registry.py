@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from toolkit import datasets
 from toolkit.datasets import formats, load_sequence
 from toolkit.errors import DataError
 
@@ -28,20 +26,6 @@ def test_listing_imports_neither_gtsam_nor_scipy_io() -> None:
     )
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert printed.strip() == "[]"
-
-
-def test_the_name_of_a_file_does_not_matter(course: dict[str, Any], openvins: Path, tmp_path: Path) -> None:
-    np.savez(tmp_path / "course.npz", **course)
-    shutil.move(tmp_path / "course.npz", tmp_path / "recording.mat")
-    assert load_sequence(str(tmp_path / "recording.mat")).provenance.format == "course-npz"
-    shutil.move(openvins, tmp_path / "features.npz")
-    assert load_sequence(str(tmp_path / "features.npz")).provenance.format == "openvins-sim"
-
-
-def test_exactly_one_format_recognises_a_recording(course: dict[str, Any], openvins: Path, tmp_path: Path) -> None:
-    np.savez(tmp_path / "course.npz", **course)
-    for path, name in ((tmp_path / "course.npz", "course-npz"), (openvins, "openvins-sim")):
-        assert [n for n, reader in datasets._readers().items() if reader.recognises(path)] == [name]
 
 
 def test_a_file_that_opens_and_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,58 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import scipy.io
 
-from toolkit.datasets import load_sequence, utias_mat
-from toolkit.geometry import se3_inverse, transform
+from toolkit.datasets import utias_mat
 from toolkit.measurements import NS_PER_S, TwistNoise
-from toolkit.models.stereo import project, triangulate
 from toolkit.motion_samples import TwistSamples
-from toolkit.sequence import Sequence
-
-DRIVES = [
-    ("2011_09_26_drive_0001_sync_KLT", 108, 707, 10501),
-    ("2011_09_26_drive_0005_sync_KLT", 154, 911, 13908),
-    ("2011_09_26_drive_0009_sync_KLT", 446, 1461, 26708),
-    ("2011_09_26_drive_0027_sync_KLT", 188, 1281, 12660),
-    ("2011_09_26_drive_0035_sync_KLT", 131, 536, 11588),
-    ("2011_09_26_drive_0051_sync_KLT", 125, 741, 7984),
-    ("2011_09_30_drive_0027_sync_KLT", 500, 2811, 44556),
-    ("dataset3", 1900, 20, 9410),
-]
-
-
-def one_step_median_px(sequence: Sequence) -> float:
-    """Return the median root mean square of (uL, uR, v) when a sighting is carried to the next frame by the truth."""
-    assert sequence.truth is not None
-    seen, T_world_cam = sequence.observations, sequence.truth.T_world_imu @ sequence.rig.T_imu_cam
-    name = seen.frame * 10**6 + seen.track_id
-    _, before, after = np.intersect1d(name + 10**6, name, return_indices=True)
-    usable = seen.uv_px[before, 0] - seen.uv_px[before, 1] > 2.0
-    before, after = before[usable], after[usable]
-    T_after_before = se3_inverse(T_world_cam[seen.frame[after]]) @ T_world_cam[seen.frame[before]]
-    points = transform(T_after_before, triangulate(seen.uv_px[before], sequence.rig))
-    residual_px = seen.uv_px[after] - project(points, sequence.rig)
-    return float(np.median(np.sqrt((residual_px**2).mean(axis=1))))
 
 
 def written(folder: Path, variables: dict[str, Any]) -> Path:
     path = folder / "small.mat"
     scipy.io.savemat(path, variables)
     return path
-
-
-@pytest.mark.parametrize(("name", "frames", "tracks", "observations"), DRIVES)
-def test_real_recordings_have_their_known_size_and_fit_their_truth(
-    real: Callable[[str], Path], name: str, frames: int, tracks: int, observations: int
-) -> None:
-    sequence = load_sequence(str(real(f"utias/{name}.mat")))
-    assert sequence.frame_count == sequence.motion.t_ns.size == frames
-    assert np.unique(sequence.observations.track_id).size == tracks
-    assert len(sequence.observations) == observations
-    # 0.33-0.77 px on the drives and 1.87 px indoors; a transposed rotation gives 1.2-17 px and 7.6 px
-    assert one_step_median_px(sequence) < (2.0 if name == "dataset3" else 0.8)
 
 
 def test_indoor_twist_errors_have_the_stated_variances_under_the_stated_pairing(real: Callable[[str], Path]) -> None:
