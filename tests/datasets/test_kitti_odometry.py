@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import toolkit
-from toolkit.datasets import kitti, load_sequence
+from toolkit.datasets import load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
 from toolkit.experiment.recording import Recording, prepare
@@ -23,13 +23,6 @@ FRAMES, FOCAL_PX, BASELINE_M, STEP_M = 8, 250.0, 0.4, 0.05
 @pytest.fixture
 def drive(kitti_drive: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(kitti_drive, tmp_path / "drive"))
-
-
-def test_a_folder_is_recognised_by_its_images(drive: Path) -> None:
-    assert kitti.recognises(drive)
-    assert not kitti.recognises(drive / "image_0")
-    (drive / "calib.txt").unlink()
-    assert kitti.recognises(drive)
 
 
 def test_no_motion_is_measured_and_that_is_reported(drive: Path) -> None:
