@@ -1,8 +1,10 @@
 """Truths and trajectories of made-up systems as files."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +40,17 @@ def write(path: str | Path, t_ns: IntArray, poses: Array) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(tum.text(Trajectory(t_ns, poses)))
     return target
+
+
+def runs_in(folder: str = "out") -> list[dict[str, Any]]:
+    return list(json.loads(Path(folder, "evaluation.json").read_text())["runs"])
+
+
+def run_of(vislam: Callable[..., int], *words: str) -> dict[str, Any]:
+    """Evaluate a file against truth.tum, and return the one run."""
+    assert vislam("evaluate", "truth.tum", *words, "--out", "out", "--quiet") == 0
+    (run,) = runs_in()
+    return run
 
 
 @pytest.fixture(scope="session")

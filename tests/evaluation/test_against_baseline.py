@@ -161,26 +161,21 @@ def test_trouble_is_reported_in_one_line(vislam, capsys, words, status, wanted):
     assert wanted in printed
 
 
-def test_runs_without_a_change_raise_an_alarm_no_more_often_than_stated():
-    rng = np.random.default_rng(3)
+def p_values(rng: np.random.Generator, checks: int, scatter: float, grown: float) -> list[tuple[Repeats, float]]:
+    """Return tests of five runs against five that have grown, each with its p-value."""
+    where, criterion, found = Where("", "", "", ""), Criterion("larger", 0.0), []
+    for _ in range(checks):
+        before, after = np.exp(scatter * rng.standard_normal((2, 5)))
+        found.append(Repeats(where, criterion, before, grown * after))
+    return [(one, float(one.worse_p())) for one in found]
+
+
+def test_five_runs_raise_no_more_alarms_than_stated_and_show_growth_as_a_one_sided_test_at_half_the_rate_does():
     checks = 2000
-    alarms = sum(
-        Repeats(Where("", "", "", ""), Criterion("larger", 0.0), *np.exp(0.2 * rng.standard_normal((2, 5)))).worse_p()
-        <= 0.05
-        for _ in range(checks)
-    )
+    alarms = sum(p <= 0.05 for _, p in p_values(np.random.default_rng(3), checks, 0.2, 1.0))
     # Welch's test is a little off at five runs; three standard deviations above 5 %.
     assert 0.03 * checks <= alarms <= 0.05 * checks + 3.0 * np.sqrt(0.05 * checks)
-
-
-def test_five_runs_against_five_show_growth_as_a_one_sided_test_at_half_the_rate_does():
-    rng = np.random.default_rng(4)
-    found = []
-    for _ in range(400):
-        before, after = np.exp(0.08 * rng.standard_normal((2, 5)))
-        one = Repeats(Where("", "", "", ""), Criterion("larger", 0.0), before, 1.15 * after)
-        (verdict,) = check_metrics([one], 0.05)
-        assert (verdict.finding == "regressed") == (one.worse_p() <= 0.025)
-        found.append(verdict.finding == "regressed")
+    grown = p_values(np.random.default_rng(4), 400, 0.08, 1.15)
+    assert all((check_metrics([one], 0.05)[0].finding == "regressed") == (p <= 0.025) for one, p in grown[:50])
     # 66 % by 1500 such checks; three standard deviations below.
-    assert np.mean(found) > 0.66 - 3.0 * np.sqrt(0.66 * 0.34 / len(found))
+    assert np.mean([p <= 0.025 for _, p in grown]) > 0.66 - 3.0 * np.sqrt(0.66 * 0.34 / len(grown))
