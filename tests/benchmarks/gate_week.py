@@ -14,9 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.evaluation.against_baseline import SequenceRecord, check_trajectories, new_trajectory_baseline
+from toolkit.evaluation.against_baseline import (
+    CHANGES_PERCENT,
+    SequenceRecord,
+    check_trajectories,
+    new_trajectory_baseline,
+    planned,
+)
 from toolkit.evaluation.against_baseline import scored_metrics as scored
-from toolkit.evaluation.planning import CHANGES_PERCENT, planned
 from toolkit.evaluation.scoring import TIME_COVERAGE
 
 SEQUENCES, COMMITS, PLANTED = 8, 30, 4

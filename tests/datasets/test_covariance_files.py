@@ -134,10 +134,3 @@ def test_what_is_not_stated_stays_unknown_in_every_convention() -> None:
     left = StatedCovariances(values, None).read_as(CONVENTIONS["rot-pos/left"], given.T_world_imu)
     assert np.isfinite(left[:, :3, :3]).all()
     assert np.isnan(left[:, 3:, 3:]).all()
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_trajectory_without_covariances_is_told_so(name: str) -> None:
-    given = trajectory(6)
-    with pytest.raises(DataError, match="no covariances are known"):
-        FORMATS[name].text_with_covariances(Trajectory(given.t_ns, given.T_world_imu))

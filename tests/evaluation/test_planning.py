@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from toolkit.evaluation.against_baseline import SequenceRecord, check_trajectories, new_trajectory_baseline
-from toolkit.evaluation.planning import CHANGES_PERCENT, planned
+from toolkit.evaluation.against_baseline import (
+    CHANGES_PERCENT,
+    SequenceRecord,
+    check_trajectories,
+    new_trajectory_baseline,
+    planned,
+)
 from toolkit.evaluation.scoring import TIME_COVERAGE
 
 

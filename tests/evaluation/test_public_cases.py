@@ -413,23 +413,6 @@ def noise(count: int) -> Array:
     return np.random.default_rng(1).standard_normal((count, 6)) * np.repeat([0.001, 0.05], 3)
 
 
-@pytest.mark.parametrize(
-    ("write", "words"),
-    [
-        (lambda t: f"{int(t)}.000000", "40 different stamps, of no digits behind the point"),
-        (lambda t: f"{t:e}", "1 different stamps, of 7 significant digits"),
-        (lambda t: f"{int(t)}.5", "40 different stamps, of 1 digits behind the point"),
-    ],
-)
-def test_stamps_of_too_few_digits_are_told_to_be_and_not_to_be_sorted(scene, vislam, capsys, write, words) -> None:
-    t_ns = scene.stamps(10.0, 0.0, 40.0)
-    lines = rows(t_ns, scene.poses_at(t_ns), TUM).splitlines()
-    cut = [f"{write(float(t))} {rest}" for t, _, rest in (line.partition(" ") for line in lines)]
-    Path("s.tum").write_text("\n".join(cut) + "\n")
-    assert vislam("evaluate", "truth.tum", "s.tum", "--quiet") == 3
-    assert words in capsys.readouterr().err
-
-
 def test_a_run_that_ends_in_nan_is_one_that_failed_and_the_others_are_compared(scene, vislam, capsys) -> None:
     t_ns = scene.stamps(10.0)
     for run in range(6):

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -69,15 +70,21 @@ def test_what_kalibrs_bag_extractor_writes_is_a_recording(asl: Path) -> None:
     assert (load_sequence(str(asl / "extracted")).motion.values == motion.values).all()
 
 
-def test_a_camera_alone_is_no_pair(asl: Path) -> None:
-    shutil.rmtree(asl / "mav0/cam1")
-    with pytest.raises(DataError, match="there is cam0 and no cam1; stereo needs both"):
-        load_sequence(str(asl))
-
-
-def test_cameras_without_an_imu_are_reported_with_what_to_do(asl: Path) -> None:
-    (asl / "mav0/imu0/data.csv").unlink()
-    with pytest.raises(DataError, match=r"no imu0.csv of Kalibr's: name the folder that has mav0, or rectify"):
+@pytest.mark.parametrize(
+    ("remove", "words"),
+    [
+        (lambda root: shutil.rmtree(root / "mav0/cam1"), "there is cam0 and no cam1; stereo needs both"),
+        (
+            lambda root: (root / "mav0/imu0/data.csv").unlink(),
+            "no imu0.csv of Kalibr's: name the folder that has mav0, or rectify",
+        ),
+    ],
+)
+def test_what_lacks_of_a_recording_is_reported_with_what_to_do(
+    asl: Path, remove: Callable[[Path], object], words: str
+) -> None:
+    remove(asl)
+    with pytest.raises(DataError, match=words):
         load_sequence(str(asl))
 
 

@@ -110,8 +110,7 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
-    from toolkit.evaluation.against_baseline import BOUND_PERCENT, new_trajectory_baseline, to_text
-    from toolkit.evaluation.planning import planned
+    from toolkit.evaluation.against_baseline import BOUND_PERCENT, new_trajectory_baseline, planned, to_text
     from toolkit.evaluation.scoring import Terms
     from toolkit.files.writing import check_writable, write_text
     from toolkit.report.gate import plan_text

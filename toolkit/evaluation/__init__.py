@@ -1,6 +1,5 @@
 """Any systems' trajectory files against the truth, without recording or estimator: ``vislam evaluate``.
 
 Reading order: gathering (the files) -> scoring (one file) -> standings (over runs and sequences, and
-evaluation.json) -> against_baseline (the accuracy gate for such files) -> planning (how many runs it needs). Without
-the last two nothing here needs GTSAM.
+evaluation.json) -> against_baseline (the accuracy gate for such files, which alone needs GTSAM).
 """

@@ -2,6 +2,13 @@
 
 The baseline holds the scores of each sequence's runs (:mod:`toolkit.evaluation.scoring`), never the trajectories, and
 the hash of the truth they were scored against: the contract is ``vislam.trajectory-baseline/1`` (docs/gate.md).
+
+How many runs it needs is planned from the scatter of the first ones. The tests are those of a check
+(:mod:`toolkit.gate.significance`) of as many runs as the baseline has, each at the share of the rate that Holm's
+correction leaves to the smallest p-value of all. The power of Welch's at a standard deviation s is a noncentral t
+probability (Cohen, "Statistical power analysis for the behavioral sciences", 1988, chapter 2). The s of few runs is
+itself uncertain, so that the power is averaged over the chi-square distribution of s^2 given them (O'Hagan, Stevens and
+Campbell, "Assurance in clinical trial design", Pharmaceutical Statistics 4, 2005).
 """
 
 import time
@@ -14,6 +21,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
+from scipy.special import chdtri, nctdtr, stdtrit
 
 from toolkit.errors import DataError, no_such, one_line, printable
 from toolkit.evaluation.gathering import Item, files_by_sequence, truths_in
@@ -35,6 +43,10 @@ BOUND_PERCENT, COVERAGE_POINTS = 5.0, 2.0
 _NAMED = 3
 # In the place of a sequence's name, where all of them are judged together.
 EVERYWHERE = "all sequences"
+# Growths whose chance of being found is told; the chance that is wanted; and the most runs that are thought of for it.
+CHANGES_PERCENT = (5.0, 10.0, 20.0)
+WANTED, MOST_RUNS = 0.9, 200
+_QUANTILES = (np.arange(20) + 0.5) / 20.0
 
 
 class SequenceRecord(Struct, frozen=True, kw_only=True):
@@ -361,3 +373,75 @@ def _coverage(before: SequenceRecord, now: SequenceRecord, allowed: float) -> It
     worse = old - new > allowed
     words = f"a run covered {old:.1f} percent of the time, and {new:.1f} now; {allowed:g} less is allowed"
     yield _verdict(before, TIME_COVERAGE, "regressed" if worse else "same", words if worse else "", old, new)
+
+
+# How many runs a gate needs ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What runs as scattered as the first ones show of one metric, on one sequence or on all of them together.
+
+    ``seen`` has the chance of each of CHANGES_PERCENT with as many ``runs`` a sequence as there are; ``needed`` the
+    runs a sequence for a chance of 90 %, None where that is more than MOST_RUNS.
+    """
+
+    where: Where
+    runs: int
+    bound_percent: float
+    scatter_percent: float
+    seen: tuple[float, ...]
+    needed: tuple[int | None, ...]
+
+    def is_allowed(self, i: int) -> bool:
+        """Say whether the i-th of CHANGES_PERCENT is within the bound, and so never found."""
+        return CHANGES_PERCENT[i] <= self.bound_percent
+
+
+def planned(baseline: TrajectoryBaselineRecord) -> tuple[Planned, ...]:
+    """Return the plan of every metric that a check would test; raises DataError where none has three runs or more."""
+    tests: list[Repeats] = []
+    for one in baseline.sequences:
+        for key, percent in baseline.bounds.items():
+            values = _known(one.scores[key])
+            if values.size >= FEWEST_RUNS:  # as if the baseline's own runs came again
+                tests.append(Repeats(Where(one.sequence, "", "", key), Criterion("larger", percent), values, values))
+    if not tests:
+        raise DataError(
+            f"no sequence has {FEWEST_RUNS} runs, of which the scatter is known; give the files of repeated runs, "
+            "SEQUENCE/RUN.tum"
+        )
+    tests += everywhere(tests)
+    rate = baseline.false_alarm_rate / 2.0 / len(tests)
+    return tuple(_planned(one, rate) for one in tests)
+
+
+def _planned(test: Repeats, rate: float) -> Planned:
+    error, dof = test.error_and_dof
+    runs = min(part.before.size for part in (test.parts if isinstance(test, Everywhere) else (test,)))
+    # Errors of one run on each side, at which the variance is as certain as one side's runs make it.
+    one_run, known = error * np.sqrt(runs), 0.5 * dof
+    counts = np.arange(FEWEST_RUNS, max(MOST_RUNS, runs) + 1.0)
+    excess = np.log1p(np.array(CHANGES_PERCENT) / 100.0) - test.criterion.margin
+    chances = _chances(excess, counts, one_run, known, dof / (2.0 * (runs - 1)), rate)
+    return Planned(
+        test.where,
+        runs,
+        test.criterion.percent,
+        100.0 * float(np.expm1(one_run / np.sqrt(2.0))),
+        tuple(chances[:, runs - FEWEST_RUNS].tolist()),
+        tuple(int(counts[np.argmax(row >= WANTED)]) if row.max() >= WANTED else None for row in chances),
+    )
+
+
+def _chances(excess: Array, counts: Array, one_run: float, known: float, sequences: float, rate: float) -> Array:
+    """Return the chance (c, n) that growths beyond the bound of ``excess`` (c,) are found with ``counts`` (n,) runs."""
+    if one_run == 0.0:
+        return np.repeat((excess > 0.0)[:, None].astype(float), counts.size, axis=1)
+    errors = one_run * np.sqrt(known / chdtri(known, _QUANTILES))
+    dof = 2.0 * (counts - 1.0) * sequences
+    limit = stdtrit(dof, 1.0 - rate)
+    shift = excess[:, None, None] / (errors[None, None, :] / np.sqrt(counts)[None, :, None])
+    # Farther from the limit the chance to miss is none, and the function has no value.
+    missed = nctdtr(dof[None, :, None], np.minimum(shift, 30.0), limit[None, :, None])
+    return np.where(excess[:, None] > 0.0, 1.0 - missed.mean(axis=-1), 0.0)

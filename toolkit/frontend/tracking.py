@@ -7,6 +7,8 @@ left and right are not exchanged, and that the calibration fits the images.
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,7 +81,7 @@ def track_images(
 
 def matched_corners(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend) -> int:
     """Return how many corners of the left images of a few pairs are found in the same rows of the right ones."""
-    return _SideCheck(pairs, rig, settings, _bits_of(pairs)).looked_at()[2]
+    return sum(one.found for one in _SideCheck(pairs, rig, settings, _bits_of(pairs)).looked_at.values())
 
 
 def read_pair(
@@ -161,6 +163,13 @@ def _without_repeats(
             yield images
 
 
+class _Matches(NamedTuple):
+    """How many corners of a left image were looked for in a right one, and how many are found."""
+
+    wanted: int
+    found: int
+
+
 @dataclass(frozen=True, eq=False)
 class _SideCheck:
     """Matches corners of a few pairs, each by itself, to see whether left and right belong together."""
@@ -170,30 +179,31 @@ class _SideCheck:
     settings: Frontend
     bits: int
 
-    def looked_at(self) -> tuple[list[int], int, int]:
-        """Return the places of some usable pairs, and how many of their corners were looked for and found."""
-        usable, wanted, matched = list[int](), 0, 0
-        for place in np.unique(np.linspace(0, len(self.pairs) - 1, _LOOKED_AT).astype(int)).tolist():
-            images = read_pair(self.pairs[place], self.rig, self.bits)
-            if not isinstance(images, Unusable):
-                tracker = Tracker(self.rig, self.settings)
-                matched += _count(tracker.step(*images))
-                wanted += tracker.tried
-                usable.append(place)
-        return usable, wanted, matched
+    @cached_property
+    def looked_at(self) -> dict[int, _Matches]:
+        """The matches of some usable pairs, by their places in the recording."""
+        places = np.unique(np.linspace(0, len(self.pairs) - 1, _LOOKED_AT).astype(int)).tolist()
+        tried = {place: self._matches(place) for place in places}
+        return {place: matches for place, matches in tried.items() if matches is not None}
 
-    def exchanged(self, place: int) -> int:
-        """Return how many corners of a pair are found in the partner where left and right are exchanged."""
-        images = read_pair(self.pairs[place], self.rig, self.bits, (1, 0))
-        return 0 if isinstance(images, Unusable) else self._matched(images[1], images[0])
+    def found(self, offset: int = 0, sides: tuple[int, int] = (0, 1)) -> int:
+        """Return how many corners of these left images are found in the right images ``offset`` pairs later.
 
-    def matched_with(self, place: int, offset: int) -> int:
-        """Return how many corners of a left image are found in the right image of a pair ``offset`` pairs later."""
+        ``sides`` (1, 0) exchanges left and right.
+        """
+        matches = (self._matches(place, offset, sides) for place in self.looked_at)
+        return sum(one.found for one in matches if one is not None)
+
+    def _matches(self, place: int, offset: int = 0, sides: tuple[int, int] = (0, 1)) -> _Matches | None:
         if not 0 <= place + offset < len(self.pairs):
-            return 0
+            return None
         pair = replace(self.pairs[place], right=self.pairs[place + offset].right)
-        images = read_pair(pair, self.rig, self.bits)
-        return 0 if isinstance(images, Unusable) else self._matched(*images)
+        images = read_pair(pair, self.rig, self.bits, sides)
+        if isinstance(images, Unusable):
+            return None
+        tracker = Tracker(self.rig, self.settings)
+        seen = tracker.step(images[sides[0]], images[sides[1]])
+        return _Matches(tracker.tried, 0 if seen is None else len(seen.track_ids))
 
     def all_alike(self) -> bool:
         """Say whether left and right image are one and the same in a few pairs, before any rectification."""
@@ -205,30 +215,24 @@ class _SideCheck:
                 return False
         return True
 
-    def _matched(self, left: Image, right: Image) -> int:
-        return _count(Tracker(self.rig, self.settings).step(left, right))
-
-
-def _count(found: TrackedCorners | None) -> int:
-    return 0 if found is None else len(found.track_ids)
-
 
 def _check_sides(check: _SideCheck) -> None:
     folders, settings = f"{check.pairs[0].left.parent} and {check.pairs[0].right.parent}", check.settings
     if check.all_alike():
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
-    places, wanted, matched = check.looked_at()
+    wanted = sum(one.wanted for one in check.looked_at.values())
+    matched = sum(one.found for one in check.looked_at.values())
     least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
     # A pair begins at most this many tracks: where enough are found as called, no other way can find more by the
     # factor.
-    most = settings.max_tracks * len(places)
-    if most > least and sum(map(check.exchanged, places)) > least:
+    most = settings.max_tracks * len(check.looked_at)
+    if most > least and check.found(sides=(1, 0)) > least:
         raise DataError(
             f"{folders}: left and right images are exchanged; exchange the two, or turn the images back if all are "
             "upside down or mirrored"
         )
     if min(most, wanted) > least:
-        before, after = (sum(check.matched_with(place, offset) for place in places) for offset in (-1, 1))
+        before, after = check.found(-1), check.found(1)
         if max(before, after) > least:
             which = "before" if before > after else "after"
             raise DataError(

@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from toolkit.errors import printable
-from toolkit.evaluation.planning import CHANGES_PERCENT, MOST_RUNS, WANTED, Planned
+from toolkit.evaluation.against_baseline import CHANGES_PERCENT, MOST_RUNS, WANTED, Planned
 from toolkit.files.documents import to_text
 from toolkit.files.writing import write_text
 from toolkit.gate.case_check import SHOWN

@@ -527,16 +527,8 @@ def exchanges() -> tuple[Exchange, ...]:
     return tuple(exchange for _, exchange in sorted(found, key=lambda one: one[0]))
 
 
-def exchanged(truth: Array, estimate: Array) -> str | None:
-    """Say under which exchange of axes alone poses (n, 4, 4) fit the truth's (n, 4, 4), of the same times.
-
-    None where they do as given, or under none.
-    """
-    fit = _fit(truth, estimate)
-    return None if fit is None else _exchange(fit)
-
-
 def _exchange(fit: "_Fit") -> str | None:
+    """Say under which exchange of axes alone poses fit the truth's; None where they do as given, or under none."""
     if fit.is_mirrored:
         return _named(fit) or "its positions mirrored"
     turns_alike = fit.turned_rad(_AS_GIVEN) < _WRONG_RAD or fit.body.scatter_rad < _FITTING_RAD
