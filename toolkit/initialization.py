@@ -260,7 +260,6 @@ def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
 
 
 def _tracks_worth_using(frames: list[StereoFrame]) -> IntArray:
-    """Return the ids of the tracks with two good sightings or more."""
     good = [f.track_ids[stereo.disparity_px(f.uvs_px) > _LEAST_DISPARITY_PX] for f in frames]
     ids, counts = np.unique(np.concatenate(good), return_counts=True)
     return ids[counts >= 2]
@@ -287,7 +286,6 @@ class _SeenMotion(NamedTuple):
 
 
 def guess_from_vision(sequence: Sequence) -> FirstGuess:
-    """Return the states that the tracks alone show; the world is the first IMU frame."""
     poses = np.array(list(accumulate(_vision_motion(sequence).T_before_after, np.matmul, initial=np.eye(4))))
     t_s = sequence.frames_s
     return FirstGuess(poses, np.gradient(poses[:, :3, 3], t_s, axis=0), np.zeros(6))
@@ -347,7 +345,6 @@ class _Path:
 
     @classmethod
     def of(cls, pieces: list[Preintegration]) -> "_Path":
-        """Chain the preintegrated intervals."""
         t_s, turn, speed, place = [0.0], [np.eye(3)], [np.zeros(3)], [np.zeros(3)]
         for piece in pieces:
             dt_s = piece.deltaTij()
@@ -358,11 +355,9 @@ class _Path:
         return cls(np.array(t_s), np.array(turn), np.array(speed), np.array(place))
 
     def positions(self, v_first: Array, gravity: Array) -> Array:
-        """Return the positions (N + 1, 3) m from the first velocity and gravity (3,)."""
         return np.asarray(self.gained_m + self.t_s[:, None] * v_first + 0.5 * self.t_s[:, None] ** 2 * gravity)
 
     def velocities(self, v_first: Array, gravity: Array) -> Array:
-        """Return the velocities (N + 1, 3) m/s from the first velocity and gravity (3,)."""
         return np.asarray(self.gained_mps + v_first + self.t_s[:, None] * gravity)
 
     def translation_residuals(self, seen: _SeenMotion) -> Array:

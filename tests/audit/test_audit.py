@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from toolkit.audit import audit, faults
 from toolkit.errors import UnknownNameError
 from toolkit.sequence import Observations, Sequence, check_runnable
 from toolkit.simulation import SCENARIOS
-from toolkit.simulation.faults import identity_intrinsics, zero_intrinsics
+from toolkit.simulation.faults import identity_intrinsics
 
 AUDIT_PAGE = Path(__file__).parents[2] / "docs/audit.md"
 
@@ -77,7 +78,9 @@ def test_every_fault_has_a_summary_of_one_line_and_a_row_in_the_docs() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("break_it", [zero_intrinsics, identity_intrinsics, beyond_single_precision])
+@pytest.mark.parametrize(
+    "break_it", [partial(identity_intrinsics, dose=0.0), identity_intrinsics, beyond_single_precision]
+)
 def test_what_is_broken_is_reported_without_a_warning_of_numpy(break_it: Callable[[Sequence], Sequence]) -> None:
     assert audit(break_it(clean_recording().truncated(40))).findings
 

@@ -19,19 +19,6 @@ from toolkit.simulation import faults
 from toolkit.simulation.sensors import TrackNoise, with_track_noise
 
 
-@pytest.mark.parametrize("scenario", ["drive", "flight"])
-def test_half_precision_numbers_are_named_with_the_step_they_have_there(scenario: str) -> None:
-    sound = recording(scenario)
-    uv_px = sound.observations.uv_px.astype(np.float16).astype(float)
-    uv_px[:, 2] += 0.01  # the mean of two rows has finer steps
-    found = coarse_pixels(Evidence(with_pixels(sound, uv_px)))
-    assert isinstance(found, Symptom) and not found.harmful
-    step_px = 2.0 ** (np.floor(np.log2(float(np.median(uv_px[:, 0])))) - 10)  # ten bits of a mantissa
-    assert f"half-precision numbers, with steps of {step_px:g} px" in found.detail
-    single = sound.observations.uv_px.astype(np.float32).astype(float)
-    assert coarse_pixels(Evidence(with_pixels(sound, single))) is None
-
-
 @pytest.mark.parametrize("step_px", [1.0, 0.5, 0.1])
 def test_the_step_of_rounded_pixels_adds_its_root_of_a_twelfth(step_px: float) -> None:
     sound = recording("drive")

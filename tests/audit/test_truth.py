@@ -41,14 +41,6 @@ def test_a_sound_truth_is_not_accused(scenario: str) -> None:
     assert truth_mismatch(Evidence(recording(scenario, 21))) is None
 
 
-@pytest.mark.parametrize(("metres", "unit"), [(0.3048, "feet"), (0.9144, "yards"), (0.0254, "inches")])
-def test_a_truth_in_another_unit_is_named_and_not_taken_for_another_motion(metres: float, unit: str) -> None:
-    drive = recording("drive")
-    found = with_truth(drive, truth_of(faults.truth_unit(drive, 1.0 / metres)))
-    assert isinstance(found, Symptom)
-    assert f"times the truth's, as of one in {unit}" in found.detail
-
-
 def test_a_truth_of_another_flight_is_reported() -> None:
     """Of the same hall, later: speeds and turns are alike in size, and not in direction."""
     flight, later = recording("flight"), truth_of(recording("flight", 0, 18.0))

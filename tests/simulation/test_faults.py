@@ -19,7 +19,7 @@ INJECTORS = {
     if function.__module__ == faults.__name__ and not name.startswith("_") and name != "planted"
 }
 # What an estimator is not given without a repair or a refusal first.
-NOT_RUNNABLE = {"nan_span", "clock_jump", "zero_intrinsics", "negative_focal"}
+NOT_RUNNABLE = {"nan_span", "clock_jump"}
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ FAULTS: dict[Check, str] = {
     samples.not_finite: "sightings or motion samples that hold NaN or infinity",
     samples.implausible: "single sightings or motion samples beyond the range of any sensor",
     samples.stuck_samples: "an accelerometer, a gyro or odometry that repeats one value",
-    tracks.coarse_pixels: "sightings rounded to whole pixels or parts of one, or written as half-precision numbers",
+    tracks.coarse_pixels: "sightings rounded to whole pixels or parts of one",
     timing.outside_motion: "frames before the first or after the last motion sample",
     samples.saturated_samples: "an accelerometer or a gyro that is saturated",
     tracks.swapped_coordinates: "left and right images, or rows and columns, exchanged",

@@ -24,15 +24,12 @@ from toolkit.sequence import Sequence
 RATIO_SIGMAS = 5.0
 # Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
 NEAR_UNIT = 0.08
-# Velocities in the faster half whose median angle exceeds this have a wrong sign, or axes that no repair corrected.
-MOST_ANGLE_DEG = 60.0
 
 
 @beside_camera
 def disagreement(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report tracks that do not follow the measured motion after all repairs."""
     found = evidence.agreement
-    findings = [*_direction(intervals), *_ratios(evidence.sequence, intervals)]
+    findings = list(_ratios(evidence.sequence, intervals))
     if not (found.residual_px > found.limit_px or found.own_px > found.limit_px or findings):
         return None
     residuals = f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion"
@@ -44,23 +41,7 @@ def disagreement(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     return Symptom(count=1, detail="; ".join(findings), treatment=treatment, remedy=None)
 
 
-def _direction(intervals: Intervals) -> Iterator[str]:
-    """Yield a description of velocities in the faster half that point away from the camera's (median)."""
-    if intervals.v_mps is None:
-        return
-    measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
-    lengths = np.linalg.norm(measured, axis=1) * np.linalg.norm(seen, axis=1)
-    moving = lengths > np.median(lengths)
-    if moving.sum() < LEAST_INTERVALS // 2:
-        return
-    cosine = np.median(np.sum(measured * seen, axis=1)[moving] / lengths[moving])
-    angle_deg = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    if angle_deg > MOST_ANGLE_DEG:
-        yield f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)"
-
-
 def _ratios(sequence: Sequence, intervals: Intervals) -> Iterator[str]:
-    """Yield a description of each size of the motion that differs from the camera's, or gravity, by a factor."""
     for quantity in (SPEED, RATE, FORCE):
         ratio = quantity.ratio_of(sequence, intervals)
         margin = np.inf if ratio is None else RATIO_SIGMAS * ratio.error
@@ -142,7 +123,6 @@ def conflict(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | 
 
 
 def _deviations(evidence: Evidence, intervals: Intervals) -> tuple[Deviation, ...]:
-    """Return the deviations of rotation, less the gyro's bias, and of the velocity or of an IMU's specific force."""
     sequence = evidence.sequence
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     t_s = 0.5 * (frame_s[intervals.interval] + frame_s[intervals.interval + 1])
@@ -263,7 +243,6 @@ LEAST_STRETCHES_ASIDE = 2
 
 @beside_camera
 def scale_change(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided | None:
-    """Report a step of odometry's scale, as of a tyre or gear, that its scatter over ten stretches does not explain."""
     if intervals.v_mps is None:
         return None  # an IMU has no speed to compare
     measured, seen = intervals.v_measured_mps, intervals.v_seen_mps

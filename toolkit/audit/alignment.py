@@ -57,7 +57,6 @@ class Turn(NamedTuple):
 
     @property
     def angle(self) -> Scalar:
-        """The angle of the rotation about the axes that can be judged."""
         angle = float(np.linalg.norm(self.rad))
         return Scalar(angle, float(np.linalg.norm(self.rad * self.error_rad)) / max(angle, 1e-12))
 
@@ -70,7 +69,6 @@ class Position(NamedTuple):
 
     @property
     def error_m(self) -> Array:
-        """The standard errors (3,) along the axes of the IMU."""
         return np.sqrt(np.diag(self.cov_m2))
 
 
@@ -148,14 +146,9 @@ def _robust_solution(response: Array, jacobian: Array) -> Array:
 
 def way_gone(intervals: Intervals, position: Position, way_m: Array) -> Scalar:
     """Return where the camera is along a vector (3,) m from the given position: 0 is its start, 1 its end."""
-    return share_of_way(position.lacking_m, position.cov_m2 + _systematic_cov_m2(intervals), way_m)
-
-
-def share_of_way(lacking_m: Array, cov_m2: Array, way_m: Array) -> Scalar:
-    """Return the same for a measured correction (3,) m with its covariance (3, 3), by weighted least squares."""
-    weighted = np.linalg.solve(cov_m2, way_m)
+    weighted = np.linalg.solve(position.cov_m2 + _systematic_cov_m2(intervals), way_m)
     information = float(weighted @ way_m)
-    return Scalar(float(weighted @ lacking_m) / information, float(1.0 / np.sqrt(information)))
+    return Scalar(float(weighted @ position.lacking_m) / information, float(1.0 / np.sqrt(information)))
 
 
 def is_there(share: Scalar) -> bool:
@@ -169,17 +162,14 @@ def is_excluded(share: Scalar) -> bool:
 
 
 def _log_odds(share: Scalar) -> float:
-    """Return the logarithm of the odds of the vector's end against its start."""
     return (share.value - 0.5) / share.error**2
 
 
 def metres(position: Array) -> str:
-    """Return a position (3,) m as text."""
     return "(" + ", ".join(f"{x:z.2f}" for x in position) + ")"
 
 
 def _systematic_cov_m2(intervals: Intervals) -> Array:
-    """Return the covariance (3, 3) of the systematic error of the position in sound recordings."""
     if intervals.v_mps is None:
         return BESIDE_IMU_M**2 * np.eye(3)
     w_radps, v_mps = intervals.w_seen_radps, intervals.v_seen_mps

@@ -6,14 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from toolkit.audit.alignment import (
-    MOST_SIGMAS,
     SYSTEMATIC_RAD,
-    Position,
     Turn,
     VelocityFit,
-    is_there,
     metres,
-    share_of_way,
 )
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
@@ -109,7 +105,6 @@ def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wron
 
 
 def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | None:
-    """Say which parts are wrong by more than chance but no more than in sound recordings."""
     differences = _beyond(found, rig, kind, {name: 0.0 for name, one in JUDGED.items() if one.unseen})
     summary = "; ".join(one.summary for one in differences)
     return f"{summary}: that is more than chance and no more than in recordings without faults" if differences else None
@@ -141,7 +136,6 @@ def _beyond(found: SelfCalibration, rig: StereoRig, kind: MotionKind, limits: di
 
 
 def _summary(name: str, value: Array, error: Array, rig: StereoRig, beside: str) -> str:
-    """Say in words how a parameter is off, by values and standard errors (1,) or (3,)."""
     (off, *_), (e, *_) = value.tolist(), error.tolist()
     if name in ("fx_px", "fy_px", "cx_px", "cy_px"):
         given = getattr(rig, name)
@@ -182,7 +176,6 @@ MOST_STRETCHED = 1.5
 
 
 def intrinsics(evidence: Evidence) -> Symptom | None:
-    """Report a principal point or focal length that no lens has, where others fit one motion of the camera better."""
     sequence = evidence.sequence
     uv_px = sequence.observations.uv_px
     if len(uv_px) < LEAST_INTERVALS or not is_measured(uv_px).all():
@@ -320,7 +313,6 @@ def _bias_read(evidence: Evidence) -> tuple[Array, Array, str] | None:
 
 
 def _median(residual_radps: Array, systematic_radps: float) -> tuple[Array, Array]:
-    """Return the median (3,) of readings (M, 3) that should be zero, and its standard error."""
     return np.median(residual_radps, axis=0), np.hypot(median_error(residual_radps), systematic_radps)
 
 
@@ -382,8 +374,6 @@ LEVER_SIGMAS, SYSTEMATIC_M = {"twist": 5.0, "imu": 4.0}, {"twist": 0.6, "imu": 0
 LARGEST_ERROR_M = 0.25
 # Where only a camera farther off than this (m) would be found, the finding is undecided and says so.
 HIDDEN_M = {"twist": 1.2, "imu": 0.5}
-# Least distance (m) of a position that a mistake explains, and the systematic error (m) added to the standard errors.
-LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
 @beside_camera
@@ -399,39 +389,17 @@ def lever_arm(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided |
         errors = ", ".join(f"{error:.1f}" for error in found.error_m)
         return Undecided(f"too little rotation: the camera's position along x, y and z is known to {errors} m only")
     least_m = SYSTEMATIC_M[kind] + LEVER_SIGMAS[kind] * found.error_m
-    off, slip = decidable & (np.abs(found.lacking_m) > least_m), _slip(found, T_imu_cam) if kind == "imu" else ""
-    if not off.any() and not slip:
+    if not (off := decidable & (np.abs(found.lacking_m) > least_m)).any():
         far = np.flatnonzero(decidable & (least_m > HIDDEN_M[kind])).tolist()
         parts = ", ".join(f"{least_m[k]:.1f} m along {'xyz'[k]}" for k in far)
         hidden = f"too little rotation: a camera that is off by less than {parts} would not show"
         return Undecided(hidden) if far else None
-    axes = np.flatnonzero(off if off.any() else decidable).tolist()
+    axes = np.flatnonzero(off).tolist()
     axes_m = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
-    place = f"from {metres(T_imu_cam[:3, 3])}, its position in T_imu_cam{slip}"
+    place = f"from {metres(T_imu_cam[:3, 3])}, its position in T_imu_cam"
     summary = f"residuals are correlated with rotation: the camera is off by {', '.join(axes_m)} {place}"
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
     return Symptom.warning(summary, f"check the translation of T_imu_cam{other_point}", len(axes))
-
-
-def _slip(found: Position, T_imu_cam: Array) -> str:
-    """Return in words the mistake in the translation that puts the camera where it was found; empty if none does."""
-    given = T_imu_cam[:3, 3]
-    meant = {"its sign were changed": -given, "it were that of the inverse": -T_imu_cam[:3, :3].T @ given}
-    likely = {how: place for how, place in meant.items() if _explains(place - given, found)}
-    if not likely:
-        return ""
-    how, place = min(likely.items(), key=lambda one: float(np.linalg.norm(one[1] - given - found.lacking_m)))
-    return f", as if {how}: {metres(place)}"
-
-
-def _explains(way_m: Array, found: Position) -> bool:
-    """Say whether the camera is at the end of a vector (3,) m from the given position, and not beside the vector."""
-    if float(np.linalg.norm(way_m)) < LEAST_APART_M:
-        return False
-    cov_m2 = found.cov_m2 + SLIP_M**2 * np.eye(3)
-    share = share_of_way(found.lacking_m, cov_m2, way_m)
-    beside = found.lacking_m - share.value * way_m
-    return is_there(share) and float(beside @ np.linalg.solve(cov_m2, beside)) <= MOST_SIGMAS**2
 
 
 # Limits, beyond five standard errors, of the ratio of specific force to gravity and of that of odometry's rates to the
@@ -482,7 +450,6 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
 
 
 def _by_turn(turn: Turn, rig: StereoRig) -> tuple[list[Wrong], str]:
-    """Judge the rotation of the camera by odometry's velocities, and say what would not be found."""
     least_rad = SYSTEMATIC_RAD + turn.by_chance_rad
     least = float(least_rad.min())
     if (np.abs(turn.rad) > least_rad).any():
@@ -553,7 +520,6 @@ SCALE_BY_TRACK_DRIFT, TURN_BY_TRACK_DRIFT_RAD = 0.005, 0.003
 
 
 def steady_difference(evidence: Evidence) -> Symptom | None:
-    """Report a constant difference of vision and odometry beyond chance, within what slip causes."""
     found = evidence.velocity_fit
     if found is None:
         return None

@@ -149,7 +149,6 @@ def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
 
 
 def least_change_s(sequence: Sequence, error_s: float) -> float:
-    """Return the limit (s) of a change of the offset with this standard error (s)."""
     return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
 
 
@@ -170,7 +169,6 @@ class TruthClock(NamedTuple):
 
     @property
     def runs_otherwise(self) -> bool:
-        """Whether the rate is significant and drives the clocks apart."""
         if self.rate is None:
             return False
         return abs(self.rate.value) * self.half_s > max(LEAST_OFFSET_S, OFFSET_SIGMAS * self.rate.error * self.half_s)

@@ -191,7 +191,6 @@ def _exchanged(alone: str) -> Symptom:
 
 
 def _readings(given: Array) -> list[ExtrinsicConvention]:
-    """Return the extrinsic in all conventions: as given, with other axes of the body, of the camera, and inverted."""
     place_m, turns, inverse = given[:3, 3], right_handed_axes()[1:], se3_inverse(given)
     found = [ExtrinsicConvention(given, _OWN, "", "", place_m)]
     for turn in turns:
@@ -240,7 +239,6 @@ def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
 
 
 def _ranked(intervals: Intervals, readings: list[ExtrinsicConvention]) -> Ranking:
-    """Rank extrinsics by the negative Cauchy log-likelihood of each interval under them."""
     candidates = np.stack([reading.T_imu_cam for reading in readings])
     R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
     w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)

@@ -56,12 +56,10 @@ class Symptom:
 
     @classmethod
     def information(cls, count: int, detail: str, treatment: str) -> Self:
-        """Return a symptom that spoils no result and needs no repair."""
         return cls(count, detail, treatment, remedy=None, harmful=False)
 
     @classmethod
     def warning(cls, detail: str, treatment: str, count: int = 1, spans_ns: Spans = ()) -> Self:
-        """Return a symptom that may spoil results, or those within its spans, and has no repair."""
         return cls(count, detail, treatment, remedy=None, harmful=False, warns=True, spans_ns=spans_ns)
 
 
@@ -84,7 +82,6 @@ class Evidence:
 
     @cached_property
     def camera_motion(self) -> CameraMotion:
-        """The camera's own motion over each interval, from the stereo tracks alone."""
         return camera_motion(self.sequence)
 
     @cached_property
@@ -120,7 +117,6 @@ class Evidence:
 
     @cached_property
     def intervals(self) -> Intervals | None:
-        """The motion over each interval by the samples and by the camera; None where that cannot be compared."""
         if self.spoilt_by or not is_comparable(self.sequence):
             return None
         return compare(self.sequence, self.camera_motion)
@@ -194,5 +190,4 @@ def beside_camera(check: Callable[[Evidence, Intervals], Symptom | Undecided | N
 
 
 def name_of(check: Check) -> str:
-    """Return the name of the fault that a function checks: the function's, with hyphens."""
     return check.__name__.replace("_", "-")

@@ -64,7 +64,6 @@ class Intervals(NamedTuple):
         return np.asarray(np.median(self.w_radps - self.w_seen_radps, axis=0))
 
     def select(self, rows: BoolArray) -> "Intervals":
-        """Return those of a mask (M,)."""
         v_mps = None if self.v_mps is None else self.v_mps[rows]
         seen = self.w_cam_radps[rows], self.v_cam_mps[rows], self.T_imu_cam
         return Intervals(self.interval[rows], self.w_radps[rows], v_mps, *seen)
@@ -102,7 +101,6 @@ class Integral(NamedTuple):
 
     @classmethod
     def of(cls, t_ns: IntArray, values: Array) -> "Integral":
-        """Return the integral of samples in the order of time."""
         pieces = 0.5 * (values[1:] + values[:-1]) * (np.diff(t_ns) / NS_PER_S)[:, None]
         return cls(t_ns, values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)]))
 

@@ -69,7 +69,6 @@ class _Moved(NamedTuple):
 
 
 def _moved(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> _Moved:
-    """Move points under a motion of the camera (K - 1, 4, 4) in the intervals whose own motion is known."""
     pairs, uv_px, rig = usable_pairs(sequence), sequence.observations.uv_px, sequence.rig
     pairs = pairs.select(camera.known[pairs.interval])
     T_after_before = se3_inverse(T_before_after)[pairs.interval]
@@ -119,7 +118,6 @@ class Agreement(NamedTuple):
 
 
 def agreement(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Agreement:
-    """Measure how well the tracks follow the measured motion of a sequence that can be compared."""
     own_px = own_one_step_px(sequence, camera)
     limit_px = max(MOST_PX, TIMES_EXPLAINED * _explained_px(sequence, intervals, own_px))
     return Agreement(median_one_step_px(sequence, camera, sequence.rig.T_imu_cam), own_px, limit_px)

@@ -50,7 +50,6 @@ def cauchy(residuals: Array, least_spread: float) -> Array:
 
 
 def mean_in_sigmas(difference: Array) -> float:
-    """Return the mean of differences (M,) in its own standard errors."""
     error = float(np.std(difference)) / math.sqrt(difference.size)
     return float(np.mean(difference)) / max(error, 1e-12)
 

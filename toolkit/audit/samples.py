@@ -55,7 +55,6 @@ SENSORS: dict[MotionKind, tuple[Sensor, ...]] = {
 
 
 def not_finite(evidence: Evidence) -> Symptom | None:
-    """Count the rows with a value that is not finite, and drop them; a missing right image is no fault."""
     sequence = evidence.sequence
     sightings: BoolArray = is_measured(sequence.observations.uv_px)
     samples: BoolArray = np.asarray(np.isfinite(sequence.motion.values).all(axis=1))
@@ -254,7 +253,6 @@ def _at_an_end(column: Array) -> BoolArray:
 
 
 def _never_moves(evidence: Evidence) -> Symptom | None:
-    """Report odometry whose velocities or rates of rotation are all zero while the camera's are not."""
     camera, values = evidence.camera_motion, evidence.sequence.motion.values
     if not len(values) or camera.known.sum() < LEAST_RUN:
         return None
@@ -289,7 +287,6 @@ LEAST_COUNT, LEAST_RATIO = 10, 3.0
 
 
 def saturated_samples(evidence: Evidence) -> Symptom | None:
-    """Report the axes of an IMU whose samples accumulate at an end of the range, where values are cut off."""
     if evidence.sequence.motion_kind != "imu":
         return None
     values = evidence.sequence.motion.values
@@ -406,7 +403,6 @@ QUIET_S, QUIETEST = 0.5, 0.1
 
 
 def understated_noise(evidence: Evidence) -> Symptom | None:
-    """Report an IMU whose samples scatter far more than the stated noise, on every axis and where they are quietest."""
     motion, noise = evidence.sequence.motion, evidence.sequence.noise
     if not (isinstance(motion, ImuSamples) and isinstance(noise, ImuNoise)) or motion.t_ns.size < LEAST_SAMPLES:
         return None
@@ -433,7 +429,6 @@ _OTHER_WAY = [3, 4, 5, 0, 1, 2]
 
 
 def exchanged_samples(evidence: Evidence) -> Symptom | None:
-    """Exchange linear and angular columns where this alone makes both agree with camera and gravity."""
     sequence, intervals = evidence.sequence, evidence.intervals
     size = _linear_ratio(evidence)
     if intervals is None or size is None or 1.0 / LEAST_FACTOR < size.value < LEAST_FACTOR:
@@ -462,7 +457,6 @@ LEAST_GRAVITY, AVERAGED_S, STEADY_RANGE, MOST_BIAS = 0.5, 0.25, 0.5, 0.06
 
 
 def gravity_removed(evidence: Evidence) -> Symptom | None:
-    """Report an accelerometer whose driver took gravity out of what it measures: the motion's acceleration is left."""
     sequence, ratio = evidence.sequence, force_ratio(evidence.sequence)
     if ratio is None or not _lacks_gravity(sequence):
         return None
@@ -534,7 +528,6 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _stamps(evidence: Evidence) -> _WrongUnit | None:
-    """Report stamps by which both speeds and rates of rotation of camera and odometry differ by one factor."""
     speed = speed_ratio(evidence.intervals)
     if evidence.intervals is None or speed is None or not speed.value > 0.0:
         return None
@@ -550,7 +543,6 @@ def _stamps(evidence: Evidence) -> _WrongUnit | None:
 
 
 def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
-    """Report stamps whose steps between frames are not those of a vehicle's camera."""
     if evidence.intervals is None:
         return None
     step_s = usual_step_s(evidence.sequence.frames_t_ns)
@@ -623,7 +615,6 @@ def _of_samples(evidence: Evidence, quantity: Quantity) -> _WrongUnit | None:
 
 
 def _truth(evidence: Evidence) -> _WrongUnit | None:
-    """Judge the truth by the ratio of its speed to the samples', or to the camera's with an IMU."""
     sequence, intervals = evidence.sequence, evidence.intervals
     truth = sequence.truth
     if truth is None or intervals is None or truth.t_ns.size < 2:

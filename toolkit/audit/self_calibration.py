@@ -168,7 +168,6 @@ class Calibration(NamedTuple):
     right_roll_rad: float = 0.0
 
     def moved(self, step: Array) -> "Calibration":
-        """Return the calibration after a step (21,) of the unknowns."""
         rig, scale = self.rig, np.exp(step[[0, 1, BASELINE]])
         R_imu_cam = rig.T_imu_cam[:3, :3] @ so3_exp(step[TURN])
         after = replace(
@@ -210,11 +209,9 @@ class KeyFrameWindow(NamedTuple):
 
     @property
     def unknowns(self) -> int:
-        """Number of the window's own unknowns, without its points."""
         return STATE * len(self.position) + GRAVITY
 
     def moved(self, own: Array, points: Array) -> "KeyFrameWindow":
-        """Return the window after steps of its own unknowns and of its points (T, 3)."""
         state = own[:-GRAVITY].reshape(-1, STATE)
         return self._replace(
             R_first_imu=self.R_first_imu @ so3_exp(state[:, :3]),
@@ -241,13 +238,11 @@ class Reduced(NamedTuple):
     vision: ReducedVision
 
     def moved(self, window: KeyFrameWindow, step: Array) -> KeyFrameWindow:
-        """Return the window after a step (21,) of the calibration and the step of its own unknowns that follows."""
         own = self.own - self.per_common @ step
         return window.moved(own, self.vision.point_steps(np.append(own, step)[self.seen]))
 
 
 def reduce(window: KeyFrameWindow, calibration: Calibration) -> Reduced:
-    """Linearise the window and eliminate its own unknowns and its points."""
     (vision, of_tracks), (information, of_strides) = _tracks(window, calibration), _strides(window, calibration)
     # Sightings depend on the poses, and on the calibration except for the biases.
     own, of_poses = window.unknowns, STATE * np.arange(len(window.position))[:, None] + np.arange(POSE)
@@ -427,7 +422,6 @@ class SelfCalibration(NamedTuple):
 
     @property
     def error(self) -> Array:
-        """The standard errors (21,)."""
         return np.sqrt(np.diag(self.cov))
 
     @property
@@ -488,7 +482,6 @@ def _fitted(at: _Adjustment, kind: MotionKind) -> tuple[_Adjustment, Array]:
 
 
 def _adjusted(at: _Adjustment, kind: MotionKind, free: int) -> _Adjustment:
-    """Adjust the first ``free`` unknowns by Gauss-Newton."""
     prior, after = PRIOR[kind], at
     for _ in range(MOST[kind].iterations):
         reduced = [reduce(window, after.calibration) for window in after.windows]
@@ -569,7 +562,6 @@ def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
 
 
 def _roughly_moved(sequence: Sequence, camera: CameraMotion) -> tuple[Array, BoolArray]:
-    """Return initial motions of the camera (K - 1, 4, 4), and whether they are known; odometry fills gaps."""
     T_before_after, known = moved_by(camera, sequence), camera.known
     if sequence.motion_kind != "twist":
         return T_before_after, known

@@ -229,7 +229,6 @@ def _kept(part: Sequence, whole: Sequence) -> str:
 
 
 def _late(t_ns: IntArray) -> int:
-    """Count the stamps that are no time, or not after all before them."""
     latest_before = np.maximum.accumulate(np.concatenate([[NOT_A_TIME], t_ns[:-1]]))
     return int(np.sum(t_ns <= latest_before)) if t_ns.size else 0
 
@@ -245,7 +244,6 @@ LEAST_FRAMES = 2
 
 
 def outside_motion(evidence: Evidence) -> Symptom | None:
-    """Count the frames before the first or after the last motion sample and cut them off."""
     sequence = evidence.sequence
     frames_t_ns, motion_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
     if motion_t_ns.size == 0:
@@ -317,7 +315,6 @@ MOST_STEP_S, MOST_RATIO = 2.0, 20.0
 
 
 def sparse_motion(evidence: Evidence) -> Symptom | None:
-    """Report motion samples that come more rarely than frames, by the ratio that makes a gap."""
     sequence = evidence.sequence
     if sequence.motion.t_ns.size < 2 or sequence.frame_count < 2 or not is_comparable(sequence):
         return None
@@ -599,7 +596,6 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
 
 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
-    """Return the self-calibration's offset, unless that of the rotations is large and leads to a self-calibration."""
     fitted = evidence.self_calibration
     if found is None or fitted is None:
         return found

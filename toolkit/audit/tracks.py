@@ -22,7 +22,6 @@ from toolkit.sequence import NO_FEATURES, ONE_ROW_FOR_BOTH, Observations, Sequen
 
 
 def no_sightings(evidence: Evidence) -> Symptom | None:
-    """Count the frames if none has a sighting, unless the recording states that it has no camera."""
     sequence = evidence.sequence
     if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
         return None
@@ -157,45 +156,36 @@ MOST_ROUNDING = 0.5
 
 
 def coarse_pixels(evidence: Evidence) -> Symptom | None:
-    """Report sightings rounded to whole pixels, a simple part of one, or to half-precision numbers.
+    """Report sightings rounded to whole pixels, or to a simple part of one.
 
     Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals",
-    1948). Half-precision numbers have steps of half a pixel above 512 px, and of a whole one above 1024 px.
+    1948).
     """
     rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
     seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
     if len(seen_px) < LEAST_SIGHTINGS:
         return None
-    step_px, grid = _step_px(seen_px)
-    if step_px is None:
+    if (step_px := _step_px(seen_px)) is None:
         return None
     rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
-    detail = f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL"
+    adds = f"rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px stated for uL"
+    detail = f"uL and uR are multiples of {step_px:g} px: {adds}"
     treatment = "write them with all the digits that the tracker has; depths of far points suffer most"
     found = Symptom.information(len(seen_px), detail, treatment)
     return replace(found, warns=bool(rounding_px > MOST_ROUNDING * stated_px))
 
 
-def _step_px(uv_px: Array) -> tuple[float | None, str]:
-    """Return the step (px) of coordinates (N, 2), and its description; None where there is none."""
+def _step_px(uv_px: Array) -> float | None:
     some_px = uv_px[:LEAST_SIGHTINGS]  # enough to exclude it in most recordings
     for step_px in STEPS_PX:
         if _share_round(some_px, step_px) > SOME and _share_round(uv_px, step_px) > NEARLY_ALL:
-            return step_px, f"uL and uR are multiples of {step_px:g} px"
-    if _share_half(some_px) <= SOME or _share_half(uv_px) <= NEARLY_ALL:
-        return None, ""
-    step_px = float(np.spacing(np.float16(np.median(np.abs(uv_px[:, 0])))))
-    return step_px, f"uL and uR are half-precision numbers, with steps of {step_px:g} px at the median uL"
+            return step_px
+    return None
 
 
 def _share_round(uv_px: Array, step_px: float) -> float:
     steps = uv_px / step_px
     return float(np.mean(np.abs(steps - np.round(steps)) < 1e-4))
-
-
-def _share_half(uv_px: Array) -> float:
-    with np.errstate(over="ignore"):
-        return float(np.mean(uv_px.astype(np.float16) == uv_px))
 
 
 # From this share of disparities that are not positive on, the order of the coordinates is tested.
@@ -350,7 +340,6 @@ class _Beginnings(NamedTuple):
     second_ratio: Array
 
     def select(self, rows: BoolArray) -> "_Beginnings":
-        """Return the tracks of a mask (T,)."""
         numbers, (first_px, *ratios) = self[:2], (values[rows] for values in self[2:])
         return _Beginnings(numbers[0][rows], numbers[1][rows], first_px, *ratios)
 
@@ -369,7 +358,6 @@ def _beginnings(observations: Observations) -> _Beginnings:
 
 
 def _is_doubled(begun: _Beginnings) -> bool:
-    """Say whether nearly all of the tracks double once and keep the doubled disparity."""
     doubled = (begun.first_ratio > LEAST_RATIO) & (begun.first_ratio < LARGEST_RATIO)
     again = np.isfinite(begun.second_ratio)
     if doubled.size < LEAST_DOUBLED_TRACKS or doubled.mean() < LEAST_DOUBLED_SHARE or again.mean() < LEAST_SEEN_AGAIN:
@@ -402,7 +390,6 @@ def _halved(observations: Observations, tracks: IntArray) -> Observations:
 
 
 def no_disparity(evidence: Evidence) -> Symptom | None:
-    """Count the sightings with uL - uR <= 0 and drop them; their tracks continue."""
     observations = evidence.sequence.observations
     bad = disparity_px(observations.uv_px) <= 0.0
     if not (count := int(bad.sum())):
@@ -412,7 +399,6 @@ def no_disparity(evidence: Evidence) -> Symptom | None:
 
 
 def left_only(evidence: Evidence) -> Symptom | None:
-    """Count the sightings without the right image; warn where there are no others: no point has a depth."""
     uv_px = evidence.sequence.observations.uv_px
     if not (count := int(is_left_only(uv_px).sum())):
         return None
@@ -427,7 +413,6 @@ LEAST_THIN_S = 0.5
 
 
 def thin_vision(evidence: Evidence) -> Symptom | None:
-    """Report the times at which the tracks are too few to determine the camera's motion."""
     sequence = evidence.sequence
     if evidence.spoilt_by or not len(sequence.observations) or not is_comparable(sequence):
         return None

@@ -111,7 +111,6 @@ def compared(each: Array) -> WindowMedian:
 
 
 def off_by(both: Array) -> WindowMedian:
-    """Return the difference of both motions (2, M, 3), as a share of the larger."""
     return compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
 
 
@@ -131,7 +130,6 @@ STANDARD_MPS2 = 9.81
 
 
 def gravity_direction(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare gravity in the truth's world with the mean specific force, rotated by a truth that turns as the gyro."""
     sequence, truth = evidence.sequence, evidence.sequence.truth
     if not isinstance(sequence.motion, ImuSamples) or truth is None or evidence.spoilt_by:
         return None
@@ -184,7 +182,6 @@ LARGEST_S = 0.05
 
 
 def truth_clock(evidence: Evidence) -> Symptom | Undecided | None:
-    """Report a truth by a clock that runs faster or slower than the frames', by the rotations of camera and truth."""
     if evidence.spoilt_by or evidence.sequence.truth is None:
         return None
     clock = evidence.truth_clock
@@ -214,8 +211,6 @@ LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
 DRIVES, MOST_STANDING = 5.0, 0.5
 # From this difference on, as a share of the motion, other readings are tried; one must make it this much smaller.
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
-# Units of length (m) of a truth that are only named; millimetres and centimetres are converted (`units`).
-LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = (
     "check that the truth is this recording's, in order and in the axes it is read in; do not rely on errors against it"
@@ -239,7 +234,6 @@ def truth_mismatch(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _broken(truth: Truth) -> Symptom | None:
-    """Report poses that are not finite, and steps that no vehicle makes: a reset, a flipped bit."""
     finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
     if not finite.all():
         return Symptom.warning(
@@ -288,8 +282,7 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
         within = "which is more than chance and no more than in recordings without faults"
         doubt = f"{steps}, {within}: the truth's unit, the baseline or the focal length may be off by it"
         return Undecided(doubt) if only_longer and abs(scale.value - 1.0) > scale.by_chance else None
-    unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
-    return Symptom.warning(f"{steps}{unit}", _WHERE)
+    return Symptom.warning(steps, _WHERE)
 
 
 def _standing(both: Windows, moved: BoolArray) -> Symptom | None:

@@ -62,7 +62,6 @@ class Card:
 
     @property
     def correlated(self) -> bool:
-        """Say whether the errors of a track are correlated."""
         return self.weight.correlation > 0.0
 
 
@@ -126,7 +125,6 @@ class _Residuals(NamedTuple):
 
 
 def _correlation(here: _Residuals, lag: int) -> Array:
-    """Return the autocorrelation (3,) of residuals along a track, NaN where too few are seen that long."""
     key = here.track * (here.frame.max(initial=0) + lag + 1) + here.frame
     order = np.argsort(key)
     then, found = rows_of(key + lag, key[order])

@@ -57,7 +57,6 @@ class Stretch:
 
     @classmethod
     def of(cls, sequence: Sequence, first: int, count: int) -> "Stretch":
-        """Return ``count`` frames of a sequence from the ``first`` on."""
         whole = sequence.with_frames(np.arange(first, first + count))
         part = replace(whole, track_budget=min(TRACKS, sequence.track_budget or TRACKS))
         packets = tuple(part.packets())
@@ -171,7 +170,6 @@ class Adjusted:
 
     @property
     def vision(self) -> Vision:
-        """The sightings evaluated at the minimum."""
         return self._evaluated.vision
 
     def by_sound_sightings(self) -> StereoWindow:

@@ -83,7 +83,7 @@ def dropped_frames(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequ
     """Lose a share of the frames, each independently, but the first and the last: a full disk, a busy computer."""
     kept = np.random.default_rng(seed).uniform(size=sequence.frame_count) >= dose
     kept[[0, -1]] = True
-    return _with_frames(sequence, kept)
+    return sequence.with_frames(np.flatnonzero(kept))
 
 
 @_injector("share")
@@ -332,7 +332,7 @@ def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence
     """Lose the motion samples of a span whose length is the dose (s): a full buffer, a loose cable."""
     begin_s, end_s = _span_s(sequence, dose, seed)
     t_s = sequence.elapsed_s(sequence.motion.t_ns)
-    return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
+    return sequence.with_samples((t_s <= begin_s) | (t_s >= end_s))
 
 
 @_injector("s")
@@ -397,7 +397,7 @@ def changed_speed(sequence: Sequence, dose: float = 1.08, seed: int = 0) -> Sequ
 @_injector("samples", clean=1.0)
 def thinned_motion(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
     """Keep one motion sample in as many as the dose: a log that was thinned out, a bus that is busy."""
-    return _with_samples(sequence, np.arange(sequence.motion.t_ns.size) % int(dose) == 0)
+    return sequence.with_samples(np.arange(sequence.motion.t_ns.size) % int(dose) == 0)
 
 
 @_injector("factor", clean=1.0)
@@ -559,40 +559,15 @@ def _with_frames_at(sequence: Sequence, frames_t_ns: IntArray) -> Sequence:
     """Return the sequence with other stamps of its frames (K,), without those outside the motion samples."""
     moved, motion_t_ns = replace(sequence, frames_t_ns=frames_t_ns), sequence.motion.t_ns
     inside = (frames_t_ns >= motion_t_ns[0]) & (frames_t_ns <= motion_t_ns[-1])
-    return moved if inside.all() else _with_frames(moved, inside)
-
-
-def _with_frames(sequence: Sequence, kept: BoolArray) -> Sequence:
-    """Return the sequence with the frames of a mask (K,) alone; the prior goes with the first one."""
-    seen, index = sequence.observations, np.cumsum(kept) - 1
-    rows = kept[seen.frame]
-    left = Observations(index[seen.frame[rows]], seen.track_id[rows], seen.uv_px[rows])
-    prior = sequence.prior if kept[0] else None
-    return replace(sequence, frames_t_ns=sequence.frames_t_ns[kept], observations=left, prior=prior)
+    return moved if inside.all() else moved.with_frames(np.flatnonzero(inside))
 
 
 # Calibration ----------------------------------------------------------------------------------------------------------
 
 
-def zero_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
-    """Set every intrinsic to the dose: a K nobody filled in."""
-    return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=dose, cy_px=dose)
-
-
 def identity_intrinsics(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
-    """Set the focal lengths to the dose and the centre to zero: K left at the identity."""
+    """Set the focal lengths to the dose and the centre to zero: a K left at the identity, or with 0 never filled in."""
     return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=0.0, cy_px=0.0)
-
-
-def transposed_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
-    """Set the principal point to the dose: the elements that are read from a transposed K."""
-    return _with_rig(sequence, cx_px=dose, cy_px=dose)
-
-
-@_injector("factor", clean=1.0)
-def negative_focal(sequence: Sequence, dose: float = -1.0, seed: int = 0) -> Sequence:
-    """Multiply the focal lengths by the dose: axes of a camera that looks backwards."""
-    return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
 
 
 @_injector("factor", clean=1.0)
@@ -613,14 +588,6 @@ def shifted_centre(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Seq
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     cx_px, cy_px = sequence.rig.cx_px + dose * np.cos(angle), sequence.rig.cy_px + dose * np.sin(angle)
     return _with_rig(sequence, cx_px=float(cx_px), cy_px=float(cy_px))
-
-
-@_injector("px")
-def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequence:
-    """Give the images a skew of the dose (px), which a K may state but no rectified pair has."""
-    rig, uv_px = sequence.rig, sequence.observations.uv_px
-    shift_px = dose * (uv_px[:, 2:] - rig.cy_px) / rig.fy_px
-    return _with_pixels(sequence, uv_px + shift_px * np.array([1.0, 1.0, 0.0]))
 
 
 @_injector("factor", clean=1.0)
@@ -726,11 +693,6 @@ def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
 def _with_values(sequence: Sequence, values: Array) -> Sequence:
     """Return the sequence with other values (S, 6) of its motion samples."""
     return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
-
-
-def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
-    arrays: dict[str, Any] = {k: x[kept] for k, x in vars(sequence.motion).items() if isinstance(x, np.ndarray)}
-    return replace(sequence, motion=replace(sequence.motion, **arrays))
 
 
 def _with_rig(sequence: Sequence, **fields: Any) -> Sequence:
