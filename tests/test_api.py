@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -278,26 +277,20 @@ def surrounded(words: list[str], program: str | None, folder: Path) -> str:
     return messages.stdout
 
 
-def as_script(folder: Path) -> str:
-    (folder / "unguarded.py").write_text(PROGRAM)
-    return surrounded(["unguarded.py"], None, folder)
+# A kernel executes each statement in the namespace of a main module without a file.
+KERNEL = """
+import ast, sys
+main = sys.modules["__main__"].__dict__
+for cell in ast.parse(sys.stdin.read()).body:
+    exec(compile(ast.Module([cell], []), "<cell>", "exec"), main)
+"""
 
 
-def in_a_notebook(folder: Path) -> str:
-    """Run it as a kernel does: each statement executed in the namespace of a main module without a file."""
-    kernel = textwrap.dedent("""
-        import ast, sys
-        main = sys.modules["__main__"].__dict__
-        for cell in ast.parse(sys.stdin.read()).body:
-            exec(compile(ast.Module([cell], []), "<cell>", "exec"), main)
-    """)
-    return surrounded(["-c", kernel], PROGRAM, folder)
-
-
-@pytest.mark.parametrize("run", [as_script, in_a_notebook])
-def test_it_runs_in_processes_from_anywhere_and_once(tmp_path: Path, run: Callable[[Path], str]) -> None:
+@pytest.mark.parametrize("words", [["unguarded.py"], ["-c", KERNEL]], ids=["script", "notebook"])
+def test_it_runs_in_processes_from_anywhere_and_once(tmp_path: Path, words: list[str]) -> None:
     """No guard around the main program, no file to import again: and what the program prints, it prints once."""
-    reported = run(tmp_path)
+    (tmp_path / "unguarded.py").write_text(PROGRAM)
+    reported = surrounded(words, PROGRAM, tmp_path)
     assert reported.count("metrics agree: True\n") == 1
     assert reported.splitlines()[1] == "drive_small"
     assert "mine" in reported

@@ -5,6 +5,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, simulate
@@ -52,18 +53,19 @@ def test_what_is_given_at_a_frame_does_not_depend_on_later_ones():
     np.testing.assert_array_equal(short.track_id, long.track_id[long.frame < 11])
 
 
-def test_every_part_of_the_view_has_one_track_before_any_has_two():
-    crowd, alone = (0, 0, 3), (5, 2, 1)
-    assert chosen(2, [9, 9, 9, 0], [crowd, crowd, crowd, alone]) == [0, 3]
+CROWD, ALONE = (0, 0, 3), (5, 2, 1)
 
 
-def test_within_a_part_the_track_that_has_lived_longest_comes_first():
-    part = (0, 0, 3)
-    assert chosen(2, [1, 7, 0, 4], [part] * 4) == [1, 3]
-
-
-def test_a_track_without_depth_comes_after_all_others():
-    assert chosen(3, [9, 0, 0, 0], [(4, 4, -1), (0, 0, 2), (0, 0, 2), (0, 0, 2)]) == [1, 2, 3]
+@pytest.mark.parametrize(
+    ("budget", "ages", "parts", "given"),
+    [
+        (2, [9, 9, 9, 0], [CROWD, CROWD, CROWD, ALONE], [0, 3]),  # every part has one track before any has two
+        (2, [1, 7, 0, 4], [CROWD] * 4, [1, 3]),  # within a part the one that has lived longest comes first
+        (3, [9, 0, 0, 0], [(4, 4, -1), (0, 0, 2), (0, 0, 2), (0, 0, 2)], [1, 2, 3]),  # one without depth comes last
+    ],
+)
+def test_which_tracks_of_a_frame_are_given(budget, ages, parts, given):
+    assert chosen(budget, ages, parts) == given
 
 
 def test_parts_are_cells_of_the_image_and_octaves_of_disparity():

@@ -6,10 +6,6 @@ import re
 import shutil
 from pathlib import Path
 
-import pytest
-
-from toolkit.report.text import in_markdown
-
 RECORDING = Path(__file__).parents[2] / "data" / "drive_small"
 HOSTILE = "a\x1b[2J\u202eb|c <img src=x> [click](http://x) $\\frac$ \udcff"
 QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
@@ -30,11 +26,6 @@ def test_names_act_neither_on_the_terminal_nor_in_the_report(vislam, capfd):
     assert vislam("report", "run") == 0
     assert vislam("check-data", "hostile") == 0
     assert capfd.readouterr().out.replace("\n", "").isprintable()
-
-
-@pytest.mark.parametrize("text", ["plain words, 3.5 m", "kitti_t_percent at -0.5", "a (b) c: d; 1e-05 = 2"])
-def test_plain_text_is_the_same_in_markdown(text):
-    assert in_markdown(text) == text
 
 
 def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(vislam, capfd):

@@ -12,6 +12,7 @@ from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.pipeline import run as run_plan
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import Unit, run_unit
+from toolkit.progress import SILENT
 from toolkit.settings import SettingsError
 from toolkit.settings.reading import settings_of
 from toolkit.simulation.faults import dropped_frames
@@ -67,6 +68,17 @@ def test_trials_that_come_to_the_same_run_run_once(plan, monkeypatch):
     assert len({id(outcomes[0]) for outcomes in grid.outcomes.values()}) == 1
 
 
+def test_stretches_of_two_runs_that_lack_frames_are_of_the_same_times():
+    prepared = prepare(Recording("drive", 0, duration_s=12.0))
+    thinned = replace(prepared, sequence=dropped_frames(prepared.sequence, 0.2, 1))
+    whole, lacking = (
+        run_unit(Unit(one, 0, "dead-reckoning"), SILENT).outputs["final"].drift_m for one in (prepared, thinned)
+    )
+    both = np.isfinite(lacking)
+    assert np.isfinite(whole).all() and both.mean() > 0.8
+    assert np.corrcoef(whole[both], lacking[both])[0, 1] > 0.8  # the ends are up to a frame apart
+
+
 def test_a_recording_that_a_fault_makes_unusable_is_a_failed_run(plan):
     grid = run_grid(plan, [CLEAN, Trial.of("dead-reckoning", faults={"nan_span": 0.5})])
     clean, broken = grid.outcomes.values()
@@ -89,22 +101,3 @@ def test_what_cannot_be_run_is_told_before_anything_runs(plan, trial, error, wha
     monkeypatch.setattr(pipeline, "run_unit", lambda *_: pytest.fail("a unit was run"))
     with pytest.raises(error, match=what):
         run_grid(replace(plan, sources=("flight" if error is DataError else "drive",)), [CLEAN, trial()])
-
-
-def test_stretches_of_two_runs_that_lack_frames_are_of_the_same_times():
-    from toolkit.experiment.units import drift_over_stretches, run_estimator
-    from toolkit.metrics import Evaluation
-    from toolkit.progress import SILENT
-
-    prepared = prepare(Recording("drive", 0, duration_s=12.0))
-    thinned = replace(prepared, sequence=dropped_frames(prepared.sequence, 0.2, 1))
-    whole, lacking = (
-        drift_over_stretches(
-            Evaluation(run_estimator(Unit(one, 0, "dead-reckoning"), one, SILENT), "final", one.sequence)
-        )
-        for one in (prepared, thinned)
-    )
-    assert np.isfinite(whole).all()
-    both = np.isfinite(lacking)
-    assert both.mean() > 0.8
-    assert np.corrcoef(whole[both], lacking[both])[0, 1] > 0.8  # the ends are up to a frame apart

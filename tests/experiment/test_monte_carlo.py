@@ -41,11 +41,14 @@ def test_the_band_is_for_the_runs_that_are_there():
     assert averaged.in_band_percent == 100.0
 
 
-def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
-    astray = over.rows[2]
-    assert (astray.estimator, astray.counts) == ("astray", {"ok": 3, "diverged": 1, "failed": 0})
+def test_a_seed_that_diverged_is_counted_and_in_no_mean_and_who_never_answers_keeps_a_line(over):
+    rows = [("honest", "causal"), ("honest", "final"), ("astray", "causal"), ("broken", "final")]
+    assert [(row.estimator, row.output) for row in over.rows] == rows
+    astray, broken = over.rows[2:]
+    assert astray.counts == {"ok": 3, "diverged": 1, "failed": 0}
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
     assert astray.values("ate_none_m") == [3.0, 4.0, 5.0, 6.0]
+    assert (broken.spread("ate_none_m"), broken.reason("ate_none_m")) == (None, "no run is ok")
     assert not over.all_ok
 
 
@@ -78,17 +81,6 @@ def _with_values(outcome: Outcome, values: dict[str, float | None]) -> Outcome:
     scored = outcome.outputs["causal"]
     scores = Scores(scored.scores.values | values, scored.scores.notes)
     return replace(outcome, outputs={"causal": replace(scored, scores=scores)})
-
-
-def test_an_estimator_without_any_answer_keeps_a_line(over):
-    assert [(g.estimator, g.output) for g in over.rows] == [
-        ("honest", "causal"),
-        ("honest", "final"),
-        ("astray", "causal"),
-        ("broken", "final"),
-    ]
-    assert over.rows[3].spread("ate_none_m") is None
-    assert over.rows[3].reason("ate_none_m") == "no run is ok"
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """Many processes give what one gives, and what goes wrong in one of them stays there."""
 
 import os
-import subprocess
 import sys
 import textwrap
 import time
@@ -240,26 +239,6 @@ def test_a_stage_before_the_first_frame_is_no_half_of_a_run() -> None:
 
     list(results_of([0], 1, works, Listening()))
     assert received == [(0, 100, "compiling"), (25, 100, ""), (50, 100, "solving, iteration 1")]
-
-
-def test_every_process_is_started_with_the_signals_of_a_terminal_held_back(tmp_path):
-    """In a program of its own, because Python's resource tracker starts once a program, with the first process."""
-    program = textwrap.dedent("""
-        import signal
-        from toolkit.experiment import workers
-        submit = workers.ProcessPoolExecutor.submit
-        def told(*given):
-            print({"SIGINT", "SIGHUP"} <= {number.name for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])})
-            return submit(*given)
-        workers.ProcessPoolExecutor.submit = told
-        for _ in range(2):
-            process = workers.WorkerProcess()
-            process.submit(int).result()
-            process.end()
-        print(signal.pthread_sigmask(signal.SIG_BLOCK, []))
-    """)
-    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert ran.stdout.splitlines() == ["True", "True", "set()"]
 
 
 def test_no_process_outlives_one_that_is_killed(tmp_path, starts_group):

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from toolkit.experiment.statistics import holm, paired_p
+from toolkit.experiment.statistics import holm, mean_interval, paired_p
 from toolkit.gate.significance import smallest_detectable
 
 
@@ -19,6 +19,8 @@ def test_the_paired_test_is_scipys(n, shift, margin):
     before, after = rng.standard_normal(n), rng.standard_normal(n) + shift
     expected = stats.ttest_1samp(after - before, margin, alternative="greater").pvalue
     assert float(paired_p(after - before, margin)) == pytest.approx(expected, rel=1e-9)
+    of_mean = stats.t.interval(0.95, n - 1, (after - before).mean(), stats.sem(after - before))
+    assert mean_interval(after - before)[1:] == pytest.approx(of_mean, rel=1e-9)
 
 
 @pytest.mark.parametrize(("value", "p"), [(0.0, 1.0), (-0.1, 1.0), (0.005, 1.0), (0.1, 0.0)])

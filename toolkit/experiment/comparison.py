@@ -114,7 +114,6 @@ class Row:
 
     @property
     def status(self) -> Status:
-        """Return how the run under the first seed ended."""
         return self.outcomes[0].status
 
     @cached_property
@@ -163,7 +162,6 @@ class Row:
         return None if spread is None else spread.mean
 
     def values(self, key: str) -> list[float | None]:
-        """Return a metric's value under each seed, whatever the run's status."""
         given = (outcome.outputs.get(self.output) for outcome in self.outcomes)
         return [None if scored is None else scored.scores.values.get(key) for scored in given]
 
@@ -172,7 +170,6 @@ class Row:
         return [v if o.status == "ok" else None for v, o in zip(self.values(key), self.outcomes, strict=True)]
 
     def spread(self, key: str) -> Spread | None:
-        """Return mean, median and spread of a metric over the runs that are ok, or None where there is no value."""
         return spread_of(_known(self.good, key))
 
     def quantiles_of_all(self, metric: Metric) -> QuantilesAll | None:
@@ -211,7 +208,6 @@ class Row:
 
     @cached_property
     def position_m(self) -> Array | None:
-        """Position errors (runs, K) m of the runs that are ok, or None where no run has any."""
         known = [scored.position_m for scored in self.good if np.isfinite(scored.position_m).any()]
         return np.array(known) if known else None
 
@@ -296,7 +292,6 @@ class Comparison:
 
     @property
     def hashes(self) -> tuple[str | None, ...]:
-        """The hash of what the estimators read under each seed, None where no run completed."""
         known = {outcome.seed: outcome.sequence_hash for outcome in self.outcomes if outcome.sequence_hash}
         return tuple(known.get(seed) for seed in self.seeds)
 
@@ -317,5 +312,4 @@ class Comparison:
 
 
 def in_order(outcomes: Iterable[Outcome], estimators: Sequence[str], seeds: Sequence[int]) -> tuple[Outcome, ...]:
-    """Return outcomes by estimator, then seed, whatever the order they came in."""
     return tuple(sorted(outcomes, key=lambda o: (estimators.index(o.estimator), seeds.index(o.seed))))

@@ -55,7 +55,6 @@ class Trial(NamedTuple):
         return cls(estimator, tuple(sorted((changes or {}).items())), struck, frozenset(keep))
 
     def __str__(self) -> str:
-        """Return what differs from the plan, apart from the estimator."""
         settings = [f"{key}={value}" for key, value in self.changes]
         faults = [f"fault:{name}={dose:g}" for name, dose in self.faults]
         return " ".join([*settings, *faults, *(f"keep:{name}" for name in sorted(self.keep))])

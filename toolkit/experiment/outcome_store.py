@@ -54,7 +54,6 @@ class UnitKey(Struct, frozen=True, kw_only=True):
     versions: Annotated[dict[str, str], Meta(description="of Python and of the packages that compute")]
 
     def text(self) -> bytes:
-        """Return the key in one form, for a mapping."""
         return msgspec.json.encode(self, order="deterministic")
 
 
@@ -149,7 +148,6 @@ class Conditions:
     own: Mapping[str, str] = field(default_factory=dict)
 
     def key(self, unit: Unit) -> UnitKey:
-        """Return everything that the outcome of a unit depends on."""
         return UnitKey(
             data=self.data,
             seed=unit.seed,
@@ -274,7 +272,6 @@ class OutcomeStore:
 
 
 def trajectory_file(unit: Unit, output: Output) -> str:
-    """Return where in a run directory the trajectory of a unit's output is kept."""
     return f"{_TRAJECTORIES}/seed-{unit.seed}/{plain_name(unit.estimator)}_{output}.tum"
 
 

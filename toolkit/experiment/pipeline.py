@@ -250,7 +250,6 @@ def _units(plan: Plan, case: Prepared, entries: Mapping[str, EstimatorEntry]) ->
 
 
 def located(source: str | Recorded) -> str | Recorded:
-    """Return a path as an absolute path, anything else unchanged."""
     if isinstance(source, Recorded) or is_built_in(source):
         return source
     return str(Path(source).expanduser().absolute())

@@ -64,7 +64,6 @@ class Paired:
 
     @property
     def interval(self) -> "Interval":
-        """Return the mean with its 95 % interval by Student's t."""
         reach = float(stdtrit(self.n - 1, 1.0 - LEVEL / 2.0)) * self.error
         return Interval(self.mean, self.mean - reach, self.mean + reach)
 
@@ -166,7 +165,6 @@ class MeanNees:
 
     @property
     def in_band_percent(self) -> float:
-        """Share of the frames with a mean at which it is in its band."""
         known = self.runs > 0
         return 100.0 * float(np.mean((self.mean >= self.low)[known] & (self.mean <= self.high)[known]))
 
@@ -177,7 +175,6 @@ class MeanNees:
 
 
 def spread_of(values: Iterable[float]) -> Spread | None:
-    """Return mean, median and spread of values, or None where there are none."""
     given = np.array(list(values), dtype=float)
     if not given.size:
         return None

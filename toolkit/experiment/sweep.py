@@ -91,7 +91,6 @@ class Axis:
 
     @property
     def points(self) -> tuple["Point", ...]:
-        """Return the points at which this axis alone is varied."""
         return tuple(((self.name, value),) for value in self.values)
 
     @property
@@ -145,7 +144,6 @@ class Sweep:
 
     @property
     def estimators(self) -> tuple[str, ...]:
-        """Return the estimators as they were named."""
         return tuple(dict.fromkeys(trial.estimator for trial in self.grid.outcomes))
 
     @cached_property
@@ -155,7 +153,6 @@ class Sweep:
 
     @property
     def over_seeds(self) -> bool:
-        """Say whether intervals are over seeds, not over stretches of one recording."""
         return len(self.grid.plan.seeds) > 1
 
     @cached_property
@@ -164,7 +161,6 @@ class Sweep:
 
     @cached_property
     def breaking(self) -> tuple[Breaking, ...]:
-        """Where estimators break, by axis of faults, side and estimator."""
         return tuple(
             self._breaking(name, axis, side)
             for axis in self.axes
@@ -301,7 +297,6 @@ def _over_stretches(clean: Row, row: Row, key: str) -> Interval | None:
 
 
 def _nees(row: Row) -> Interval | None:
-    """Return the NEES over seeds, or over the stretches of one run."""
     if len(row.outcomes) > 1:
         known = [value for value in row.good_values(NEES) if value]
         return mean_interval(np.log(known)).exp() if known else None

@@ -46,12 +46,10 @@ class Unit:
 
     @property
     def requested(self) -> Recording:
-        """Return the recording as it is asked for."""
         return self.recording.recording if isinstance(self.recording, Prepared) else self.recording
 
 
 def no_stretches() -> Array:
-    """Return errors over no stretch (40,): NaN."""
     return np.full(STRETCHES, np.nan)
 
 

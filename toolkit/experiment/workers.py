@@ -84,14 +84,12 @@ class WorkerProcess:
         return future
 
     def end(self) -> None:
-        """End the process, whatever it is doing."""
         if self._executor is not None:
             self._executor.shutdown(wait=True, kill_workers=True)
             self._executor = None
 
 
 def how_it_ended(error: BrokenProcessPool) -> str:
-    """Return how a process ended, from loky's message."""
     named = re.search(r"exit codes of the workers are \{(\w+)\((-?\d+)\)", str(error))
     if named is None:
         return "ended"
@@ -233,7 +231,6 @@ class _HandingOut(Generic[R]):
             self._waiting.clear()
 
     def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | LostUnit], None, None]:
-        """Yield the place and the result of each task as it is there, and call ``meanwhile`` while there is none."""
         died = []
         for _ in self._tasks:
             while True:

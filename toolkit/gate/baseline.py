@@ -184,7 +184,6 @@ def _matters(name: str, release: str) -> list[str]:
 
 
 def releases_in_a_name() -> str:
-    """Return the installed releases as part of a file name."""
     return "_".join(f"{name}-{'.'.join(_matters(name, release))}" for name, release in installed_releases().items())
 
 

@@ -58,7 +58,6 @@ class CaseVerdicts:
 def check_case(
     case: Case, before: Measured, now: Measured, bounds: BoundsRecord, terms: CheckTerms = USUAL_TERMS
 ) -> CaseVerdicts:
-    """Judge one case on the terms given."""
     collected = CaseVerdicts()
     if wrong := now.unreadable or _other_measurements(case, before, now):
         collected.verdicts.append(_missing(case, "", "sequence", wrong))
@@ -134,7 +133,6 @@ class _Sides:
             self._tell("status", "moved", words)
 
     def check_metrics(self) -> None:
-        """Judge every metric where both sides ended well."""
         ends = zip(self.before.status, self.now.status, strict=True)
         usable = [i for i, (was, is_) in enumerate(ends) if was == is_ == "ok"]
         if not usable:

@@ -105,12 +105,10 @@ class Repeats(Compared):
 
     @property
     def change(self) -> float:
-        """Return the change of the mean logarithm."""
         return float(log_of(self.after).mean() - log_of(self.before).mean())
 
     @property
     def still(self) -> float:
-        """Return the change, as a log ratio, that is no movement."""
         return self.criterion.margin
 
     @property
@@ -129,15 +127,12 @@ class Repeats(Compared):
         return float(np.sqrt(total)), dof
 
     def moved_p(self) -> float:
-        """Return the p-value of having changed by more than the margin, two-sided."""
         return min(1.0, 2.0 * min(self._beyond_p(1.0), self._beyond_p(-1.0)))
 
     def worse_p(self) -> float:
-        """Return the p-value of having grown by more than the margin."""
         return self._beyond_p(1.0)
 
     def detectable(self, rate: float) -> float:
-        """Return the excess over a margin, as a log ratio, that one test at ``rate`` finds with 95 % power."""
         error, dof = self.error_and_dof
         return float(stdtrit(dof, 1.0 - rate) + stdtrit(dof, POWER)) * error
 

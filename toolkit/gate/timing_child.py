@@ -55,7 +55,6 @@ class Timer:
         return {}
 
     def run(self, requested: Json) -> Json:
-        """Run an estimator over the recording; return its seconds of processor time, and how it ended."""
         from toolkit import runner
         from toolkit.progress import SILENT
         from toolkit.registry import find
@@ -67,7 +66,6 @@ class Timer:
 
 
 def main() -> None:
-    """Answer requests until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # nothing that is printed shall look like an answer
