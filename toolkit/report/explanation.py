@@ -21,7 +21,6 @@ from toolkit.report.results_folder import Results, Shown
 from toolkit.report.text import (
     MISSING,
     Table,
-    TextPart,
     number,
 )
 from toolkit.settings import changes_of
@@ -355,13 +354,8 @@ def _cells(effect: ContributionRecord, keys: Sequence[str]) -> Iterator[str]:
 
 
 def _shown_as(found: ExplanationRecord) -> Shown:
-    pairs = (
-        f"{part.ingredient}: {'; '.join(f'{one.less} and {one.more}' for one in part.effects) or 'none'}"
-        for part in found.parts
-    )
     title = f"From {found.gap.less} to {found.gap.more} on {found.sequence.name}"
-    more = (TextPart("Pairs that differ in one ingredient", tuple(pairs)),)
-    return Shown(title, found.words, explanation_table(found), found.figures, found.files, more)
+    return Shown(title, found.words, explanation_table(found), found.figures, found.files)
 
 
 EXPLANATIONS = Results("explain.json", "explain.md", read_explanation, _shown_as)

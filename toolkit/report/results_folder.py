@@ -19,13 +19,11 @@ from toolkit.files.writing import check_replaceable, replaced_directory, with_fo
 from toolkit.report.html import card
 from toolkit.report.text import (
     Table,
-    TextPart,
     Width,
     as_markdown,
     as_text,
     filled,
     in_markdown,
-    parts_as_markdown,
 )
 
 if TYPE_CHECKING:
@@ -57,14 +55,13 @@ def take_over(file: Path, place: Path) -> None:
 
 
 class Shown(NamedTuple):
-    """What a document says: title, words, table, captions by figure, files, and what only its Markdown has."""
+    """What a document says: title, words, table, captions by figure, and files."""
 
     title: str
     words: str
     table: Table
     figures: Mapping[str, str]
     files: tuple[str, ...]
-    more: tuple[TextPart, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class Results(Generic[Record]):
         shown = self.shown(record)
         figures = (f"![{in_markdown(said)}]({name})\n\n{in_markdown(said)}" for name, said in shown.figures.items())
         parts = (f"# {in_markdown(shown.title)}", in_markdown(shown.words), as_markdown(shown.table), *figures)
-        return "\n\n".join([*parts, *parts_as_markdown(shown.more)]) + "\n"
+        return "\n\n".join(parts) + "\n"
 
     def section(self, directory: Path) -> str:
         """Return the section of the page for a folder; raises DataError where its document or a figure is missing."""

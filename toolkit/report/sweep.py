@@ -20,7 +20,6 @@ from toolkit.report.results_folder import Results, Shown
 from toolkit.report.text import (
     MISSING,
     Table,
-    TextPart,
     cell,
     number,
     unit_of,
@@ -188,28 +187,8 @@ def _under(sweep: SweepRecord) -> Iterator[str]:
         yield f"{axis.name}{f' [{axis.unit}]' if axis.unit else ''}: {axis.meaning}"
 
 
-def _whole_table(sweep: SweepRecord) -> Table:
-    metric = metric_of(sweep)
-    unit = unit_of(metric, [effect.error for effect in sweep.effects])
-    heads = ("over", "value", "estimator", "ok", f"error [{unit.name}]", "over clean", "withheld tracks over clean")
-    rows = tuple(
-        (
-            *(_named(effect.at) if effect.at else ("clean", "")),
-            effect.estimator,
-            f"{effect.ok} of {effect.runs}",
-            cell(effect.error, metric, unit),
-            *map(in_words, (effect.over_clean, effect.held_out, effect.nees)),
-            MISSING if effect.cpu_ms is None else number(effect.cpu_ms),
-        )
-        for effect in sweep.effects
-    )
-    return Table(tuple((head, "", "") for head in (*heads, "NEES pose", "CPU frame [ms]")), rows, labels=3)
-
-
 def _shown_as(sweep: SweepRecord) -> Shown:
-    more = (TextPart("Every point", _whole_table(sweep)),)
-    title = f"Sweep of {sweep.sequence.name}"
-    return Shown(title, sweep.about, sweep_table(sweep), sweep.figures, sweep.files, more)
+    return Shown(f"Sweep of {sweep.sequence.name}", sweep.about, sweep_table(sweep), sweep.figures, sweep.files)
 
 
 SWEEPS = Results("sweep.json", "sweep.md", read_sweep, _shown_as)
