@@ -14,7 +14,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.measurements import NS_PER_S
-from toolkit.metrics import Scores, known_metrics
+from toolkit.metrics import Scores, known_metrics, metrics_called
 from toolkit.noise import MeasuredNoise, MotionScale, TrackWeight
 from toolkit.registry import discover
 from toolkit.report import text as texts
@@ -28,10 +28,11 @@ from toolkit.report.comparison_table import (
     shown_metrics,
 )
 from toolkit.report.comparison_text import comparison_text, report_text
+from toolkit.report.evaluation import best_of
 from toolkit.report.messages import note_lines
 from toolkit.report.records import read_manifest
 from toolkit.report.run_directory import MadeBy, write_run
-from toolkit.report.text import Table, as_markdown, as_text, heading, number, unit_of, unrivalled
+from toolkit.report.text import Table, as_markdown, as_text, heading, number, unit_of
 from toolkit.sequence import Provenance
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import SCENARIOS, simulate
@@ -129,10 +130,9 @@ def test_a_column_of_lengths_is_in_millimetres_where_most_are_short_and_none_is_
 
 
 def test_what_rounding_makes_equal_is_not_the_best() -> None:
-    assert unrivalled([(0.00355, "3.55"), (0.00371, "3.71")]) == "3.55"
-    assert unrivalled([(0.003551, "3.55"), (0.003553, "3.55"), (0.00371, "3.71")]) is None
-    assert unrivalled([(0.00355, "3.55"), (0.00355, "3.55")]) == "3.55"
-    assert unrivalled([]) is None
+    columns = ([0.00355, 0.00371], [0.003551, 0.003553, 0.00371], [0.00355, 0.00355], [None, 0.1], [0.1], [])
+    (metric,) = metrics_called(("ate_se3_m",))
+    assert [best_of(values, metric) for values in columns] == [{0}, set(), {0, 1}, {1}, set(), set()]
 
 
 def test_the_report_has_the_audit_the_start_and_the_facts(comparison: Comparison) -> None:

@@ -135,8 +135,8 @@ def verify(options: argparse.Namespace) -> int:
     """
     from toolkit.cli.progress_display import of_this_process
     from toolkit.files.documents import to_text
+    from toolkit.report.comparison_text import verification_text
     from toolkit.report.text import width_of_output
-    from toolkit.report.verify_text import verification_text
     from toolkit.verify import subject_of, verify
 
     subject = subject_of(options.estimator)

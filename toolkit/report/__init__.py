@@ -4,6 +4,6 @@ Reading order: text -> comparison_table, messages -> comparison_text -> scores, 
 (each JSON document with the function that fills it; records lists all of them) -> run_directory, which writes and reads
 a run directory. curves has what is drawn; figures/ draws it, html/ makes
 the page of run directories. differences compares two, export passes one on. sweep and explanation have all
-that shows one, results_folder writes their folders. gate, evaluation, verify_text and citations show the results of
+that shows one, results_folder writes their folders. gate, evaluation and citations show the results of
 other commands.
 """

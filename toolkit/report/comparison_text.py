@@ -1,9 +1,10 @@
-"""A comparison as text: as it is printed, and as ``report.md``; and the findings of an audit alone.
+"""A comparison as text: as it is printed, and as ``report.md``; the findings of an audit, and a verification, alone.
 
 Below the table stand the verdict and the most harmful notes; the report has everything needed to read the table.
 """
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from toolkit.audit import Audit
 from toolkit.errors import printable
@@ -34,6 +35,9 @@ from toolkit.report.text import (
     markdown_section,
     section,
 )
+
+if TYPE_CHECKING:
+    from toolkit.verify import VerificationRecord
 
 # Notes below the printed table; the report has all.
 _MOST_NOTES = 3
@@ -153,3 +157,16 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     elif findings and not audited.undecided:
         lines += ["", "no fault is left that invalidates a result"]
     return "\n".join(lines)
+
+
+def verification_text(verification: "VerificationRecord", width: Width = WIDTH) -> str:
+    rows = tuple((check.name, check.result) for check in verification.checks)
+    lines = [as_text(Table((("promise",), ("result",)), rows, labels=2)), ""]
+    for check in verification.checks:
+        if check.result == "failed":
+            lines += [filled(f"{check.name}: {check.found}", width), filled(check.remedy, width, "  to do: "), ""]
+        elif check.found:
+            lines += [filled(f"{check.name}: {check.found}", width), ""]
+    failed = sum(check.result == "failed" for check in verification.checks)
+    verdict = "keeps every promise" if not failed else f"breaks {failed} of {len(verification.checks)} promises"
+    return "\n".join([*lines, f"{verification.estimator} {verdict}"])

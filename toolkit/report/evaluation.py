@@ -50,7 +50,6 @@ from toolkit.report.text import (
     parts_as_markdown,
     parts_as_text,
     unit_of,
-    unrivalled,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ _OF_ORIENTATION = (
     *("ate_none_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent"),
     *("kitti_r_deg_per_m", "end_drift_percent"),
 )
-# What a terminal shows of long lists; evaluation.json has all.
+# What is told of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
 EVALUATION = "evaluation.json"
@@ -118,7 +117,7 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
         values = [cell(medians[metric][i], metric, units[metric]) for metric in metrics]
         rows.append((standing.estimator, f"{standing.ok} of {standing.runs}", *counts, quartiles, *values))
     before = len(heads) - len(metrics)
-    best = {(i, before + j) for j, metric in enumerate(metrics) for i in _best(medians[metric], metric)}
+    best = {(i, before + j) for j, metric in enumerate(metrics) for i in best_of(medians[metric], metric)}
     return Table(tuple(heads), tuple(rows), labels=1, best=frozenset(best))
 
 
@@ -130,12 +129,14 @@ def _quartiles_of(
     return evaluation.cells[standing.estimator, evaluation.sequences[0]].metrics.get(metric.key)
 
 
-def _best(medians: list[float | None], metric: Metric) -> set[int]:
+def best_of(medians: list[float | None], metric: Metric) -> set[int]:
     """Return which median is best, or are: none of one alone, nor where another that prints alike is worse."""
     costs: Mapping[str, Callable[[float], float]] = {"least": float, "most": lambda v: -v, "one": lambda v: abs(v - 1)}
-    known = [(costs[metric.best](v), i) for i, v in enumerate(medians) if v is not None] if metric.best else []
-    text = unrivalled((cost, number(medians[i] or 0.0)) for cost, i in known) if len(medians) > 1 else None
-    return {i for _, i in known if number(medians[i] or 0.0) == text}
+    known = [(costs[metric.best](v), i, number(v)) for i, v in enumerate(medians) if v is not None and metric.best]
+    least = min(known, default=None)
+    if least is None or len(medians) < 2 or any(cost != least[0] for cost, _, text in known if text == least[2]):
+        return set()
+    return {i for _, i, text in known if text == least[2]}
 
 
 def sequences_table(evaluation: EvaluatedSystems) -> Table:
@@ -146,7 +147,7 @@ def sequences_table(evaluation: EvaluatedSystems) -> Table:
     for i, sequence in enumerate(evaluation.sequences):
         cells = [evaluation.cells[system, sequence] for system in systems]
         rows.append((sequence, *(_median_and_failures(one, metric, unit) for one in cells)))
-        best |= {(i, 1 + j) for j in _best([one.median(metric) for one in cells], metric)}
+        best |= {(i, 1 + j) for j in best_of([one.median(metric) for one in cells], metric)}
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
@@ -232,13 +233,12 @@ def _paired_line(test: PairedRecord, pairs: int, metric: Metric) -> str:
     )
 
 
-def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURES) -> Iterator[str]:
+def failure_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     failed = [run for run in evaluation.runs if run.status != "ok"]
-    shown = failed if most is None else failed[:most]
-    for run in shown:
+    for run in failed[:_MOST_FAILURES]:
         yield f"{run.estimator}, {run.sequence}, {run.run}: {run.log[0]}"
-    if len(shown) < len(failed):
-        yield f"{len(failed) - len(shown)} more runs failed; evaluation.json and --format csv have all"
+    if len(failed) > _MOST_FAILURES:
+        yield f"{len(failed) - _MOST_FAILURES} more runs failed; evaluation.json and --format csv have all"
 
 
 def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
@@ -266,9 +266,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         yield f"{listed(metric.key for metric in METRICS if metric.key in keys)}{whose}: {text}"
 
 
-def _parts(
-    evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), most: int | None = _MOST_FAILURES
-) -> Iterator[TextPart]:
+def _parts(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> Iterator[TextPart]:
     """Yield what is told of an evaluation: tables, then what is more than chance, what failed and what to know."""
     yield TextPart("Leaderboard", leaderboard_table(evaluation, columns))
     if len(evaluation.sequences) > 1:
@@ -276,7 +274,7 @@ def _parts(
     if (stated := uncertainty_table(evaluation)) is not None:
         yield TextPart(_UNCERTAINTY, stated)
     yield TextPart("Pairs", tuple(paired_lines(evaluation)))
-    yield TextPart("Fails", tuple(failure_lines(evaluation, most)))
+    yield TextPart("Fails", tuple(failure_lines(evaluation)))
     yield TextPart("Notes", tuple(note_lines(evaluation)))
 
 
@@ -363,11 +361,10 @@ def leaderboard_page(evaluation: EvaluatedSystems, figures: Mapping[Path, str]) 
     if len(evaluation.sequences) > 3:
         title += f" and {len(evaluation.sequences) - 3} more"
     cards = [card("On which terms", header_lines(evaluation))]
-    for name, body in _parts(evaluation, most=None):
+    for name, body in _parts(evaluation):
         if body:
-            cards.append(
-                card(name.capitalize(), table=body) if isinstance(body, Table) else card(name.capitalize(), body)
-            )
+            lines, table = ((), body) if isinstance(body, Table) else (body, None)
+            cards.append(card(name.capitalize(), lines, table))
     cards += [card("Figures", figures=figures)] if figures else []
     parts = {"title": in_html(title), "style": source("style.css"), "cards": "\n".join(cards)}
     return filled_page("leaderboard.html", parts)

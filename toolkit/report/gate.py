@@ -234,11 +234,13 @@ def _add_suite(root: ElementTree.Element, sequence: str, verdicts: tuple[Verdict
     for verdict in verdicts:
         who = printable(".".join(filter(None, (sequence, verdict.estimator, verdict.output))))
         case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
+        cells = zip(_NUMBERS, _row(verdict)[len(_LABELS) :], strict=True)
+        numbers = "\n".join(f"{name} {cell} {unit}".rstrip() for (name, _, unit), cell in cells if cell != MISSING)
         message = printable(f"{about(verdict)}: {verdict.words}") if verdict.words else ""
         if verdict.fails:
-            ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = _numbers(verdict)
+            ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = numbers
         elif message:
-            ElementTree.SubElement(case, "system-out").text = f"{message}\n{_numbers(verdict)}"
+            ElementTree.SubElement(case, "system-out").text = f"{message}\n{numbers}"
 
 
 def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
@@ -246,25 +248,11 @@ def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
     return {"tests": str(len(verdicts)), "failures": str(failures), "errors": "0", "skipped": "0"}
 
 
-def _numbers(verdict: Verdict) -> str:
-    numbers = {
-        "before": verdict.before,
-        "now": verdict.after,
-        "change in percent": verdict.change_percent,
-        "allowed in percent": verdict.allowed_percent,
-        "p, adjusted": verdict.p,
-        "detects, in percent": verdict.seen_percent,
-    }
-    return "\n".join(f"{name}: {value:.7g}" for name, value in numbers.items() if value is not None)
-
-
 WRITERS: Mapping[str, Callable[[Check], str]] = {
     "junit": gate_junit,
     "markdown": gate_markdown,
     "json": lambda check: to_text(check_document(check)),
 }
-
-
 # How the file of each kind begins.
 BEGINNINGS: Mapping[str, str] = {"junit": "<", "markdown": "#", "json": "{"}
 

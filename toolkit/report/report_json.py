@@ -54,7 +54,8 @@ class _Columns(Struct, frozen=True, kw_only=True):
     """Columns of one table: of equal length, which decoding checks."""
 
     def __post_init__(self) -> None:
-        _check_lengths({name: column for name, column in asdict(self).items() if name != "band"})
+        columns = asdict(self).items()
+        _check_lengths({name: column for name, column in columns if isinstance(column, tuple) and name != "band"})
 
 
 def _check_lengths(columns: dict[str, Sized]) -> None:
@@ -138,16 +139,13 @@ class DrawnRun(Struct, frozen=True, kw_only=True):
     ] = UNSET
 
 
-class StepTimes(Struct, frozen=True, kw_only=True):
+class StepTimes(_Columns, frozen=True, kw_only=True):
     """The wall clock of an estimator's steps."""
 
     estimator: str
     t_s: Times
     step_ms: Numbers
     finish_s: float | None
-
-    def __post_init__(self) -> None:
-        _check_lengths({"t_s": self.t_s, "step_ms": self.step_ms})
 
 
 class DrawnMap(Struct, frozen=True, kw_only=True):

@@ -175,18 +175,6 @@ def number(value: float, digits: int = DIGITS) -> str:
     return f"{value:.{max(0, digits - 1 - exponent)}f}"
 
 
-def unrivalled(costs: Iterable[tuple[float, str]]) -> str | None:
-    """Return how the least of costs prints, or None where another that prints alike is not equal to it.
-
-    Given are a cost and its text for each cell of a column.
-    """
-    known = list(costs)
-    least = min(known, default=None)
-    if least is None or any(cost != least[0] for cost, text in known if text == least[1]):
-        return None
-    return least[1]
-
-
 def as_text(table: Table) -> str:
     """Return the table with aligned columns, words to the left and numbers to the right; nothing is wrapped or cut.
 
