@@ -9,7 +9,6 @@ import pytest
 from toolkit import runner
 
 Vislam = Callable[..., int]
-RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
 ENDLESS = "n" * 300
 # Seven poses on a bend, so that they can be fitted to others.
 POSES = "".join(f"{k}.0 {k} {k * k} 0 0 0 {k / 20} {(1 - k * k / 400) ** 0.5}\n" for k in range(7))
@@ -24,32 +23,26 @@ WRONG: list[tuple[str, int, str]] = [
     ("compair", 2, "did you mean compare?"),
     ("compare --max-frames 1", 2, "at least 2"),
     ("compare --max-frames many", 2, "expected a whole number, at least 2, not 'many'"),
-    ("compare --seed -1", 2, "at least 0"),
     ("compare drive --workers 100000", 2, "at most 1024"),
     ("compare --estimators ,", 2, "expected names separated by commas"),
     ("compare drive flight --truth gt.tum", 2, "exactly one sequence"),
     ("compare drive --no-repair --keep time-gap", 2, "not allowed with"),
     ("compare drive --json --quiet", 2, "not allowed with"),
-    ("verify ekf --json --quiet", 2, "not allowed with"),
     # Names that are misspelt get the nearest.
     ("compare drive --max 10", 2, "there is no option --max; did you mean --max-frames? (see vislam compare --help)"),
     ("compare drive --max-frames 9 batch", 2, "unexpected argument batch (see"),
     ("compare drive --estimators EKF", 5, "did you mean ekf?"),
     ("compare drive --estimators dead-reckoning,oracle", 5, "no estimator is called oracle"),
-    ("compare Drive", 3, "did you mean drive?"),
     ("compare drive --start Truth", 2, "did you mean truth?"),
-    ("compare drive --keep time_gap", 2, "did you mean time-gap?"),
     ("compare drive --keep stale", 2, "did you mean stale-frames?"),
     ("compare drive --keep tim", 2, "did you mean time-order, time-gap or time-offset?"),
     ("compare drive --columns ate_se3", 2, "no metric is called ate_se3; did you mean ate_se3_m?"),
-    ("simulate drive_imu --out d", 2, "did you mean drive-imu?"),
     ("list cameras", 2, "estimators, metrics, faults"),
     ("cite mscf", 5, "no estimator or format is called mscf"),
     # Settings, and files of them.
     ("compare drive --set window.lag=3", 2, "there is no setting window.lag; did you mean window.lag_s?"),
     ("compare drive --set window.lag_s", 2, "--set takes KEY=VALUE"),
     ("compare drive --set window.most_states=0", 2, "window.most_states: expected integer >= 1"),
-    ("compare drive --window 1e-9", 2, "window.lag_s: expected number >= 0.001"),
     ("compare drive --set estimators.ekff.gain=1", 5, "did you mean ekf?"),
     ("compare drive --estimators ekf --set estimators.ekf.gain=2", 5, "estimator ekf has no option gain"),
     ("compare drive --config sound.toml --set window.lag=3", 2, "sound.toml or the command line: there is no setting"),
@@ -68,9 +61,6 @@ WRONG: list[tuple[str, int, str]] = [
         for option, text in (
             ("--window 3", "window.lag_s=2"),
             ("--outliers gate", "outliers.policy=robust"),
-            ("--seed 1", "first_seed=2"),
-            ("--tracks images", "frontend.tracks=auto"),
-            ("--topics imu=/a", "frontend.topics=imu=/b"),
             ("--columns bound", "metrics.bound=false"),
             ("--set window.lag_s=1", "window.lag_s=2"),
         )
@@ -93,7 +83,6 @@ WRONG: list[tuple[str, int, str]] = [
     ("compare run", 3, "is a run directory and no recording: vislam report shows it, and --config run/manifest.json"),
     ("compare drive --truth missing.tum", 3, "missing.tum"),
     ("compare kitti00 --seeds 2", 3, "kitti00 is the same under every seed"),
-    (f"compare {RECORDING} --seeds 2", 3, "drive_small is the same under every seed"),
     ("compare drive --seeds 2 --truth gt.tum", 2, "exclude each other"),
     ("compare drive --workers 2 --scheduler tcp://host:8786", 2, "exclude each other"),
     ("compare drive --trajectory gt.tum", 2, "expected NAME=FILE"),
@@ -108,7 +97,6 @@ WRONG: list[tuple[str, int, str]] = [
     ("simulate flight --out d --images --blur 50", 2, "expected milliseconds from 0 to 40"),
     ("simulate drive --out d --images", 2, "flight has"),
     ("tracks drive --out x", 3, "drive: holds no images"),
-    ("tracks nowhere --out x", 3, "no such file"),
     ("tracks nowhere --out x --set frontend.window=9", 2, "did you mean frontend.window_px?"),
     ("report", 2, "RUN_DIR"),
     ("report t", 3, "t is not a run directory"),
@@ -146,11 +134,9 @@ WRONG: list[tuple[str, int, str]] = [
     (f"{CHECK} --speed-against HEAD", 2, "with --trajectories nothing runs"),
     # Outputs that cannot be written.
     ("compare drive --estimators dead-reckoning --out taken", 4, "taken exists and is not a directory"),
-    ("compare drive --estimators dead-reckoning --out taken/run", 4, "taken/run"),
     (f"compare drive --estimators dead-reckoning --out {ENDLESS}", 4, "File name too long"),
     # Of a word of thousands of letters both ends are told.
     (f"diff {ENDLESS * 20} run", 3, "nnn...nnn"),
-    (f"compare drive --workers {ENDLESS * 20}", 2, "nnn...nnn"),
     (f"cite {ENDLESS}", 5, "or name a run directory"),
 ]
 

@@ -62,14 +62,6 @@ def is_broken(unit, progress):
 def tells_threads(unit, progress):
     return tuple(os.environ[name] for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
 
-def holds_much(unit, progress):
-    if len(kept) == 1:
-        time.sleep(1.1)  # memory is looked at once a second
-    kept.append(b"x" * (350_000_000 if len(kept) == 1 else 1))
-    return os.getpid()
-
-kept = []
-
 def names_its_process(unit, progress):
     time.sleep(0.02 * (unit.estimator == "ekf"))
     return os.getpid()
@@ -181,13 +173,6 @@ def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(jobs, work,
     assert by_place(jobs((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
-
-
-def test_a_process_with_much_memory_goes_on_without_a_message(jobs, work, recwarn):
-    """Where psutil is there, loky takes a recording held in memory for a leak, says so and begins the process anew."""
-    pytest.importorskip("psutil")
-    assert len(set(by_place(jobs((0, 1, 2, 3)), 2, work.holds_much))) <= 2
-    assert not recwarn.list
 
 
 def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_have_other_work(jobs, work):

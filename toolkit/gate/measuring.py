@@ -35,11 +35,13 @@ from toolkit.gate.baseline import COVERAGE, BoundsRecord, Case, Measured, Series
 from toolkit.geometry import Array
 from toolkit.progress import Progress, ProgressFor
 from toolkit.registry import find
-from toolkit.sequence import Sequence
 from toolkit.settings import Settings
 
 DATA_ROOT = "VISLAM_DATA"
-# Of a fingerprint: significant digits that are hashed, and hexadecimal digits of the hash that are kept.
+# A fingerprint is a hash that survives another processor's rounding: a simulation differs there in its last bits, since
+# numeric libraries choose other instructions. Of the content rounded to so many digits of each array's largest value so
+# many hexadecimal digits are kept: with a chance below 1e-4 a sequence it is another one for the same content, and any
+# other change of a measurement by more than one part in a million shows.
 _DIGITS, _LENGTH = 6, 16
 _UPDATES, _JOINT, _SAMPLES, _POSES = 30, 20, 1500, 100
 
@@ -119,18 +121,7 @@ def timed(unit: Unit, progress: Progress) -> TimedOutcome:
     outcome = replace(outcome_of(run, prepared.sequence, unit.seed), run=None)
     timings = run.timings if run.status in ("ok", "diverged") else None  # one that failed ended early
     speed = None if timings is None else timings.cpu_s / reference
-    return TimedOutcome(outcome, speed, fingerprint(prepared.sequence))
-
-
-def fingerprint(sequence: Sequence) -> str:
-    """Return a hash of what an estimator can see and of the truth that survives another processor's rounding.
-
-    The same simulation differs in its last bits from one processor to the next, since numeric libraries choose other
-    instructions there; its content hash then differs in everything. The same content rounded to six digits of each
-    array's largest value has another hash with a chance below 1e-4 a sequence, and any other change of a measurement by
-    more than one part in a million shows.
-    """
-    return sequence.content_hash(_DIGITS)[:_LENGTH]
+    return TimedOutcome(outcome, speed, prepared.sequence.content_hash(_DIGITS)[:_LENGTH])
 
 
 def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], absent: dict[str, str]) -> Measured:
