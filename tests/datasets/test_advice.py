@@ -927,7 +927,7 @@ _WRITTEN_ANEW = re.compile(r"^(copy|export|save|make) .*(again|whole (export|rec
 ELSEWHERE = {
     "add noise to the twists for a meaningful comparison": "a fact",
     "do not rely on figures against it": "a fact",
-    "check that calib.txt is of images of this size": "a fact",
+    "check that calib.txt is of them": "a fact",
     "change its permissions": "whoever may read everything, as in a container, is never told so",
     "check the program that wrote them": "another program",
     "convert it with ros2 bag convert or rosbag decompress, or install a newer rosbags": "another program",

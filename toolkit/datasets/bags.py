@@ -123,17 +123,12 @@ def _read(
 
 def _why_no_pairs(chosen: Chosen, listed: Listed, motion: MotionSamples) -> str:
     if not listed.pairs:
-        return (
-            f"no image of {chosen['left'].name} has one of {chosen['right'].name} within 1 ms ({listed.stamps} left "
-            "ones); a stereo pair is taken at one instant: synchronise the cameras, or correct the stamps"
-        )
-    moved = chosen.get("imu") or chosen.get("twist")
+        sides = f"no image of {chosen['left'].name} has one of {chosen['right'].name} within 1 ms"
+        return f"{sides} ({listed.stamps} left ones); synchronise the cameras, or correct the stamps"
     ranges = ((listed.pairs[0].t_ns, listed.pairs[-1].t_ns), (int(motion.t_ns.min()), int(motion.t_ns.max())))
     images, measured = (f"{first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s" for first, last in ranges)
-    return (
-        f"by their stamps the images are of {images} and {moved.name if moved else 'the motion'} of {measured}: two "
-        "clocks; stamp both by one, or name another topic with --topics imu=TOPIC"
-    )
+    remedy = "stamp both by one, or name another topic with --topics imu=TOPIC"
+    return f"by their stamps the images are of {images} and the motion of {measured}: two clocks; {remedy}"
 
 
 def _as_filmed(camera: Mounted, pairs: Sequence[StampedPair], frontend: Frontend) -> Mounted:
@@ -146,10 +141,8 @@ def _as_filmed(camera: Mounted, pairs: Sequence[StampedPair], frontend: Frontend
     calibrated, as_they_are = (matched_corners(pairs, rig, frontend) for rig in (camera.pair, camera.as_they_are))
     if as_they_are <= _CLEARLY * calibrated:
         return camera
-    fact = (
-        f"the images are rectified already: {as_they_are} corners have the same row in both as they are, and "
-        f"{calibrated} once rectified by the calibration"
-    )
+    rows = f"{as_they_are} corners have the same row in both as they are, and {calibrated} once rectified"
+    fact = f"the images are rectified already: {rows} by the calibration"
     return replace(camera, pair=camera.as_they_are, facts=(*camera.facts, fact))
 
 
@@ -172,10 +165,8 @@ def _truth(source: Recorded) -> tuple[Truth | None, tuple[str, ...]]:
     elif T_child_body is not None:
         T_world_child = T_world_child @ T_child_body
     elif child and child != body:
-        remarks.append(
-            f"the truth's poses are of {child!r}, which no transform connects to {body!r}: they are assumed to be the "
-            "body's"
-        )
+        unknown = f"the truth's poses are of {child!r}, which no transform connects to {body!r}"
+        remarks.append(f"{unknown}: they are assumed to be the body's")
     return Truth(t_ns[kept], T_world_child), tuple(remarks)
 
 
@@ -214,15 +205,10 @@ def _twists(source: Recorded) -> TwistSamples:
     path, topic = source.path, source.chosen.get("twist")
     if topic is None:
         others = ", ".join(one.name for one in _usable(source.topics, ROLES["twist"]))
-        remedy = (
-            f"name one with --topics twist=TOPIC ({others})"
-            if others
-            else f"{_RECORD_ONE}; {_there_are(source.topics)}"
-        )
-        raise DataError(
-            f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry that can be read, so nothing measures the motion; "
-            f"{remedy}"[:_LONGEST]
-        )
+        remedy = f"{_RECORD_ONE}; {_there_are(source.topics)}"
+        remedy = f"name one with --topics twist=TOPIC ({others})" if others else remedy
+        why = "no sensor_msgs/Imu and no nav_msgs/Odometry that can be read, so nothing measures the motion"
+        raise DataError(f"{path}: {why}; {remedy}"[:_LONGEST])
     messages = _messages_of(source, topic)
     values = [message.value for message in messages]
     linear, angular = (ros.columns(values, part) for part in ros.VECTORS[topic.type])
@@ -257,10 +243,8 @@ def _measured(source: Recorded, topic: Topic, what: str) -> tuple[IntArray, Arra
     # A covariance of -1 says that a value is absent.
     if not values.any() or getattr(messages[0].value, f"{part}_covariance").ravel()[0] == -1.0:
         apart = "the accelerometer's topic with --topics accel=TOPIC, " if what == "acceleration" else ""
-        raise DataError(
-            f"{source.path}: {topic.name} measures no {what} (its values are 0 or marked as absent); name {apart}"
-            f"{_NAME_ANOTHER}"
-        )
+        why = f"measures no {what} (its values are 0 or marked as absent)"
+        raise DataError(f"{source.path}: {topic.name} {why}; name {apart}{_NAME_ANOTHER}")
     return ros.stamps_ns(messages), values
 
 
@@ -572,14 +556,12 @@ def mounted(source: Recorded, motion: MotionSamples) -> Mounted:
 
 
 def _not_joined(source: Recorded) -> str:
-    used = source.chosen.values()
-    others = ", ".join(one.name for one in _usable(source.topics, (ros.IMU,)) if one not in used)
-    other = f", or name another Imu with --topics imu=TOPIC ({others})" if others else ""
+    frames = f"{source.body!r} and {source.frame_of(source.chosen['left'])!r}"
+    others = [one.name for one in _usable(source.topics, (ros.IMU,)) if one not in source.chosen.values()]
+    other = f", or name another Imu with --topics imu=TOPIC ({', '.join(others)})" if others else ""
     tf = "/tf_static and no fixed transform of /tf" if _transforms(source.topics, _MOVING) else "/tf_static"
-    return (
-        f"{source.path}: the camera's pose on the body is unknown: no {tf} connects the frames "
-        f"{source.body!r} and {source.frame_of(source.chosen['left'])!r}; {_PUT_BESIDE}{other}"
-    )
+    why = f"the camera's pose on the body is unknown: no {tf} connects the frames {frames}"
+    return f"{source.path}: {why}; {_PUT_BESIDE}{other}"
 
 
 def _calibration_folder(path: Path) -> tuple[Path, Path] | None:
@@ -609,9 +591,7 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
     # How far right each camera is of the origin of the rectified axes; 0 where nothing is stated.
     left_m, right_m = (-float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0 for P in projections)
     pinhole_px, baseline_m = pinhole_of(projections[0]), right_m - left_m
-    T_right_left = source.tree.between(
-        *(source.frame_of(one) for one in (source.chosen["right"], source.chosen["left"]))
-    )
+    T_right_left = source.tree.between(*(source.frame_of(source.chosen[side]) for side in ("right", "left")))
     # As ROS says it in the last words of a topic's name.
     if any(_RECTIFIED in word for word in source.chosen["left"].name.split("/")[-2:]):
         if not baseline_m > 0.0 and T_right_left is not None:
@@ -619,10 +599,8 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
         if not (baseline_m > 0.0 and pinhole_px[0] > 0.0):
             lacks = "no baseline (Tx is 0), and no /tf_static joins the two cameras"
             lacks = lacks if pinhole_px[0] > 0.0 else "no focal length"
-            raise DataError(
-                f"{what[1]}: the images are rectified, and P states {lacks}; correct P, or {_PUT_BESIDE} and name the "
-                "raw images"
-            )
+            remedy = f"correct P, or {_PUT_BESIDE} and name the raw images"
+            raise DataError(f"{what[1]}: the images are rectified, and P states {lacks}; {remedy}")
         # The frame of an image is the camera's own; R turns it into the rectified one's.
         return replace(already_rectified(pinhole_px, baseline_m, size_px), R_rect_cam=R_rect_left), None, how
     left, right = (camera(info, text) for info, text in zip(infos, what, strict=True))
@@ -637,17 +615,14 @@ def _pair(source: Recorded) -> tuple[RectifiedPair, RectifiedPair | None, str]:
 
 
 def _infos(source: Recorded) -> tuple[list[Topic], list[Any]]:
-    chosen, topics, infos = source.chosen, [], []
-    for image, topic in ((chosen["left"], chosen.get("left_info")), (chosen["right"], chosen.get("right_info"))):
-        messages = source.of(topic)
-        if topic is None or not messages:
-            raise DataError(
-                f"{source.path}: there is no sensor_msgs/CameraInfo beside {image.name}; name it with --topics "
-                f"left_info=TOPIC,right_info=TOPIC, or {_PUT_BESIDE}"
-            )
-        infos.append(messages[0].value)
-        topics.append(topic)
-    return topics, infos
+    found = {side: source.chosen.get(f"{side}_info") for side in ("left", "right")}
+    for side, topic in found.items():
+        if not source.of(topic):
+            lacking = f"there is no sensor_msgs/CameraInfo beside {source.chosen[side].name}"
+            remedy = f"name it with --topics left_info=TOPIC,right_info=TOPIC, or {_PUT_BESIDE}"
+            raise DataError(f"{source.path}: {lacking}; {remedy}")
+    topics = [topic for topic in found.values() if topic is not None]
+    return topics, [source.of(topic)[0].value for topic in topics]
 
 
 # Trajectories --------------------------------------------------------------------------------------------------------

@@ -216,13 +216,12 @@ def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
     if not all(_BORDER < place < 1.0 - _BORDER for place in places):
         remedy = "where these were scaled or cut, do the same to P0 to P3"
         raise DataError(f"{file}: its principal point, {centre}, is not that of images of {size}; {remedy}")
-    facts = (
-        f"the principal point, {centre}, is far from the middle of images of {size}: check that calib.txt is of images "
-        "of this size",
+    remark = (
+        f"the principal point, {centre}, is far from the middle of images of {size}: check that calib.txt is of them"
     )
     T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
     is_aside = all(abs(place - 0.5) > _ASIDE for place in places)
-    return _Mounted(pair, T_FLU_CAM @ T_cam0_left, facts if is_aside else ())
+    return _Mounted(pair, T_FLU_CAM @ T_cam0_left, (remark,) if is_aside else ())
 
 
 def _listed_by_number(layout: _Layout) -> Listed:

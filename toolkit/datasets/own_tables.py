@@ -199,9 +199,7 @@ def _imu_samples(table: Columns, t_ns: IntArray, columns: tuple[str, ...]) -> tu
     joined = joined_imu((t_ns[of_gyro], values[of_gyro, 3:]), (t_ns[of_accel], values[of_accel, :3]))
     if joined is None:
         raise DataError(f"{table.what}: accelerometer and gyro have no time in common; correct the stamps of one")
-    counts = (
-        f"{int(of_accel.sum())} samples of the accelerometer are interpolated at the {joined.t_ns.size} of the gyro"
-    )
+    counts = f"{of_accel.sum()} samples of the accelerometer are interpolated at the {joined.t_ns.size} of the gyro"
     return joined, (f"{counts}: each has rows of its own",)
 
 

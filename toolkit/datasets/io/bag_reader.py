@@ -190,15 +190,11 @@ def _parts(folder: Path) -> list[Path]:
     numbers = sorted(int(found[1]) for bag in bags if (found := _PART.search(bag.stem)))
     if len(bags) == 1 or (of_ros1 and numbers == list(range(len(bags)))):
         return bags
-    remedy = (
-        "if they are parts of one recording, let their names end in _0, _1 and so on, as rosbag record --split does"
-        if of_ros1
-        else "run ros2 bag reindex on the folder"
-    )
+    of_split = "if they are parts of one recording, let their names end in _0, _1 and so on"
+    remedy = of_split if of_ros1 else "run ros2 bag reindex on the folder"
     names = printable(", ".join(bag.name for bag in bags))[:200]
-    raise DataError(
-        f"{folder}: holds {len(bags)} bags and no {_METADATA} that joins them: {names}; name one of them, or {remedy}"
-    )
+    held = f"{len(bags)} bags and no {_METADATA} that joins them: {names}"
+    raise DataError(f"{folder}: holds {held}; name one of them, or {remedy}")
 
 
 def _reader(kind: Kind | None) -> Any:
@@ -237,10 +233,9 @@ def _guarded(path: Path) -> Iterator[None]:
     except Exception as error:
         why = printable(" ".join(str(error).split()))[:200] or type(error).__name__
         if _NOT_SUPPORTED in why:
-            raise DataError(
-                f"{path}: rosbags does not read such a bag ({why.removesuffix('; please report issue.')}); convert it "
-                "with ros2 bag convert or rosbag decompress, or install a newer rosbags"
-            ) from error
+            remedy = "convert it with ros2 bag convert or rosbag decompress, or install a newer rosbags"
+            why = why.removesuffix("; please report issue.")
+            raise DataError(f"{path}: rosbags does not read such a bag ({why}); {remedy}") from error
         of_folder = path.is_file() and _of_rosbag2(path.parent / _METADATA)
         remedy = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _REMEDY
         raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {remedy}") from error
@@ -324,10 +319,8 @@ def image_file(message: Any, what: str) -> tuple[str, bytes]:
         return ".png", content
     if content.startswith(_JPEG):
         return ".jpg", content
-    raise DataError(
-        f"{what}: compressed images are {printable(str(message.format))[:50]}, expected PNG or JPEG; republish them as "
-        "one of these, or as raw images"
-    )
+    kind, remedy = printable(str(message.format))[:50], "republish them as one of these, or as raw images"
+    raise DataError(f"{what}: compressed images are {kind}, expected PNG or JPEG; {remedy}")
 
 
 # Where messages have their vectors, by type: of an IMU rates and specific force, of others linear and angular velocity.

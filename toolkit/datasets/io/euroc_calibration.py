@@ -204,10 +204,8 @@ def _check_camchain(fields: Fields) -> None:
     if not any(key.startswith("cam1.") for key in fields.arrays):
         raise DataError(f"{fields.path}: holds one camera, and stereo needs two; calibrate cam0 and cam1 together")
     if "cam0.intrinsics" in fields and "cam0.T_cam_imu" not in fields:
-        raise DataError(
-            f"{fields.path}: has no cam0.T_cam_imu, so it is of cameras alone; take the camchain that Kalibr writes "
-            "when it calibrates cameras and IMU"
-        )
+        remedy = "take the camchain that Kalibr writes when it calibrates cameras and IMU"
+        raise DataError(f"{fields.path}: has no cam0.T_cam_imu, so it is of cameras alone; {remedy}")
     fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
 
 

@@ -230,16 +230,14 @@ def _rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
 
 
 def _facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
-    used = tracks.t_ns.size
-    a_frame = np.bincount(tracks.frame, minlength=used)
-    facts = [
-        f"stereo tracks made of {used} image pairs with OpenCV: {a_frame.mean():.0f} a frame, {a_frame.min()} at least"
-    ]
-    if tracks.skipped:
-        named = ", ".join(tracks.skipped[:_NAMED])
-        more = f" and {len(tracks.skipped) - _NAMED} more" if len(tracks.skipped) > _NAMED else ""
-        facts.append(f"{len(tracks.skipped)} of {pairs} image pairs could not be used and are left out: {named}{more}")
-    return tuple(facts)
+    a_frame = np.bincount(tracks.frame, minlength=tracks.t_ns.size)
+    made = f"stereo tracks made of {tracks.t_ns.size} image pairs with OpenCV"
+    counted = f"{made}: {a_frame.mean():.0f} a frame, {a_frame.min()} at least"
+    if not tracks.skipped:
+        return (counted,)
+    named, others = ", ".join(tracks.skipped[:_NAMED]), len(tracks.skipped) - _NAMED
+    lost = f"{len(tracks.skipped)} of {pairs} image pairs could not be used and are left out: {named}"
+    return counted, f"{lost} and {others} more" if others > 0 else lost
 
 
 def _side(camera: Path) -> _Side:
