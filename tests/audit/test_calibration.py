@@ -192,24 +192,6 @@ def test_a_right_image_that_hardly_any_parallax_shows_is_not_decidable() -> None
         assert why in (hidden(SelfCalibration(np.zeros(COMMON), cov, 1), "imu") or "")
 
 
-@pytest.mark.parametrize(
-    "plant, dose, scenario, duration_s, why",
-    [
-        (faults.rolled_right, 0.01, FLIGHT, 8.0, "rolled about its optical axis by +0.01"),
-        (faults.rolled_right, -0.01, DRIVE_IMU, 12.0, "rolled about its optical axis by -0.0"),
-        (faults.rolled_right, 0.01, DRIVE, 12.0, "rolled about its optical axis by +0.0"),
-        (faults.shifted_right, -1.0, FLIGHT_REALISTIC, 8.0, "the right image's columns are -0.98"),
-        (faults.shifted_right, 1.0, DRIVE, 12.0, "the right image's columns are +"),
-    ],
-)
-def test_a_right_image_that_is_not_rectified_is_reported(
-    plant: faults.Fault, dose: float, scenario: Scenario, duration_s: float, why: str
-) -> None:
-    sound = recorded(scenario, 31, duration_s)
-    assert "miscalibration" not in unrepaired(sound)
-    assert why in unrepaired(plant(sound, dose, 31))["miscalibration"]
-
-
 @pytest.mark.parametrize("scenario", [FLIGHT, FLIGHT_REALISTIC, DRIVE], ids=lambda scenario: scenario.name)
 def test_standard_errors_are_honest_also_where_the_errors_of_tracks_are_correlated(scenario: Scenario) -> None:
     count, duration_s = (8, 12.0) if scenario is DRIVE else (12, 4.0)
@@ -284,16 +266,6 @@ def test_a_position_counts_beyond_what_sound_recordings_have_and_four_standard_e
     assert "0.7 m along x, 0.7 m along y, 0.7 m along z would not show" in unseen.why
 
 
-def test_a_displaced_camera_is_reported_once_and_one_in_its_place_or_that_hardly_turns_is_not() -> None:
-    displaced = unrepaired(faults.displaced_camera(recorded(FLIGHT, 6, 8.0), 0.25, 6))
-    assert list(displaced) == ["lever-arm"]
-    # From frame to frame these five sound seconds have it 0.2 m off, by eight of its standard errors.
-    assert lever_arm(Evidence(recorded(FLIGHT_REALISTIC, 515, 5.0, varied=True))) is None
-    straight = audit(recorded(DRIVE_IMU, 6, 6.0)).undecided
-    assert "too little rotation" in straight["lever-arm"]
-    assert "too little change of velocity" in straight["vision-scale"]
-
-
 def test_beside_odometry_scale_and_position_are_measured_within_their_errors() -> None:
     sound = recorded(DRIVE, 5, 20.0)
     faulty = faults.displaced_camera(faults.stretched_disparity(sound, 1.1), 0.5, 1)
@@ -337,21 +309,10 @@ def test_a_scale_that_the_recording_hardly_shows_says_how_large_a_fault_it_hides
     assert "would not show" in audit(faults.stretched_disparity(sound, 1.02)).undecided["vision-scale"]
 
 
-def test_beside_odometry_a_wrong_focal_length_is_found_and_the_windows_that_turn_are_taken() -> None:
-    sound = recorded(DRIVE, 61, 12.0, varied=True)
-    assert audit(sound).findings == ()
-    for dose in (0.9, 1.1):
-        fit = f"tracks and odometry fit fx_px = {sound.rig.fx_px / 100.0:.0f}"
-        assert fit in unrepaired(faults.wrong_focal_length(sound, dose))["miscalibration"]
+def test_beside_odometry_the_windows_that_turn_are_taken() -> None:
     assert "fx off by" in audit(recorded(DRIVE, 0, 5.0)).undecided["miscalibration"]
     # The scenario goes straight ahead for most of a minute: windows that are spread know fx to one percent.
     assert fitted(recorded(DRIVE, 0, 60.0)).error[0] < 0.003
-
-
-def test_a_clock_is_checked_by_all_that_tracks_and_imu_tell() -> None:
-    """From rotations alone these five sound seconds have an offset of 7 ms, beyond five standard errors."""
-    sound = simulate(replace(FLIGHT_REALISTIC, duration_s=5.0, varied=True), 501)
-    assert "time-offset" not in {finding.fault for finding in audit(sound).findings}
 
 
 def test_a_turned_camera_is_no_late_one() -> None:

@@ -73,15 +73,6 @@ def test_what_is_beyond_the_bound_of_chance_is_so_as_rarely_as_it_says(stretches
     assert beyond <= 2000 * LEVEL + 3.0 * np.sqrt(2000 * LEVEL)  # three standard deviations of a count of two
 
 
-def test_few_stretches_have_a_bound_and_many_are_not_loosened_by_it() -> None:
-    error, formal = np.array([0.002]), np.array([0.002])
-    two, ten = (chance_bound(error, formal, stretches)[0] for stretches in (2.0, 10.0))
-    assert two < 0.05  # by their own scatter two stretches have none
-    assert ten == pytest.approx(
-        4.781 * 0.002, rel=1e-3
-    )  # Student's t of nine degrees of freedom, 0.0005 on either side
-
-
 def test_errors_are_independent_only_where_five_standard_errors_leave_no_other_correlation() -> None:
     """The correlation is -1/2 for independent errors, and above -1/4 where a random walk has twice their variance."""
     assert errors_are_independent(Scalar(-0.45, 0.039))

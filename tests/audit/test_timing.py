@@ -58,14 +58,6 @@ def test_a_frame_and_a_sample_that_are_there_twice_are_repeats_and_not_a_jump() 
     assert found["time-order"].count == 2 and "sorted by time" in found["time-order"].detail
 
 
-def test_stamps_that_tremble_together_are_no_jumps() -> None:
-    sound, rng = recording("drive"), np.random.default_rng(1)
-    late_ns = np.rint(rng.normal(0.0, 0.02e9, sound.frame_count)).astype(np.int64)
-    stamps = np.interp(sound.motion.t_ns, sound.frames_t_ns, sound.frames_t_ns + late_ns).astype(np.int64)
-    motion = sound.motion.of(stamps, sound.motion.values)
-    assert clock_jump(Evidence(replace(sound, frames_t_ns=sound.frames_t_ns + late_ns, motion=motion))) is None
-
-
 def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_reported() -> None:
     """What its tracks move by is noise, of which every interval has as much, however long it is."""
     standing = faults.standstill(recording("drive", 1, 6.0), 6.0, 1)

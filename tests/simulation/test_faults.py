@@ -8,7 +8,6 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.geometry import so3_exp
-from toolkit.measurements import NS_PER_S
 from toolkit.models.stereo import CHANNELS, triangulate
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -25,10 +24,6 @@ NOT_RUNNABLE = {"nan_span", "clock_jump"}
 @pytest.fixture(scope="module")
 def drive() -> Sequence:
     return simulate(replace(SCENARIOS["drive"], duration_s=6.0), 0)
-
-
-def seen_at_s(sequence: Sequence) -> np.ndarray:
-    return (sequence.frames_t_ns[sequence.observations.frame] - sequence.frames_t_ns[0]) / NS_PER_S
 
 
 @pytest.mark.parametrize("name", INJECTORS)
@@ -50,12 +45,6 @@ def test_what_remains_can_be_run(name: str, drive: Sequence) -> None:
     check_runnable(INJECTORS[name](drive, seed=1))
 
 
-def test_faults_are_composed_by_calling_one_after_the_other(drive: Sequence) -> None:
-    both = faults.camera_clock(faults.few_tracks(drive, 3, 0), 0.25, 0)
-    assert np.bincount(both.observations.frame).max() <= 3
-    assert both.frames_t_ns[0] == drive.frames_t_ns[0] + NS_PER_S // 4
-
-
 def test_a_rolled_right_camera_sees_what_one_turned_about_its_optical_axis_sees(drive: Sequence) -> None:
     rig, uv_px = drive.rig, drive.observations.uv_px
     rolled = faults.rolled_right(drive, 0.02, 0).observations.uv_px
@@ -73,30 +62,6 @@ def test_a_blackout_ends_every_track(drive: Sequence) -> None:
     assert empty.size == 10
     seen = dark.observations
     assert np.intersect1d(seen.track_id[seen.frame < empty[0]], seen.track_id[seen.frame > empty[-1]]).size == 0
-
-
-def test_outlier_tracks_begin_where_they_were_and_slide(drive: Sequence) -> None:
-    moved = faults.outlier_tracks(drive, 0.3, 0).observations.uv_px - drive.observations.uv_px
-    _, first = np.unique(drive.observations.track_id, return_index=True)
-    assert not moved[first].any()
-    np.testing.assert_allclose(moved[:, 0], moved[:, 1], atol=1e-9)  # the disparity stays, but for rounding
-    later = np.setdiff1d(np.arange(len(moved)), first)
-    assert moved[later].any(axis=1).mean() == pytest.approx(0.3, abs=0.1)
-
-
-def test_moving_points_keep_their_height_over_the_road_and_move_for_a_third_of_the_time(drive: Sequence) -> None:
-    before, after = drive.observations, faults.moving_objects(drive, 1.0, 0).observations
-    seen_s = seen_at_s(faults.moving_objects(drive, 1.0, 0))
-    key = {(f, t): uv for f, t, uv in zip(before.frame, before.track_id, before.uv_px, strict=True)}
-    moved = np.array(
-        [not np.allclose(key[f, t], uv) for f, t, uv in zip(after.frame, after.track_id, after.uv_px, strict=True)]
-    )
-    assert np.ptp(seen_s[moved]) == pytest.approx(drive.duration_s / 3.0, abs=0.3)  # but for the first sightings in it
-    depth_and_row = [
-        (uv[2] - drive.rig.cy_px) / (uv[0] - uv[1]) - (key[f, t][2] - drive.rig.cy_px) / (key[f, t][0] - key[f, t][1])
-        for f, t, uv in zip(after.frame, after.track_id, after.uv_px, strict=True)
-    ]
-    assert np.allclose(depth_and_row, 0.0, atol=1e-9)
 
 
 def test_few_tracks_last_as_long_as_they_did(drive: Sequence) -> None:
@@ -136,14 +101,6 @@ def test_a_walk_grows_with_the_root_of_the_age_and_an_offset_stays(drive: Sequen
     off_px = (faults.match_offset(drive, 0.7, 1).observations.uv_px - seen.uv_px) @ CHANNELS.T
     assert np.abs(off_px - off_px[first][row]).max() < 1e-9
     assert off_px[first].std(axis=0) == pytest.approx([0.0, 0.7, 0.0], rel=0.1, abs=1e-9)
-
-
-def test_a_mismatch_persists_to_the_end_of_its_track(drive: Sequence) -> None:
-    seen = drive.observations
-    away_px = faults.persistent_mismatch(drive, 0.3, 2).observations.uv_px - seen.uv_px
-    for track in np.unique(seen.track_id[away_px[:, 2] != 0.0]):
-        steps = np.diff(away_px[seen.track_id == track], axis=0)
-        assert np.count_nonzero(np.abs(steps).max(axis=1) > 1e-9) <= 1
 
 
 def test_moving_objects_move_a_share_of_the_tracks_and_keep_their_first_sightings(drive: Sequence) -> None:
