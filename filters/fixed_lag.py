@@ -51,8 +51,8 @@ class LagWindow(Protocol):
     def values(self) -> gtsam.Values:
         """Return the latest values of the window."""
 
-    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
-        """Return the joint marginal of some variables of the window."""
+    def cov(self, keys: list[int]) -> Array:
+        """Return the joint covariance of the variables of a state of the window, in GTSAM's tangent spaces."""
 
     def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
         """Recover from the refusal of a covariance; raise it again where nothing helps."""
@@ -103,12 +103,13 @@ class FixedLag:
     def _state(self, k: int) -> Estimate:
         """Return a state of the window as it was last read, with the covariance the window has for it."""
         state = self._builder.motion.read(self._values, k, self._stamps_ns[k])
-        motion, R_world_imu = self._builder.motion, state.T_world_imu[:3, :3]
+        motion = self._builder.motion
         try:
-            return replace(state, cov=motion.state_cov(self._tree, k, R_world_imu))
+            cov = self._tree.cov(motion.keys(k))
         except RuntimeError as refusal:
             self._note(self._tree.rebuilt_by_qr(refusal))
-            return replace(state, cov=motion.state_cov(self._tree, k, R_world_imu))
+            cov = self._tree.cov(motion.keys(k))
+        return replace(state, cov=motion.estimate_cov(cov, state.T_world_imu[:3, :3]))
 
     def _read(self, packet: Packet) -> Estimate:
         """Read the window's landmarks and return its newest state; states that have left keep their last values."""

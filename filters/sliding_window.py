@@ -5,26 +5,40 @@ it. Its mean and its covariance are never computed again, but it is linearised a
 past is in a Kalman filter; `fixed-lag` keeps the linearisation points instead. States leave before a frame corrects,
 and a frame is iterated to convergence, so that the window of the newest state alone is the iterated filter (Bell &
 Cathey 1993). Two options say what that Gaussian is: the coordinates in which it is one, and whether its covariances
-between the state and the landmarks are kept. Answers are read as in `fixed-lag`.
+between the state and the landmarks are kept. Answers are read as in `fixed-lag`. Landmarks that are not in the Gaussian
+are eliminated as in `smart`; the rest of the system is dense.
 """
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple, cast
 
 import gtsam
 import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
 
 from filters.fixed_lag import FixedLag
 from filters.kalman.coordinates import inverse_depth, inverse_depth_jacobian
 from filters.kalman.thinning import Thinned
 from filters.smoothing.graph_builder import GraphExtension
-from filters.smoothing.indeterminate import LAST, Recovery, variable_named
+from filters.smoothing.indeterminate import Recovery
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import Array, se3_inverse, se3_right_jacobian, skew, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_right_jacobian, skew, transform
 from toolkit.measurements import NS_PER_S
-from toolkit.models.factors import L, kind_of, linear_factor, ordering_of
+from toolkit.models.factors import L, kind_of
+from toolkit.models.motion import motion_model
+from toolkit.models.stereo_adjustment import (
+    Eliminated,
+    Evaluated,
+    ReducedVision,
+    RobustCamera,
+    Sightings,
+    StereoWindow,
+    lower_factor,
+    without,
+)
 from toolkit.settings import Scalar
 
 CITES = ("sibley2010sliding", "bell1993iterated", "gtsam")
@@ -52,7 +66,6 @@ WITHOUT = {
 _NEGLIGIBLE = 0.5
 _MOST_STEPS, _MOST_HALVINGS = 10, 6
 _UNSOLVED = "the last step in the window was longer than one standard deviation; further such windows are not listed"
-_UNIT = gtsam.noiseModel.Unit.Create(1)
 
 
 def build(setup: Setup) -> Estimator:
@@ -61,25 +74,66 @@ def build(setup: Setup) -> Estimator:
     coordinates: dict[Scalar, Coordinates] = {"invariant": InBody(setup.rig.T_imu_cam), "latest": Coordinates()}
     kept: dict[Scalar, Kept] = {True: whole, False: without_cross_covariances}
     chosen = setup.choice("marginals", coordinates), setup.choice("cross_covariances", kept)
-    return Thinned(setup, FixedLag(setup, lag_s, SlidingWindow(round(lag_s * NS_PER_S), *chosen)))
+    return Thinned(setup, FixedLag(setup, lag_s, SlidingWindow(setup, round(lag_s * NS_PER_S), *chosen)))
+
+
+class Blocks(NamedTuple):
+    """The Jacobian (n, n) of errors of a state and M landmarks, in which a landmark's error involves no other landmark.
+
+    ``state`` (n, d) are the columns of the state, ``points`` (M, 3, 3) the blocks of the landmarks; n = d + 3M.
+    """
+
+    state: Array
+    points: Array
+
+    def after(self, matrix: Array) -> Array:
+        """Return the product (m, n) of a matrix (m, n) and this one."""
+        d = self.state.shape[1]
+        of_points = matrix[:, d:].reshape(len(matrix), -1, 3).swapaxes(0, 1) @ self.points
+        return np.hstack([matrix @ self.state, of_points.swapaxes(0, 1).reshape(len(matrix), -1)])
+
+    def carry(self, information: Array, vector: Array) -> tuple[Array, Array]:
+        """Return an information matrix (n, n) and vector (n,) of the errors as those of what they are errors of."""
+        return self.after(self.after(information).T), self.after(vector[None])[0]
+
+    def inverse(self) -> "Blocks":
+        """Return the inverse."""
+        d, points = self.state.shape[1], np.asarray(np.linalg.inv(self.points))
+        of_state = np.linalg.inv(self.state[:d])
+        below = points @ self.state[d:].reshape(-1, 3, d)
+        return Blocks(np.vstack([of_state, -below.reshape(-1, d) @ of_state]), points)
+
+
+class Place(NamedTuple):
+    """A state, its keys in the order pose, (velocity,) bias, and landmarks (M, 3) m in the world."""
+
+    keys: tuple[int, ...]
+    state: gtsam.Values
+    points: Array
+
+    @classmethod
+    def of(cls, window: StereoWindow, points: Array) -> "Place":
+        """Return the oldest state of a window, and points."""
+        return cls(window.keys[0], window.values.extract(list(window.keys[0])), points)
 
 
 class Coordinates:
     """What the errors of a Gaussian on one state and some landmarks are measured in: here GTSAM's own tangent spaces.
 
-    Velocities and landmarks are in the axes of the world. Keys are in the order pose, (velocity,) bias, landmarks.
+    Velocities and landmarks are in the axes of the world.
     """
 
-    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
-        """Return the errors (n,) of values against others, and their Jacobian (n, n) in GTSAM's tangent spaces.
+    def errors(self, at: Place, now: Place) -> tuple[Array, Blocks]:
+        """Return the errors (n,) of a place against another, and their Jacobian in GTSAM's tangent spaces.
 
         Here the identity, which it is to first order.
         """
-        error = np.asarray(at.localCoordinates(values).vector(keys))
-        return error, np.eye(error.size)
+        of_state = np.asarray(at.state.localCoordinates(now.state).vector(list(now.keys)))
+        error = np.concatenate([of_state, (now.points - at.points).ravel()])
+        return error, Blocks(np.eye(error.size, of_state.size), np.tile(np.eye(3), (len(at.points), 1, 1)))
 
-    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
-        """Take note that the Gaussian is on another state from now on; ``landmarks`` are all that are in it then."""
+    def pass_on(self, T_new_old: Array, track_ids: IntArray) -> None:
+        """Take note that the Gaussian is on another state from now on; ``track_ids`` are all landmarks in it then."""
 
 
 @dataclass
@@ -94,224 +148,310 @@ class InBody(Coordinates):
     T_imu_cam: Array
     _anchors: dict[int, Array] = field(default_factory=dict)
 
-    def errors(self, at: gtsam.Values, values: gtsam.Values, keys: list[int]) -> tuple[Array, Array]:
-        """Return the errors (n,) and their exact Jacobian (n, n)."""
-        before, after = at.atPose3(keys[0]).matrix(), values.atPose3(keys[0]).matrix()
-        error = np.asarray(at.localCoordinates(values).vector(keys))
-        to_body, H = after[:3, :3].T, np.eye(error.size)
-        H[:6, :6] = np.linalg.inv(se3_right_jacobian(error[:6]))
-        if kind_of(keys[1]) == "v":
-            v_body = to_body @ values.atVector(keys[1])
-            error[6:9] = v_body - before[:3, :3].T @ at.atVector(keys[1])
-            H[6:9, :3], H[6:9, 6:9] = skew(v_body), to_body
-        landmarks = [key for key in keys if kind_of(key) == "l"]
-        if landmarks:
-            first, anchors = error.size - 3 * len(landmarks), np.array([self._anchors[key] for key in landmarks])
-            seen = transform(se3_inverse(after), np.array([values.atPoint3(key) for key in landmarks]))
-            old = transform(se3_inverse(before), np.array([at.atPoint3(key) for key in landmarks]))
-            to_anchors = se3_inverse(anchors)
-            now, then = transform(to_anchors, seen), transform(to_anchors, old)
-            error[first:] = (inverse_depth(now) - inverse_depth(then)).reshape(-1)
-            by_seen = inverse_depth_jacobian(now) @ to_anchors[:, :3, :3]
-            H[first:, :3], H[first:, 3:6] = (by_seen @ skew(seen)).reshape(-1, 3), -by_seen.reshape(-1, 3)
-            for i, by_point in enumerate(by_seen @ to_body):
-                H[first + 3 * i : first + 3 * i + 3, first + 3 * i : first + 3 * i + 3] = by_point
-        return error, H
+    def errors(self, at: Place, now: Place) -> tuple[Array, Blocks]:
+        """Return the errors (n,) and their exact Jacobian."""
+        pose, velocity, *_ = now.keys
+        error, H = super().errors(at, now)
+        before, after = at.state.atPose3(pose).matrix(), now.state.atPose3(pose).matrix()
+        d, to_body = H.state.shape[1], after[:3, :3].T
+        H.state[:6, :6] = np.linalg.inv(se3_right_jacobian(error[:6]))
+        if kind_of(velocity) == "v":
+            v_body = to_body @ now.state.atVector(velocity)
+            error[6:9] = v_body - before[:3, :3].T @ at.state.atVector(velocity)
+            H.state[6:9, :3], H.state[6:9, 6:9] = skew(v_body), to_body
+        to_anchors = se3_inverse(np.array(list(self._anchors.values())).reshape(-1, 4, 4))
+        seen, old = transform(se3_inverse(after), now.points), transform(se3_inverse(before), at.points)
+        seen_there = transform(to_anchors, seen)
+        error[d:] = (inverse_depth(seen_there) - inverse_depth(transform(to_anchors, old))).ravel()
+        by_seen = inverse_depth_jacobian(seen_there) @ to_anchors[:, :3, :3]
+        H.state[d:, :3], H.state[d:, 3:6] = (by_seen @ skew(seen)).reshape(-1, 3), -by_seen.reshape(-1, 3)
+        return error, Blocks(H.state, by_seen @ to_body)
 
-    def pass_on(self, old: gtsam.Pose3, new: gtsam.Pose3, landmarks: Sequence[int]) -> None:
+    def pass_on(self, T_new_old: Array, track_ids: IntArray) -> None:
         """Leave the cameras where they are in the world; landmarks that are new were seen first from the old state."""
-        T_new_old = new.between(old).matrix()
-        self._anchors = {key: T_new_old @ self._anchors.get(key, self.T_imu_cam) for key in landmarks}
+        self._anchors = {i: T_new_old @ self._anchors.get(i, self.T_imu_cam) for i in track_ids.tolist()}
 
 
 class Gaussian(NamedTuple):
-    """A Gaussian of errors e (n,) in some coordinates about values.
+    """A Gaussian of errors e (n,) in some coordinates about a place: ``e^T information e / 2 - vector^T e``."""
 
-    The residuals ``root e - told`` have unit covariance: ``root`` is (m, n), ``told`` (m,).
-    """
-
-    keys: list[int]
-    at: gtsam.Values
-    root: Array
-    told: Array
+    track_ids: IntArray
+    at: Place
+    information: Array
+    vector: Array
     coordinates: Coordinates
 
-    def linear(self, values: gtsam.Values) -> gtsam.GaussianFactor:
-        """Return the factor linearised at some values."""
-        error, H = self.coordinates.errors(self.at, values.extract(self.keys), self.keys)
-        sizes = self.at.dims()
-        columns = np.split(self.root @ H, np.cumsum([sizes[key] for key in self.keys])[:-1], axis=1)
-        return linear_factor(list(zip(self.keys, columns, strict=True)), self.told - self.root @ error)
-
-    def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares."""
-        error, _ = self.coordinates.errors(self.at, values.extract(self.keys), self.keys)
-        return 0.5 * float(np.square(self.root @ error - self.told).sum())
+    def error(self, errors: Array) -> float:
+        """Return half the sum of squares of errors (n,), up to a constant."""
+        return float((0.5 * self.information @ errors - self.vector) @ errors)
 
 
 Kept = Callable[[Array, Array, int], tuple[Array, Array]]
-"""Changes a Gaussian, given by its root (m, n) and what it told (m,); the first ``size`` errors are the state's."""
+"""Changes a Gaussian, given by its information (n, n) and vector (n,); the first ``size`` errors are the state's."""
 
 
-def whole(root: Array, told: Array, size: int) -> tuple[Array, Array]:
+def whole(information: Array, vector: Array, size: int) -> tuple[Array, Array]:
     """Return the Gaussian as it is."""
-    return root, told
+    return information, vector
 
 
-def without_cross_covariances(root: Array, told: Array, size: int) -> tuple[Array, Array]:
+def without_cross_covariances(information: Array, vector: Array, size: int) -> tuple[Array, Array]:
     """Return the Gaussian as if state and landmarks were independent; raise EstimatorError if it is singular."""
-    information = root.T @ root
     try:
-        cov, mean = np.linalg.inv(information), np.linalg.solve(information, root.T @ told)
-        cov[:size, size:], cov[size:, :size] = 0.0, 0.0
-        root = np.linalg.inv(np.linalg.cholesky(cov))
+        root = lower_factor(information)
     except np.linalg.LinAlgError as refusal:
         raise EstimatorError(
             "what left the window does not determine its state and landmarks, so their cross-covariances cannot be "
             "left out: set cross_covariances to true, or a larger noise"
         ) from refusal
-    return root, root @ mean
+    solved = cho_solve((root, True), np.column_stack([np.eye(len(vector)), vector]), check_finite=False)
+    result, mean = np.zeros_like(information), solved[:, -1]
+    for part in (slice(size), slice(size, len(vector))):
+        result[part, part] = np.linalg.inv(solved[part, part])
+    return result, result @ mean
+
+
+class Tried(NamedTuple):
+    """A window evaluated, its error with that of a Gaussian on its oldest state, and these errors with Jacobian."""
+
+    here: Evaluated
+    error: float
+    off: Array
+    H: Blocks | None
+
+    @classmethod
+    def of(cls, window: StereoWindow, camera: RobustCamera, left: Gaussian | None, tied: IntArray) -> "Tried":
+        """Evaluate a window; ``tied`` are the rows of the Gaussian's landmarks in it."""
+        here = Evaluated.of(window, camera)
+        if left is None:
+            return cls(here, here.error, np.zeros(0), None)
+        off, H = left.coordinates.errors(left.at, Place.of(window, window.points[tied]))
+        return cls(here, here.error + left.error(off), off, H)
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The normal equations (n, n), (n,) of a window of K states with d errors each.
+
+    The unknowns are all poses, the velocities and biases of the oldest and of the newest state, and the landmarks
+    ``tied`` to more than sightings. Velocities and biases between, which the motion alone involves, were eliminated
+    (``between``), and so were all other landmarks. ``places`` (K d,) are, before the landmarks, the unknowns' places in
+    the order of time, eliminated ones first.
+    """
+
+    information: Array
+    vector: Array
+    places: IntArray
+    between: Eliminated
+    vision: ReducedVision
+    tied: IntArray
+
+    @classmethod
+    def of(cls, tried: Tried, left: Gaussian | None, tied: IntArray) -> "Equations":
+        """Linearise a window and a Gaussian on its oldest state and on the first of the landmarks that are tied."""
+        here, keys, d = tried.here, tried.here.window.keys, tried.here.window.size
+        count, vision = len(keys), here.vision.reduced(tied)
+        order = [*(key for of_one in keys[1:-1] for key in of_one[1:]), *(of_one[0] for of_one in keys)]
+        order += [key for of_one in keys[:1] + keys[1:][-1:] for key in of_one[1:]]
+        place = np.arange(count * d).reshape(count, d)
+        ends = place[[0, -1] if count > 1 else [0], 6:]
+        places = np.concatenate([place[1:-1, 6:].ravel(), place[:, :6].ravel(), ends.ravel()])
+        of_states, vector, between = without(*here.of_motion(order), place[1:-1, 6:].size)
+        poses, first = 6 * count, len(vector)
+        across = vision.coupling.reshape(poses, -1, 3)[:, tied].reshape(poses, -1)
+        information = np.zeros((first + across.shape[1], first + across.shape[1]))
+        information[:first, :first] = of_states
+        information[:poses, :poses] += vision.information
+        information[:poses, first:], information[first:, :poses] = across, across.T
+        diagonal = first + np.arange(across.shape[1]).reshape(-1, 3)
+        information[diagonal[:, :, None], diagonal[:, None]] = vision.of_points[tied]
+        vector = np.concatenate([vector, vision.point_vector[tied].ravel()])
+        vector[:poses] += vision.vector
+        if left is not None and tried.H is not None:
+            of_left, vector_left = tried.H.carry(left.information, left.vector - left.information @ tried.off)
+            rows = np.r_[:6, poses : poses + d - 6, first : first + 3 * len(left.track_ids)]
+            information[np.ix_(rows, rows)] += of_left
+            vector[rows] += vector_left
+        return cls(information, vector, places, between, vision, tied)
+
+    @cached_property
+    def root(self) -> Array:
+        """The lower Cholesky factor (n, n) of the information; raises LinAlgError where there is none."""
+        return lower_factor(self.information)
+
+    def solved(self) -> tuple[Array, Array, float]:
+        """Return the steps of the states (K d,) and of all landmarks (M, 3), and by how much they lower the error."""
+        steps = cho_solve((self.root, True), self.vector, check_finite=False)
+        known, states = steps[: -3 * len(self.tied) or None], np.empty(len(self.places))
+        states[self.places] = np.concatenate([self.between.steps(known), known])
+        points = self.vision.point_steps(known[: len(self.vision.vector)])
+        points[self.tied] = steps[len(known) :].reshape(-1, 3)
+        others = np.delete(self.vision.point_vector, self.tied, axis=0)
+        gain = self.vector @ steps + np.square(self.between.vector).sum() + np.square(others).sum()
+        return states, points, 0.5 * float(gain)
+
+    def cov(self, i: int, d: int) -> Array:
+        """Return the covariance (d, d) of state i, in GTSAM's tangent spaces."""
+        chosen, count = np.eye(len(self.places), d, -i * d)[self.places], len(self.between.vector)
+        eliminated = solve_triangular(self.between.root, chosen[:count], lower=True, check_finite=False)
+        rest = np.zeros((len(self.vector), d))
+        rest[: len(self.places) - count] = chosen[count:] - self.between.across.T @ eliminated
+        known = solve_triangular(self.root, rest, lower=True, check_finite=False)
+        return np.asarray(eliminated.T @ eliminated + known.T @ known)
 
 
 class SlidingWindow:
-    """Adds factors and values with their stamps; variables older than the lag are marginalised."""
+    """Adds packets with their stamps to a window; variables older than the lag are marginalised."""
 
-    def __init__(self, lag_ns: int, coordinates: Coordinates, kept: Kept) -> None:
+    def __init__(self, setup: Setup, lag_ns: int, coordinates: Coordinates, kept: Kept) -> None:
         self._lag_ns, self._coordinates, self._kept = lag_ns, coordinates, kept
-        # Each with its keys, which every marginalisation asks of all of them.
-        self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
-        self._left: Gaussian | None = None
-        self._values = gtsam.Values()
-        # The states in the order of time, each with its keys, and the landmarks: both with their last stamps.
-        self._states: list[tuple[int, list[int]]] = []
-        self._landmarks: dict[int, int] = {}
-        self._tree = gtsam.GaussianBayesTree()
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._camera = RobustCamera(setup.rig, setup.settings.outliers.smoother_huber)
+        self._window, self._left = StereoWindow.empty(), cast(Gaussian | None, None)
+        self._stamps_ns, self._last_seen_ns = list[int](), dict[int, int]()
+        self._read: tuple[tuple[tuple[int, ...], ...], Equations] | None = None
         self._is_told = False
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
-        """Add a packet's factors and values at a time, and solve; return the recoveries.
+        """Add a packet's state and sightings at a time, and solve.
 
         Raises EstimatorError where the system does not determine a state.
         """
-        self._states.append((t_ns, sorted(extension.state_keys, key=_place)))
-        self._landmarks |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
-        added = (extension.factors.at(i) for i in range(extension.factors.size()))
-        self._factors += [(frozenset(factor.keys()), factor) for factor in added]
-        self._values.insert(extension.values)
+        assert extension.seen is not None
+        k = gtsam.Symbol(extension.state_keys[0]).index()
+        estimate = self._motion.read(extension.values, k, t_ns)
+        new = self._motion, estimate, extension.motion, extension.seen, k, self._camera.rig
+        self._window = self._window.extended(*new)
+        self._stamps_ns.append(t_ns)
+        self._last_seen_ns |= dict.fromkeys(extension.landmark_ids, t_ns)
         oldest_ns = t_ns - self._lag_ns
-        unseen = [key for key, seen_ns in self._landmarks.items() if seen_ns < oldest_ns]
-        while self._states[0][0] < oldest_ns:
-            leaving = self._states.pop(0)[1]
-            is_last = self._states[0][0] >= oldest_ns
-            self._marginalise([*leaving, *(unseen if is_last else ())])
+        unseen = [i for i, seen_ns in self._last_seen_ns.items() if seen_ns < oldest_ns]
+        while self._stamps_ns[0] < oldest_ns:
+            self._stamps_ns.pop(0)
+            self._without_oldest(unseen if self._stamps_ns[0] >= oldest_ns else [])
         return self._solved()
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Remove landmarks and their sightings in the window; the others keep what older sightings told of them."""
-        leaving = {L(i) for i in track_ids}
-        self._factors = [one for one in self._factors if leaving.isdisjoint(one[0])]
-        self._marginalise(sorted(leaving))
+        if self._left is not None:
+            known, at, information, vector, _ = self._left
+            gone = np.isin(known, list(track_ids))
+            leave = np.concatenate([np.zeros(self._window.size, dtype=bool), np.repeat(gone, 3)])
+            information, vector = _without(information, vector, leave)
+            self._coordinates.pass_on(np.eye(4), known[~gone])
+            at = at._replace(points=at.points[~gone])
+            self._left = Gaussian(known[~gone], at, information, vector, self._coordinates)
+        self._forget(track_ids)
         return self._solved()
 
     def values(self) -> gtsam.Values:
         """Return the latest values of the window."""
-        return self._values
+        values = gtsam.Values(self._window.values)
+        for track_id, point in self._window.points_by_id().items():
+            values.insert(L(track_id), point)
+        return values
 
-    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
-        """Return the joint marginal of some variables of the window."""
-        return self._tree.jointMarginalCovariance(keys)
+    def cov(self, keys: list[int]) -> Array:
+        """Return the joint covariance of the variables of a state, in GTSAM's tangent spaces."""
+        assert self._read is not None
+        states, equations = self._read
+        return equations.cov(states.index(tuple(keys)), self._window.size)
 
     def rebuilt_by_qr(self, refusal: RuntimeError) -> Recovery:
         """Raise the refusal of a covariance again: every frame is solved anew, nothing is left to rebuild."""
         raise refusal
 
-    def _marginalise(self, leaving: list[int]) -> None:
-        """Marginalise landmarks, or the variables of the state before the oldest one; what they told stays."""
-        gone, values, state = set(leaving), self._values, self._states[0][1]
-        linear = gtsam.GaussianFactorGraph()
-        for keys_of, factor in self._factors:
-            if not gone.isdisjoint(keys_of):
-                linear.push_back(factor.linearize(values))
-        if self._left is not None:
-            linear.push_back(self._left.linear(values))
-        known = set(linear.keyVector())
-        if gone & known:
-            self._factors = [one for one in self._factors if gone.isdisjoint(one[0])]
-            _, rest = linear.eliminatePartialSequential(ordering_of(key for key in leaving if key in known))
-            landmarks = sorted(key for key in known - gone if kind_of(key) == "l")
-            before = leaving[0] if kind_of(leaving[0]) == "x" else state[0]
-            self._coordinates.pass_on(values.atPose3(before), values.atPose3(state[0]), landmarks)
-            keys = [*state, *landmarks]
-            at = values.extract(keys)
-            root, told = self._kept(*rest.jacobian(ordering_of(keys)), at.extract(state).dim())
-            _, H = self._coordinates.errors(at, at, keys)
-            self._left = Gaussian(keys, at, np.asarray(np.linalg.solve(H.T, root.T).T), told, self._coordinates)
-        for key in leaving:
-            self._landmarks.pop(key, None)
-            if values.exists(key):
-                values.erase(key)
+    def _tied(self) -> IntArray:
+        """Return the rows (M,) of the Gaussian's landmarks in the window."""
+        row_of = {i: row for row, i in enumerate(self._window.track_ids.tolist())}
+        known = [] if self._left is None else self._left.track_ids.tolist()
+        return np.array([row_of[i] for i in known], dtype=np.int64)
+
+    def _without_oldest(self, unseen: Collection[int]) -> None:
+        """Marginalise the oldest state, and landmarks that no other state sees; what they told stays."""
+        window, tied = self._window, self._tied()
+        seen, by_oldest = window.sightings, window.sightings.pose == 0
+        rows = np.concatenate([tied, np.setdiff1d(seen.point[by_oldest], tied)])
+        place = np.empty(len(window.points), dtype=np.int64)
+        place[rows] = np.arange(len(rows))
+        sightings = Sightings(seen.pose[by_oldest], place[seen.point[by_oldest]], seen.uv_px[by_oldest])
+        leaving = replace(
+            window,
+            keys=window.keys[:2],
+            motion=window.motion[:2],
+            points=window.points[rows],
+            track_ids=window.track_ids[rows],
+            sightings=sightings,
+        )
+        tried = Tried.of(leaving, self._camera, self._left, np.arange(len(tied)))
+        equations = Equations.of(tried, self._left, np.arange(len(rows)))
+        d, gone = window.size, np.isin(leaving.track_ids, list(unseen))
+        leave = np.concatenate([equations.places < d, np.repeat(gone, 3)])
+        information, vector = self._kept(*_without(equations.information, equations.vector, leave), d)
+        old, new = leaving.poses
+        self._coordinates.pass_on(se3_inverse(new) @ old, leaving.track_ids[~gone])
+        values = gtsam.Values(window.values)
+        for key in window.keys[0]:
+            values.erase(key)
+        self._window = replace(
+            window,
+            keys=window.keys[1:],
+            values=values,
+            motion=(gtsam.NonlinearFactorGraph(), *window.motion[2:]),
+            sightings=Sightings(seen.pose[~by_oldest] - 1, seen.point[~by_oldest], seen.uv_px[~by_oldest]),
+        )
+        at = Place.of(self._window, leaving.points[~gone])
+        _, H = self._coordinates.errors(at, at)
+        self._left = Gaussian(leaving.track_ids[~gone], at, *H.inverse().carry(information, vector), self._coordinates)
+        self._forget(unseen)
+
+    def _forget(self, track_ids: Collection[int]) -> None:
+        """Remove landmarks and their sightings."""
+        window, seen = self._window, self._window.sightings
+        kept = ~np.isin(window.track_ids, list(track_ids))
+        of_kept, place = kept[seen.point], np.cumsum(kept) - 1
+        sightings = Sightings(seen.pose[of_kept], place[seen.point[of_kept]], seen.uv_px[of_kept])
+        points, ids = window.points[kept], window.track_ids[kept]
+        self._window = replace(window, points=points, track_ids=ids, sightings=sightings)
+        for i in track_ids:
+            self._last_seen_ns.pop(i, None)
 
     def _solved(self) -> Recovery:
-        """Iterate to the minimum; landmarks that are indeterminate are dropped."""
-        graph = gtsam.NonlinearFactorGraph()
-        for _, factor in self._factors:
-            graph.add(factor)
+        """Iterate to the minimum."""
         try:
-            converged = self._iterate(graph)
-        except RuntimeError as refusal:
-            key = variable_named(refusal)
-            if kind_of(key) != "l":
-                raise EstimatorError(f"{gtsam.Symbol(key).string()} is indeterminate in the window") from refusal
-            track_id = gtsam.Symbol(key).index()
-            line = f"landmark {track_id} made the system indeterminate and was dropped"
-            again = self.drop([track_id])
-            return Recovery([line, *again.log], {track_id} | again.dropped)
+            converged = self._iterate()
+        except np.linalg.LinAlgError as refusal:
+            raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
         if converged or self._is_told:
             return Recovery([], set())
         self._is_told = True
         return Recovery([_UNSOLVED], set())
 
-    def _iterate(self, graph: gtsam.NonlinearFactorGraph) -> bool:
+    def _iterate(self) -> bool:
         """Take Gauss-Newton steps, halved until the error falls, until one would gain little; say whether one did."""
-        ordering, error = self._order(), self._error(graph, self._values)
+        tied = self._tied()
+        tried = Tried.of(self._window, self._camera, self._left, tied)
+        if not np.isfinite(tried.error):
+            raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
         for _ in range(_MOST_STEPS):
-            linear = self._linear(graph)
-            self._tree = linear.eliminateMultifrontal(ordering)
-            step = self._tree.optimize()
-            if abs(linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)) <= _NEGLIGIBLE:
-                self._values = self._values.retract(step)
+            equations, window = Equations.of(tried, self._left, tied), self._window
+            states, points, gain = equations.solved()
+            self._read = window.keys, equations
+            if gain <= _NEGLIGIBLE:
+                self._window = window.moved(states, points)
                 return True
-            shortened = (self._values.retract(step.scale(0.5**halvings)) for halvings in range(_MOST_HALVINGS + 1))
-            tried = ((values, self._error(graph, values)) for values in shortened)
-            lower = next(((values, then) for values, then in tried if then < error), None)
+            shares = (0.5**halvings for halvings in range(_MOST_HALVINGS + 1))
+            shortened = (window.moved(share * states, share * points) for share in shares)
+            tries = (Tried.of(moved, self._camera, self._left, tied) for moved in shortened)
+            lower = next((one for one in tries if one.error < tried.error), None)
             if lower is None:
                 return False
-            self._values, error = lower
+            tried, self._window = lower, lower.here.window
         return False
 
-    def _linear(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.GaussianFactorGraph:
-        linear = graph.linearize(self._values)
-        if self._left is not None:
-            linear.push_back(self._left.linear(self._values))
-        # As in the incremental tree, so that the state before the newest has a clique of its own (``indeterminate``).
-        for key in self._states[-1][1]:
-            size = self._values.extract([key]).dim()
-            linear.add(gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), _UNIT))
-        return linear
 
-    def _error(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> float:
-        return graph.error(values) + (0.0 if self._left is None else self._left.error(values))
-
-    def _order(self) -> gtsam.Ordering:
-        """Return the elimination order: landmarks, those that the Gaussian connects last, then states in time.
-
-        The oldest state stands beside the newest, whose covariances are read at every frame.
-        """
-        connected = set() if self._left is None else set(self._left.keys)
-        landmarks = sorted(self._landmarks, key=lambda key: (key in connected, key))
-        states = [*self._states[1:-1], *self._states[:1], *self._states[1:][-1:]]
-        return ordering_of([*landmarks, *(key for _, keys in states for key in keys), LAST])
-
-
-def _place(key: int) -> int:
-    return "xvb".index(kind_of(key))
+def _without(information: Array, vector: Array, gone: BoolArray) -> tuple[Array, Array]:
+    """Return a Gaussian's information (n, n) and vector (n,) without the errors of a mask."""
+    order = np.argsort(~gone, kind="stable")
+    information, vector, _ = without(information[np.ix_(order, order)], vector[order], int(np.count_nonzero(gone)))
+    return information, vector

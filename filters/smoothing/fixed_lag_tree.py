@@ -31,7 +31,8 @@ from filters.smoothing.indeterminate import (
     without_gaps,
 )
 from toolkit.errors import EstimatorError
-from toolkit.models.factors import L, key_list, kind_of
+from toolkit.geometry import Array
+from toolkit.models.factors import L, joint_cov, key_list, kind_of
 
 MOST_RECOVERIES = 20
 # How many landmarks with a marginal on them are eliminated in one clique: with fewer, copying from clique to clique
@@ -108,9 +109,9 @@ class FixedLagTree:
         """Return the latest values of the window, and of the variables that left it with the last packet."""
         return self._values
 
-    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
-        """Return the joint marginal of some variables of the window."""
-        return self._isam.jointMarginalCovariance(keys)
+    def cov(self, keys: list[int]) -> Array:
+        """Return the joint covariance of some variables of the window, in GTSAM's tangent spaces."""
+        return joint_cov(self._isam, keys)
 
     def _solved(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int] = ()

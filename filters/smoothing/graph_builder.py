@@ -27,8 +27,13 @@ from toolkit.models.state import Belief
 
 @dataclass
 class GraphExtension:
-    """New factors and values, and every state and landmark they involve."""
+    """New factors and values, and every state and landmark they involve.
 
+    ``motion`` are the factors that are no sightings, ``seen`` the sightings.
+    """
+
+    motion: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    seen: StereoFrame | None = None
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     state_keys: list[int] = field(default_factory=list)
@@ -54,6 +59,7 @@ class GraphBuilder:
         """Return what a packet adds; the new state is predicted from the latest one."""
         extension = GraphExtension()
         expected = self._add_state(packet, extension)
+        extension.factors.push_back(extension.motion)
         there, sound = self._outlier_check.placed(expected, packet.frame, self._landmarks)
         if self._begins_there:
             self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
@@ -91,12 +97,12 @@ class GraphBuilder:
         """Add the new state; return its prediction with the covariance relative to the map."""
         expected = relative_to_its_map(self.belief)
         if packet.motion is None:
-            extension.factors.push_back(self.motion.hold(self.belief, packet.index))
+            extension.motion.push_back(self.motion.hold(self.belief, packet.index))
         else:
             increment = self.motion.integrate(packet.motion, self.belief.bias)
             prediction = increment.predict(self.belief)
             self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
-            extension.factors.push_back(increment.factors(packet.index))
+            extension.motion.push_back(increment.factors(packet.index))
         return expected
 
     def _add_sightings(self, frame: StereoFrame, k: int, extension: GraphExtension) -> None:
@@ -110,5 +116,5 @@ class GraphBuilder:
             extension.values.insert(L(track_id), point)
         for factor in self._stereo.of(used, k):
             extension.factors.add(factor)
-        extension.landmark_ids = used.track_ids.tolist()
+        extension.seen, extension.landmark_ids = used, used.track_ids.tolist()
         self._landmarks.see(used, placed, self.belief.T_world_imu)

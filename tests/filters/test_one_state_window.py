@@ -89,4 +89,4 @@ def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_step
 
 def test_a_gaussian_that_is_not_determined_cannot_lose_its_cross_covariances_and_says_so():
     with pytest.raises(EstimatorError, match=r"does not determine .* set cross_covariances to true"):
-        sliding_window.without_cross_covariances(np.eye(2, 3), np.zeros(2), size=1)
+        sliding_window.without_cross_covariances(np.diag([1.0, 1.0, 0.0]), np.zeros(3), size=1)

@@ -3,7 +3,8 @@
 A :class:`StereoWindow` is the problem: states, motion factors between them, a linear prior, and sightings of points
 that are no variables. ``solve_window`` finds its minimum by Levenberg-Marquardt and the covariance of each state. The
 fixed-lag smoother `smart` solves one frame by frame, the start and the measurement of noise on stretches of a
-recording. Everything is dense: a window has a few hundred unknowns.
+recording; `sliding-window` ties some of its landmarks to the prior. Everything is dense: a window has a few hundred
+unknowns.
 
 Each track is a smart factor (Carlone, Kira, Beall, Indelman & Dellaert 2014, "Eliminating conditionally independent
 sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur complement,
@@ -62,7 +63,8 @@ class Sightings:
 class ReducedVision(NamedTuple):
     """Information matrix (D, D) and vector (D,) on the poses, and the matrices for back-substitution of points.
 
-    D is 6K, or 6K + C where the sightings share C more unknowns.
+    D is 6K, or 6K + C where the sightings share C more unknowns. Of points that were not eliminated, ``root`` is the
+    identity, and ``of_points`` (M, 3, 3), ``coupling`` and ``point_vector`` are the rest of the normal equations.
     """
 
     information: Array
@@ -70,6 +72,7 @@ class ReducedVision(NamedTuple):
     coupling: Array
     root: Array
     point_vector: Array
+    of_points: Array
 
     def point_steps(self, pose_steps: Array) -> Array:
         """Return the steps (M, 3) of the points for steps (D,) of the others."""
@@ -113,13 +116,16 @@ class Vision:
         """The part (M,) of the loss due to the sightings of each point."""
         return np.asarray(np.bincount(self.sightings.point, self.losses, minlength=self.counts[1]), dtype=np.float64)
 
-    def reduced(self) -> ReducedVision:
-        """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
+    def reduced(self, tied: IntArray | None = None) -> ReducedVision:
+        """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body.
+
+        Points ``tied`` (rows) to more than their sightings are not eliminated.
+        """
         weights = self.camera.rig.track_weight * huber_weights(self._squares, self.camera.huber)
         roots = np.where(self.in_front, np.sqrt(weights), 0.0)
         weighted = roots[:, None, None] * stereo.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
-        return eliminated(roots[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts)
+        return eliminated(roots[:, None] * self.whitened, J_pose, J_point, self.sightings, self.counts, tied=tied)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
@@ -156,12 +162,13 @@ def eliminated(
     seen: Sightings,
     counts: tuple[int, int],
     J_common: Array | None = None,
+    tied: IntArray | None = None,
 ) -> ReducedVision:
     """Eliminate M points of N sightings from K poses by Schur complements.
 
     ``residual`` (N, 3) is measured less predicted, ``J_pose`` (N, 3, 6) and ``J_point`` (N, 3, 3) the Jacobians of the
     prediction, and ``J_common`` (N, 3, C) those by unknowns that all sightings share, which come behind the poses'; all
-    whitened and weighted. ``counts`` are K and M.
+    whitened and weighted. ``counts`` are K and M. Points ``tied`` (rows) are not eliminated.
     """
     (pose_count, point_count), point, pose = counts, seen.point, seen.pose
     # Small matrix products are several times as fast on contiguous arrays.
@@ -170,7 +177,10 @@ def eliminated(
     information_point = (per_point @ (to_point @ J_point).reshape(-1, 9)).reshape(-1, 3, 3)
     information_point += _LEAST_INFORMATION_PER_M2 * np.eye(3)
     vector_point = per_point @ (to_point @ residual[..., None])[..., 0]
-    root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
+    gone, root = np.ones(point_count, dtype=bool), np.tile(np.eye(3), (point_count, 1, 1))
+    if tied is not None:
+        gone[tied] = False
+    root[gone] = np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point[gone])), 1, 2)
     whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
     coupling = np.zeros((pose_count, 6, point_count, 3))
     to_pose, per_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2)), _summation(pose, pose_count)
@@ -189,8 +199,10 @@ def eliminated(
         rows = J_common.reshape(-1, shared)
         information = np.block([[information, of_poses], [of_poses.T, rows.T @ rows]])
         vector = np.concatenate([vector, rows.T @ residual.ravel()])
-    information -= across @ across.T
-    return ReducedVision(information, vector - across @ whitened_vector.ravel(), across, root, whitened_vector)
+    leaving = across if gone.all() else across[:, np.repeat(gone, 3)]
+    information -= leaving @ leaving.T
+    vector = vector - leaving @ whitened_vector[gone].ravel()
+    return ReducedVision(information, vector, across, root, whitened_vector, information_point)
 
 
 def _summation(groups: IntArray, count: int) -> csc_array:
@@ -285,6 +297,14 @@ class StereoWindow:
     def points_by_id(self) -> dict[int, Array]:
         return dict(zip(self.track_ids.tolist(), self.points, strict=True))
 
+    def moved(self, step: Array, point_steps: Array) -> "StereoWindow":
+        """Return the window after a step (D,) of its states and one (M, 3) of its landmarks."""
+        delta, start, dims = gtsam.VectorValues(), 0, self.values.dims()
+        for key in self.all_keys:
+            delta.insert(key, step[start : start + dims[key]])
+            start += dims[key]
+        return replace(self, values=self.values.retract(delta), points=self.points + point_steps)
+
     def newest(self, frame: StereoFrame) -> StereoFrame:
         """Return the newest state's frame without the sightings that are not in the window."""
         taken = self.track_ids[self.sightings.point[self.sightings.pose == len(self.keys) - 1]]
@@ -316,13 +336,13 @@ class System:
     @cached_property
     def root(self) -> Array:
         """The lower Cholesky factor (D, D) of the information; raises LinAlgError where there is none."""
-        return _lower_factor(self.information)
+        return lower_factor(self.information)
 
     def damped_root(self, damping: float) -> Array:
         """Return the lower Cholesky factor (D, D) with a share of the diagonal added; raises as ``root`` does."""
         if damping == 0.0:
             return self.root
-        return _lower_factor(self.information + damping * np.diag(np.diag(self.information)))
+        return lower_factor(self.information + damping * np.diag(np.diag(self.information)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,7 +372,7 @@ class Evaluated:
     def linearised(self) -> System:
         window, count, size = self.window, len(self.window.keys), len(self.off_prior)
         d = window.size
-        information, vector = self._of_motion(count * d)
+        information, vector = self.of_motion(window.all_keys)
         information[:size, :size] += window.prior.information
         vector[:size] += window.prior.vector - window.prior.information @ self.off_prior
         vision = self.vision.reduced()
@@ -360,17 +380,21 @@ class Evaluated:
         vector.reshape(count, d)[:, :6] += vision.vector.reshape(count, 6)
         return System(information, vector, vision)
 
-    def _of_motion(self, size: int) -> tuple[Array, Array]:
-        """Return the normal equations of the motion factors, which involve the first states of the window, or all."""
-        tied = set(self.motion.keyVector())
-        information, vector = np.zeros((0, 0)), np.zeros(0)
-        if tied:
-            ordering = ordering_of(key for key in self.window.all_keys if key in tied)
-            # The matrix is symmetric and column-major, so its transpose is the same matrix in NumPy's row-major order.
-            augmented = self.motion.augmentedHessian(ordering).T
-            information, vector = augmented[:-1, :-1], augmented[-1, :-1]
-        rest = size - len(vector)
-        return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
+    def of_motion(self, keys: list[int]) -> tuple[Array, Array]:
+        """Return the normal equations of the motion factors on some variables, which include all that are tied."""
+        known = set(self.motion.keyVector())
+        tied, dims = [key in known for key in keys], self.window.values.dims()
+        rows = np.flatnonzero(np.repeat(tied, [dims[key] for key in keys]))
+        size = sum(dims[key] for key in keys)
+        if not known:
+            return np.zeros((size, size)), np.zeros(size)
+        # The matrix is symmetric and column-major, so its transpose is the same matrix in NumPy's row-major order.
+        augmented = self.motion.augmentedHessian(ordering_of(key for key in keys if key in known)).T
+        if len(rows) == size:
+            return augmented[:-1, :-1], augmented[-1, :-1]
+        information, vector = np.zeros((size, size)), np.zeros(size)
+        information[np.ix_(rows, rows)], vector[rows] = augmented[:-1, :-1], augmented[-1, :-1]
+        return information, vector
 
 
 def _off_prior(window: StereoWindow) -> Array:
@@ -383,7 +407,8 @@ def _off_prior(window: StereoWindow) -> Array:
     return np.concatenate([delta.at(key) for key in keys])
 
 
-def _lower_factor(matrix: Array) -> Array:
+def lower_factor(matrix: Array) -> Array:
+    """Return the lower Cholesky factor of a symmetric matrix; raises LinAlgError where there is none."""
     # LAPACK is column-major and NumPy row-major: a symmetric matrix is its own transpose and need not be copied.
     return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))
 
@@ -437,16 +462,42 @@ def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> 
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
 
+class Eliminated(NamedTuple):
+    """Unknowns that were eliminated: the lower root (n, n) of their information, and what they depend on.
+
+    ``across`` (n, m) is their coupling to the others and ``vector`` (n,) their own, both divided by the root.
+    """
+
+    root: Array
+    across: Array
+    vector: Array
+
+    def steps(self, others: Array) -> Array:
+        """Return their steps (n,) for steps (m,) of the others."""
+        whitened = self.vector - self.across @ others
+        return np.asarray(solve_triangular(self.root, whitened, lower=True, trans="T", check_finite=False))
+
+
+def without(information: Array, vector: Array, count: int) -> tuple[Array, Array, Eliminated]:
+    """Eliminate the first ``count`` unknowns of normal equations (D, D), (D,): a Schur complement.
+
+    Raises LinAlgError where the information is singular.
+    """
+    root = lower_factor(information[:count, :count])
+    right = np.column_stack([information[:count, count:], vector[:count]])
+    right = solve_triangular(root, right, lower=True, check_finite=False)
+    across, own = right[:, :-1], right[:, -1]
+    reduced = information[count:, count:] - across.T @ across
+    return reduced, vector[count:] - across.T @ own, Eliminated(root, across, own)
+
+
 def without_oldest(window: StereoWindow, count: int, camera: RobustCamera) -> StereoWindow:
     """Marginalise the ``count`` oldest states with every track they saw."""
     seen = window.sightings
     is_leaving = np.isin(seen.point, seen.point[seen.pose < count])
     leaving = replace(window.with_sightings(is_leaving), motion=window.motion[: count + 1])
     system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
-    root = np.linalg.cholesky(system.information[:gone, :gone])
-    across = solve_triangular(root, system.information[:gone, gone:], lower=True)
-    information = system.information[gone:, gone:] - across.T @ across
-    vector = system.vector[gone:] - across.T @ solve_triangular(root, system.vector[:gone], lower=True)
+    information, vector, _ = without(system.information, system.vector, gone)
     left, values = window.with_sightings(~is_leaving), gtsam.Values(window.values)
     for key in (key for keys in window.keys[:count] for key in keys):
         values.erase(key)
@@ -473,7 +524,8 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
-            moved = _moved(here.window, system, step)
+            pose_steps = step.reshape(len(here.window.keys), -1)[:, :6].ravel()
+            moved = here.window.moved(step, system.vision.point_steps(pose_steps))
             there = Evaluated.of(moved, camera)
             if not there.error <= here.error:
                 there = Evaluated.of(_with_shortened_landmark_steps(moved, here.window.points, camera), camera)
@@ -494,14 +546,3 @@ def _with_shortened_landmark_steps(moved: StereoWindow, before: Array, camera: R
     costs = [Vision.at(moved.poses, points, moved.sightings, camera).loss_of_points for points in places]
     cheapest = np.nan_to_num(costs, nan=np.inf).argmin(axis=0)
     return replace(moved, points=places[cheapest, np.arange(len(before))])
-
-
-def _moved(window: StereoWindow, system: System, step: Array) -> StereoWindow:
-    """Return the window after a step (D,) of its states and the corresponding steps of its landmarks."""
-    delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
-    for key in window.all_keys:
-        delta.insert(key, step[start : start + dims[key]])
-        start += dims[key]
-    pose_steps = step.reshape(len(window.keys), -1)[:, :6].ravel()
-    points = window.points + system.vision.point_steps(pose_steps)
-    return replace(window, values=window.values.retract(delta), points=points)
