@@ -119,10 +119,7 @@ def watch(build: Build, sequence: Sequence) -> Watched:
 
 
 def declines(build: Build, sequence: Sequence) -> str:
-    """Return what an estimator says of an input that it is not made for; empty where it takes it.
-
-    That is an EstimatorError in ``build`` or before it has answered for the first motion. Any other error is none.
-    """
+    """Return why an estimator declines an input, by an EstimatorError before it has answered for the first motion."""
     try:
         for index, _ in enumerate(answers(build, sequence)):
             if index == 1:

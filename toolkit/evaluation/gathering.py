@@ -56,18 +56,10 @@ def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gather
         there = ", ".join(sorted(known))
         raise DataError(f"{truth}: it has the truth of {', '.join(truths)}, and the trajectories are of {there}")
     items = [
-        item
-        for name, files in found.items()
-        for sequence in scored
-        for item in _items(name, sequence, files.get(sequence, ()), runs or _runs_elsewhere(files, sequence))
+        item for name, files in found.items() for sequence in scored for item in _items(name, sequence, files, runs)
     ]
     notes = (*_left_out(truths, known), *(() if runs else _fewer_runs(found, scored)))
     return Gathered({s: truths[s] for s in scored}, tuple(items), notes)
-
-
-def _runs_elsewhere(files: Mapping[str, tuple[Path, ...]], sequence: str) -> int:
-    """Return how many runs a system without any run of a sequence should have: as many as of another sequence."""
-    return 0 if sequence in files else max(map(len, files.values()))
 
 
 def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
@@ -81,9 +73,11 @@ def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
             yield f"{there}; --runs {most} counts those missing as failed"
 
 
-def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:
-    there = [Item(system, sequence, _name(file), file) for file in files]
-    return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(runs - len(there))]
+def _items(system: str, sequence: str, files: Mapping[str, tuple[Path, ...]], runs: int | None) -> list[Item]:
+    """Return the runs there are, and those that are missing: of a sequence without any, as many as of another one."""
+    there = [Item(system, sequence, _name(file), file) for file in files.get(sequence, ())]
+    wanted = runs or (0 if there else max(map(len, files.values())))
+    return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(wanted - len(there))]
 
 
 def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
@@ -94,7 +88,7 @@ def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
             raise DataError(
                 f"{path}: a folder of one system's runs needs its name, NAME={path}; or give a folder of truths"
             )
-        files = trajectory_files(path) if path.is_dir() else (_existing(path),)
+        files = _trajectory_files(path) if path.is_dir() else (_existing(path),)
         if not files:
             raise DataError(f"{path}: it holds no trajectory")
         runs = found.setdefault(name or _name(path), {})
@@ -163,7 +157,7 @@ def _name(path: Path) -> str:
 
 
 def _unzipped(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix == _ZIPPED else path
+    return Path(path.name.removesuffix(_ZIPPED))
 
 
 def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
@@ -172,7 +166,7 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
         raise DataError(f"{folder}: it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum")
     found: dict[str, tuple[Path, ...]] = {}
     for path in _entries(folder):
-        files = trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
+        files = _trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
         name = printable(path.name) if path.is_dir() else _name(path)
         if files and name in found:
             raise DataError(f"{folder}: {name} is given twice, as {found[name][0].name} and {path.name}; keep one")
@@ -185,8 +179,7 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
     return found
 
 
-def trajectory_files(folder: Path) -> tuple[Path, ...]:
-    """Return the trajectory files that are directly in a folder, by name; raises DataError where it cannot be read."""
+def _trajectory_files(folder: Path) -> tuple[Path, ...]:
     return tuple(filter(_is_file, _entries(folder)))
 
 

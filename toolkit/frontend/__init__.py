@@ -1,7 +1,7 @@
 """Stereo tracks from images, with OpenCV, made once for all estimators.
 
-Read ``tracker`` first: it is the algorithm; its steps are ``corners``, ``motion`` and ``patches``. ``tracking`` runs
-it over a recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills`` draw what it found.
+Read ``tracker`` first: it is the algorithm, with ``motion`` and ``patches``. ``tracking`` runs it over a
+recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills`` draw what it found.
 """
 
 from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified

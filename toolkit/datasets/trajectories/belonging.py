@@ -179,10 +179,7 @@ def body_of(
 
 
 def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:
-    """Raise DataError where stamps (N,) and the reference's do not overlap, or only in another unit of time.
-
-    Both ranges and the likely cause are named.
-    """
+    """Raise DataError, with the likely cause, where stamps (N,) overlap the reference's in another unit or not."""
     frames_t_ns = reference.t_ns
     scale = _fitting_scale(frames_t_ns, t_ns)
     overlap = t_ns[-1] >= frames_t_ns[0] and t_ns[0] <= frames_t_ns[-1]
@@ -419,10 +416,7 @@ def _body(
 
 
 def _fits_inverted(truth: Array, estimate: Array) -> bool:
-    """Say whether poses (n, 4, 4) that are nowhere near the truth's are, with one turn of the body, once inverted.
-
-    Those that stand in one place and turn are a circle then.
-    """
+    """Say whether poses (n, 4, 4) fit once inverted; those that stand in one place and turn are a circle then."""
     extents_m = [float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))) for poses in (estimate, truth) if len(poses)]
     if len(extents_m) < 2 or extents_m[0] < _LEAST_SHARE * extents_m[1]:
         return False

@@ -87,21 +87,14 @@ class Rows:
         return len(self.cells[0])
 
     def numbers(self, width: int, columns: str) -> Array:
-        """Return all cells as numbers (N, width); ``columns`` names the first of them.
-
-        Raises DataError naming the line that has another number of cells or one that is no number.
-        """
+        """Return all cells as numbers (N, width); raises DataError naming the line that has not these ``columns``."""
         if not self.underscored and set(map(len, self.cells)) == {width}:
             with suppress(ValueError):  # told below, with the line
                 return np.fromiter(map(float, chain.from_iterable(self.cells)), dtype=float).reshape(-1, width)
         return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
 
     def stamps(self, per_unit_ns: int, at: int = 0) -> IntArray:
-        """Return the cells of a column, in units of ``per_unit_ns``, as int64 nanoseconds (N,), rounded only there.
-
-        A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
-        or beyond what 64 bits hold.
-        """
+        """Return a column in units of ``per_unit_ns`` as :func:`exact_ns` does; raises DataError naming the line."""
         cells = [of_line[at] for of_line in self.cells]
         return exact_ns(cells, per_unit_ns, lambda row: f"{self.path}: line {self.line_numbers[row]}")
 
@@ -302,10 +295,7 @@ class Stamped:
         return Trajectory(poses.t_ns, poses.T_world_imu)
 
     def text(self, trajectory: Trajectory) -> str:
-        """Return a trajectory as the text of a file.
-
-        Poses that are not finite are left out; velocity and biases that it does not have are nan.
-        """
+        """Return a trajectory as the text of a file, without poses that are not finite; what it lacks is nan."""
         kept = _finite(trajectory)
         return self._text(kept, self.header, np.empty((len(kept), 0)))
 
@@ -346,11 +336,7 @@ class Kitti:
         return not rows.commas and rows.width == self._WIDTH
 
     def parse(self, rows: Rows) -> PosesFile:
-        """Return the poses of rows, without stamps.
-
-        Raises DataError, naming the line, where they are not a table of twelve finite numbers a line, or a matrix is
-        not a rotation.
-        """
+        """Return the poses of rows, without stamps; raises DataError naming the line whose matrix is no rotation."""
         matrices = rows.numbers(self._WIDTH, self.columns).reshape(-1, 3, 4)
         rotations = matrices[:, :, :3]
         off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
@@ -366,10 +352,7 @@ class Kitti:
         return PosesFile(rows.path, "KITTI", None, se3(R_world_imu, matrices[:, :, 3]), None)
 
     def text(self, trajectory: Trajectory) -> str:
-        """Return a trajectory, one pose for every frame, as the text of a file.
-
-        Raises DataError where a pose is not finite: rows are frames, so none can be left out.
-        """
+        """Return a trajectory, a pose for every frame, as text; raises DataError where a pose is not finite."""
         poses = trajectory.T_world_imu
         bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
         if bad.size:
@@ -435,11 +418,8 @@ _KIND = (
 def read_poses(path: Path, cov_convention: CovConvention | None = None) -> PosesFile:
     """Read a file of any of the formats, which is recognised from its content, or poses of a bag (``run.bag:/odom``).
 
-    ``cov_convention`` is that of its covariances where the file does not say it.
-
-    Raises DataError, naming the line and the likely cause, where it is missing, empty, of none of the formats or
-    not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
-    only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
+    ``cov_convention`` is that of its covariances where the file does not say it. Raises DataError, naming the line and
+    the likely cause: a wrong unit of time is named, never repaired.
     """
     place = place_in_bag(path)
     if place is None:
