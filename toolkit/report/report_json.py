@@ -4,31 +4,38 @@ It has two forms: of a comparison, and of one over seeds. First the records of b
 Times ``t_s`` count from the first frame; numbers have six digits; a value that is not finite is null.
 """
 
-from collections.abc import Callable, Iterator, Sized
-from typing import Annotated, Literal, TypeVar
+from collections.abc import Iterator
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
-from msgspec.structs import asdict
 
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.documents import number, numbers, of_attributes, reader, rounded
 from toolkit.files.writing import plain_name
 from toolkit.geometry import Array
-from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
-from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import CardRecord, card_record
 from toolkit.report.comparison_table import header_lines, noise_line, sequence_line
 from toolkit.report.curves import (
     NOT_ALIGNED,
-    ErrorCurves,
+    Columns,
+    ComponentSeries,
+    ErrorKind,
+    ErrorSeries,
+    NeesSeries,
+    NisSeries,
+    Numbers,
+    Times,
     alignment_text,
+    check_lengths,
     components,
     error_curves,
+    nees_series,
+    nis_series,
     onto_truth,
     seconds,
+    series_or_reason,
     shown_output,
     truth_during,
 )
@@ -42,84 +49,9 @@ from toolkit.report.messages import (
     verdict,
 )
 from toolkit.report.scores import REPEAT, Undecided
-from toolkit.sequence import Sequence
 
 TRUTH_FILE = "trajectories/truth.tum"
-Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
-Numbers = tuple[float | None, ...]
 Vector = tuple[float, float, float]
-
-
-class _Columns(Struct, frozen=True, kw_only=True):
-    """Columns of one table: of equal length, which decoding checks."""
-
-    def __post_init__(self) -> None:
-        columns = asdict(self).items()
-        _check_lengths({name: column for name, column in columns if isinstance(column, tuple) and name != "band"})
-
-
-def _check_lengths(columns: dict[str, Sized]) -> None:
-    first, *others = columns
-    for name in others:
-        if len(columns[name]) != len(columns[first]):
-            raise ValueError(f"{name} has {len(columns[name])} entries, {first} has {len(columns[first])}")
-
-
-class ErrorKind(Struct, frozen=True, kw_only=True):
-    """What the errors of this report are."""
-
-    what: Annotated[str, Meta(description="error, or the difference from whom")]
-    placing: Annotated[str | UnsetType, Meta(description="how estimates are placed, which old captions say")] = UNSET
-    caption: str
-
-
-class ErrorSeries(_Columns, frozen=True, kw_only=True):
-    """Errors along the recording, after the alignment."""
-
-    t_s: Times
-    path_m: Annotated[Numbers, Meta(description="along the truth")]
-    position_m: Numbers
-    heading_deg: Numbers
-
-
-class ComponentSeries(_Columns, frozen=True, kw_only=True):
-    """Errors by component along the recording, not aligned but placed as for the NEES, and what is stated of them.
-
-    Estimate minus truth, or without truth minus another estimate, along and about the world's axes.
-    """
-
-    t_s: Times
-    x_m: Numbers
-    y_m: Numbers
-    z_m: Numbers
-    about_x_deg: Numbers
-    about_y_deg: Numbers
-    about_z_deg: Numbers
-    sigma_x_m: Annotated[Numbers, Meta(description="stated standard deviation; null where none is stated")]
-    sigma_y_m: Numbers
-    sigma_z_m: Numbers
-    sigma_about_x_deg: Numbers
-    sigma_about_y_deg: Numbers
-    sigma_about_z_deg: Numbers
-
-
-class NeesSeries(_Columns, frozen=True, kw_only=True):
-    """NEES along the recording, each over its degrees of freedom."""
-
-    t_s: Times
-    pose: Numbers
-    orientation: Numbers
-    position: Numbers
-    band: Annotated[tuple[float, float], Meta(description="95 % band of the pose")]
-
-
-class NisSeries(_Columns, frozen=True, kw_only=True):
-    """NIS of each step that reports one."""
-
-    t_s: Times
-    per_dof: Annotated[Numbers, Meta(description="over what is expected of the step: its degrees of freedom, or less")]
-    low: Annotated[Numbers, Meta(description="lower end of the 95 % band for as many")]
-    high: Annotated[Numbers, Meta(description="upper end of the 95 % band for as many")]
 
 
 class DrawnRun(Struct, frozen=True, kw_only=True):
@@ -139,7 +71,7 @@ class DrawnRun(Struct, frozen=True, kw_only=True):
     ] = UNSET
 
 
-class StepTimes(_Columns, frozen=True, kw_only=True):
+class StepTimes(Columns, frozen=True, kw_only=True):
     """The wall clock of an estimator's steps."""
 
     estimator: str
@@ -199,7 +131,7 @@ class Report(Struct, frozen=True, kw_only=True):
     contests: Contests = UNSET
 
 
-class MeanNeesSeries(_Columns, frozen=True, kw_only=True):
+class MeanNeesSeries(Columns, frozen=True, kw_only=True):
     """Pose NEES over 6, averaged over the seeds, with its 95 % band for as many runs."""
 
     pose: Numbers
@@ -239,14 +171,11 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
         for i, run in enumerate(self.runs):
             nees = {} if run.nees is None else {f"runs[{i}].nees.pose": run.nees.pose}
             errors = {} if run.position_rms_m is None else {f"runs[{i}].position_rms_m": run.position_rms_m}
-            _check_lengths({"t_s": self.t_s, **nees, **errors})
+            check_lengths({"t_s": self.t_s, **nees, **errors})
 
 
 read_report = reader(Report, REPEAT)
 read_seeds_report = reader(SeedsReport, REPEAT)
-
-
-Series = TypeVar("Series", NeesSeries, NisSeries)
 
 
 _FILES = {"trajectory": "trajectories/{}_{}.tum", "states": "states/{}_{}.txt", "landmarks": "landmarks/{}.csv"}
@@ -259,13 +188,14 @@ def file_of(kind: Literal["trajectory", "states", "landmarks"], estimator: str, 
 
 def report_document(comparison: Comparison) -> Report:
     curves = error_curves(comparison)
+    errors = {} if curves is None else curves.of_rows
     return Report(
         schema="vislam.report/1",
         start_ns=int(comparison.sequence.frames_t_ns[0]),
         truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
         alignment=alignment_text(comparison.sequence),
-        error=None if curves is None else of_attributes(ErrorKind, curves),
-        runs=tuple(_row(row, comparison, _errors(row, curves, comparison.sequence)) for row in comparison.rows),
+        error=None if curves is None else curves.kind,
+        runs=tuple(_row(row, comparison, errors.get(row)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
         maps=tuple(
             DrawnMap(estimator=run.estimator, landmarks=file_of("landmarks", run.estimator), output=shown_output(run))
@@ -292,17 +222,6 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
         ),
         contests=tuple(contest_record(one) for one in over.contests),
     )
-
-
-def _errors(row: Row, curves: ErrorCurves | None, sequence: Sequence) -> ErrorSeries | None:
-    """Return a row's errors; where causal and final agree they were computed once and stand with the causal row."""
-    same = row.run.final_is_causal
-    if curves is None or (same and row.output == "final"):
-        return None
-    for other, errors in curves.of_rows:
-        if other.run is row.run and (same or other.output == row.output):
-            return of_attributes(ErrorSeries, errors, numbers, t_s=seconds(sequence, errors.t_ns))
-    return None
 
 
 def _messages(comparison: Comparison) -> Messages:
@@ -332,57 +251,15 @@ def _row(row: Row, comparison: Comparison, errors: ErrorSeries | None) -> DrawnR
         rotation=(_vector(alignment.rotation[0]), _vector(alignment.rotation[1]), _vector(alignment.rotation[2])),
         translation_m=_vector(alignment.translation),
         errors=errors,
-        nees=_series_or_reason(_nees, row, comparison),
-        nis=_series_or_reason(_nis, row, comparison),
-        components=UNSET if row.repeats_causal else _components(row, comparison),
+        nees=series_or_reason(nees_series, row, comparison.sequence),
+        nis=series_or_reason(nis_series, row, comparison.sequence),
+        components=(None if row.repeats_causal else components(comparison, row)) or UNSET,
     )
 
 
 def _vector(values: Array) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
-    if row.run.trajectory(row.output) is None:
-        return "the run gave no trajectory"
-    try:
-        with np.errstate(all="ignore"):  # a diverged run overflows; that becomes null
-            return series(row, comparison)
-    except Unavailable as reason:
-        return str(reason)
-
-
-def _components(row: Row, comparison: Comparison) -> ComponentSeries | UnsetType:
-    with np.errstate(all="ignore"):  # as above
-        found = components(comparison, row)
-    if found is None:
-        return UNSET
-    sigma = np.full(found.error.shape, np.nan) if found.sigma is None else found.sigma
-    names = ("about_x_deg", "about_y_deg", "about_z_deg", "x_m", "y_m", "z_m")  # as the columns stand in Components
-    columns = {name: numbers(found.error[:, i]) for i, name in enumerate(names)}
-    stated = {f"sigma_{name}": numbers(sigma[:, i]) for i, name in enumerate(names)}
-    return ComponentSeries(t_s=seconds(comparison.sequence, found.t_ns), **columns, **stated)
-
-
-def _nees(row: Row, comparison: Comparison) -> NeesSeries:
-    nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
-    t_s = seconds(comparison.sequence, nees.t_ns)
-    return of_attributes(NeesSeries, nees, numbers, t_s=t_s, band=nees_band(POSE_DOF))
-
-
-def _nis(row: Row, comparison: Comparison) -> NisSeries:
-    """Return each step's NIS over what is expected of it, with the two-sided 95 % band of a consistent filter's."""
-    found = nis_over_time(Evaluation(row.run, row.output, comparison.sequence))
-    causal = row.run.causal
-    assert causal is not None, "an output without estimates has no innovations"
-    low, high = found.bands()
-    return NisSeries(
-        t_s=seconds(comparison.sequence, causal.t_ns[found.rows]),
-        per_dof=numbers(found.nis / found.expected),
-        low=numbers(low),
-        high=numbers(high),
-    )
 
 
 def _steps(comparison: Comparison) -> Iterator[StepTimes]:

@@ -3,7 +3,7 @@
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +13,7 @@ from matplotlib.patches import Patch
 from toolkit.answers import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
-from toolkit.metrics import Evaluation
-from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
-from toolkit.report.curves import available
+from toolkit.report.curves import nees_series, nis_series, series_or_reason, shown_as
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 
@@ -37,15 +35,12 @@ _OF_NIS = (
 
 
 class Normalised(NamedTuple):
-    """Squared errors over their expectation at times (n,) s, and the band (n,), (n,) of a consistent estimator.
+    """Squared errors (n,) over their expectation, NaN if unknown, at times (n,) s, and the band of consistent ones."""
 
-    NaN means unknown.
-    """
-
-    t_s: Array
+    t_s: Sequence[float] | Array
     value: Array
-    low: Array
-    high: Array
+    low: Array | float
+    high: Array | float
 
     @property
     def in_band_percent(self) -> float:
@@ -62,12 +57,13 @@ def _figure(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], wha
         axes, colour = panels[row.estimator], style.colour_of(comparison, row.estimator)
         shown = np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
-        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(style.shown_as(row)), linewidth=1.0)
+        axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(shown_as(row)), linewidth=1.0)
         shares.setdefault(row.estimator, []).append(f"{series.in_band_percent:.0f} %")
         style.annotate(axes, ", ".join(shares[row.estimator]))
-        least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
+        least = float(np.fmin.reduce(np.append(shown, series.low), initial=least))
+        most = float(np.fmax.reduce(np.append(shown, series.high), initial=most))
     style.scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
-    entries = style.output_entries({style.shown_as(row) for row, _ in found})
+    entries = style.output_entries({shown_as(row) for row, _ in found})
     seeds = f", {len(comparison.seeds)} seeds: mean" if comparison.over_seeds else ":"
     band = Entry("95 % band", Patch(color=style.BAND_COLOUR, linewidth=0.0))
     style.finish(figure, panels, what, f"{comparison.name}{seeds} {what}", [*entries, band])
@@ -75,28 +71,23 @@ def _figure(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], wha
 
 
 def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
-    def of(evaluation: Evaluation) -> Normalised:
-        nees = nees_over_time(evaluation)
-        low, high = (np.full(nees.pose.size, side) for side in nees_band(POSE_DOF))
-        return Normalised(comparison.sequence.elapsed_s(nees.t_ns), nees.pose, low, high)
-
-    if found := _series(comparison, of):
+    found = [
+        (row, Normalised(series.t_s, np.array(series.pose, float), *series.band))
+        for row in comparison.lines
+        if not isinstance(series := series_or_reason(nees_series, row, comparison.sequence), str)
+    ]
+    if found:
         yield NamedFigure("nees_over_time", _OF_NEES, _figure(comparison, found, "pose NEES / 6"))
 
 
 def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
-    def of(evaluation: Evaluation) -> Normalised:
-        nis = nis_over_time(evaluation)
-        t_s = comparison.sequence.elapsed_s(evaluation.estimate.t_ns[nis.rows])
-        return Normalised(t_s, nis.nis / nis.expected, *nis.bands())
-
-    if found := _series(comparison, of):
+    found = [
+        (row, Normalised(series.t_s, *(np.array(one, float) for one in (series.per_dof, series.low, series.high))))
+        for row in comparison.lines
+        if not isinstance(series := series_or_reason(nis_series, row, comparison.sequence), str)
+    ]
+    if found:
         yield NamedFigure("nis_over_time", _OF_NIS, _figure(comparison, found, "NIS / expected"))
-
-
-def _series(comparison: Comparison, of: Callable[[Evaluation], Normalised]) -> list[tuple[Row, Normalised]]:
-    found = ((row, available(of, row.run, row.output, comparison.sequence)) for row in comparison.lines)
-    return [(row, series) for row, series in found if series is not None]
 
 
 def draw_over_seeds(over: Comparison) -> Iterator[NamedFigure]:
@@ -124,7 +115,7 @@ def _errors(over: Comparison) -> NamedFigure:
             continue
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
-        kind = style.shown_as(group)
+        kind = shown_as(group)
         axes, t_s, colour = (
             panels[group.estimator],
             over.sequence.frames_s[known],

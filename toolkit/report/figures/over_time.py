@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.patches import Patch
+from msgspec.structs import asdict
 
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.files.writing import plain_name
@@ -17,13 +18,14 @@ from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.metrics.parts.against_truth import rmse
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import (
-    Components,
+    COMPONENTS,
     ErrorCurves,
-    Errors,
+    Numbers,
     available,
     components,
     error_curves,
     reference_estimate,
+    shown_as,
 )
 from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
@@ -48,38 +50,43 @@ def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
-    figure = style.new_figure(4.4)
+    figure, kind = style.new_figure(4.4), curves.kind
     position, heading = figure.subplots(2, 1, sharex=True)
-    for row, errors in curves.of_rows:
-        t_s, width = comparison.sequence.elapsed_s(errors.t_ns), style.width_of(comparison, row.estimator)
-        stroke = style.stroke_of(comparison.estimators, row.estimator, row.output)
-        position.plot(t_s, errors.position_m, linewidth=width, **stroke)
-        heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **stroke)
-    style.label_axes(position, f"{comparison.name}: position {curves.what}, {curves.placing}", "", "position [m]")
-    style.label_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
-    _limit_position(position, curves.of_rows)
-    _limit_heading(heading, curves.of_rows)
+    position_m = {row: _known(errors.position_m) for row, errors in curves.of_rows.items()}
+    heading_deg = {row: _known(errors.heading_deg) for row, errors in curves.of_rows.items()}
+    for row, errors in curves.of_rows.items():
+        width = style.width_of(comparison, row.estimator)
+        stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
+        position.plot(errors.t_s, position_m[row], linewidth=width, **stroke)
+        heading.plot(errors.t_s, _without_wraps(heading_deg[row]), linewidth=width, **stroke)
+    style.label_axes(position, f"{comparison.name}: position {kind.what}, {kind.placing}", "", "position [m]")
+    style.label_axes(heading, f"heading {kind.what}", "time [s]", "heading [deg]")
+    rms_m = {row: rmse(values) for row, values in position_m.items()}
+    _limit_position(position, position_m, rms_m)
+    _limit_heading(heading, heading_deg)
     figure.align_ylabels()
-    rms_m = {row.estimator: f"{number(rmse(errors.position_m))} m" for row, errors in curves.of_rows}
-    entries = style.entries_of(comparison, [(row.estimator, row.output) for row, _ in curves.of_rows])
-    style.legend_below(figure, [entry._replace(label=f"{entry.label}: {rms_m[entry.label]}") for entry in entries])
-    caption = (
-        f"Position and heading {curves.what} over time, in the legend the RMS of the position, of the final output"
-    )
-    return NamedFigure("errors_over_time", f"{caption} where there is one. {curves.caption}", figure)
+    told = {row.estimator: f"{number(value)} m" for row, value in rms_m.items()}
+    entries = style.entries_of(comparison, [(row.estimator, shown_as(row)) for row in curves.of_rows])
+    style.legend_below(figure, [entry._replace(label=f"{entry.label}: {told[entry.label]}") for entry in entries])
+    caption = f"Position and heading {kind.what} over time, in the legend the RMS of the position, of the final output"
+    return NamedFigure("errors_over_time", f"{caption} where there is one. {kind.caption}", figure)
 
 
-def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
+def _known(values: Numbers) -> Array:
+    return np.array(values, dtype=float)
+
+
+def _limit_position(axes: Axes, position_m: dict[Row, Array], rms_m: dict[Row, float]) -> None:
     """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them."""
-    largest = {row: float(np.nanmax(errors.position_m)) for row, errors in curves}
+    largest = {row: float(np.nanmax(values)) for row, values in position_m.items()}
     good = [size for row, size in largest.items() if row.status == "ok"] or largest.values()
     reach = 1.05 * max(*good, _LEAST_POSITION_M)
-    style.scale_errors(axes, [rmse(errors.position_m) for row, errors in curves if row.status == "ok"], reach)
+    style.scale_errors(axes, [size for row, size in rms_m.items() if row.status == "ok"], reach)
     _say_who_leaves(axes, largest, reach, "m")
 
 
-def _limit_heading(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
-    largest = {row: float(np.nanmax(np.abs(errors.heading_deg))) for row, errors in curves}
+def _limit_heading(axes: Axes, heading_deg: dict[Row, Array]) -> None:
+    largest = {row: float(np.nanmax(np.abs(values))) for row, values in heading_deg.items()}
     sizes = sorted(size for row, size in largest.items() if row.status == "ok") or sorted(largest.values())
     middle = max(sizes[(len(sizes) - 1) // 2], _LEAST_HEADING_DEG)
     reach = 1.05 * max(size for size in (*sizes, middle) if size <= _FAR_FROM_MIDDLE * middle)
@@ -130,23 +137,26 @@ def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
     what = "error" if reference is None else f"difference from {reference.name}"
     figure, colour, entries = style.new_figure(4.6), style.colour_of(comparison, name), []
     grid = figure.subplots(3, 2, sharex=True)
-    in_order = [*grid[:, 1], *grid[:, 0]]  # rotations first, as in Components
+    in_order = [*grid[:, 1], *grid[:, 0]]  # rotations first, as in COMPONENTS
+    shown: dict[str, list[tuple[Array, Array]]] = {name: [] for name in COMPONENTS}
     for row, one in found:
-        output, t_s = style.shown_as(row), comparison.sequence.elapsed_s(one.t_ns)
+        output, columns = shown_as(row), {name: _known(column) for name, column in asdict(one).items()}
         line, alpha = style.line_of(output), _BAND_ALPHA if output == "final" else 0.0
-        label = "causal = final" if row.label == "both" else row.output
-        for i, axes in enumerate(in_order):
-            if one.sigma is not None:
-                band = _SIGMAS * one.sigma[:, i]
-                axes.fill_between(t_s, -band, band, color=colour, alpha=alpha, linewidth=0.0)
-                axes.plot(t_s, np.stack([-band, band], axis=1), color=colour, linestyle=line, linewidth=0.6)
-            axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
+        label, is_stated = "causal = final" if row.label == "both" else row.output, False
+        for column, axes in zip(COMPONENTS, in_order, strict=True):
+            error, band = columns[column], _SIGMAS * columns[f"sigma_{column}"]
+            if np.isfinite(band).any():
+                is_stated = True
+                axes.fill_between(one.t_s, -band, band, color=colour, alpha=alpha, linewidth=0.0)
+                axes.plot(one.t_s, np.stack([-band, band], axis=1), color=colour, linestyle=line, linewidth=0.6)
+            axes.plot(one.t_s, error, color=colour, linestyle=line, linewidth=1.1)
+            shown[column].append((error, band))
         entries.append(Entry.of_line(f"{label}: {what.split(maxsplit=1)[0]}", colour, line))
-        if one.sigma is not None:
+        if is_stated:
             filled = Patch(facecolor=to_rgba(colour, alpha), edgecolor=colour, linestyle=line, linewidth=0.6)
             entries.append(Entry(f"{label}: ± 3 standard deviations", filled))
-    for i, axes in enumerate(in_order):
-        _limit(axes, [one for _, one in found], i)
+    for i, (column, axes) in enumerate(zip(COMPONENTS, in_order, strict=True)):
+        _limit(axes, shown[column])
         axis = f"about {'xyz'[i]} [deg]" if i < len("xyz") else f"{'xyz'[i - 3]} [m]"
         style.label_axes(axes, "", "time [s]" if i % 3 == 2 else "", axis)
     nees = [number(value) for row, _ in found if (value := row.value("nees_pose_mean")) is not None]
@@ -169,11 +179,12 @@ _OF_COMPONENTS = {
 }
 
 
-def _limit(axes: Axes, drawn: Collection[Components], i: int) -> None:
-    """Show all of the error around zero, and the band unless that would flatten the error."""
-    error = max(float(np.abs(one.error[:, i]).max()) for one in drawn)
-    bands = [_SIGMAS * float(np.nanmax(one.sigma[:, i])) for one in drawn if one.sigma is not None]
-    reach = max(error, _LEAST, min(max(bands, default=0.0), _BAND_REACH * max(error, _LEAST)))
+def _limit(axes: Axes, drawn: Collection[tuple[Array, Array]]) -> None:
+    """Show all of the errors around zero, and their bands unless those would flatten the errors."""
+    error, widest = (
+        float(np.fmax.reduce(np.abs(np.concatenate(one)), initial=0.0)) for one in zip(*drawn, strict=True)
+    )
+    reach = max(error, _LEAST, min(widest, _BAND_REACH * max(error, _LEAST)))
     axes.set_ylim(-1.08 * reach, 1.08 * reach)
     axes.axhline(0.0, color=style.ZERO_COLOUR, linewidth=0.8, zorder=1)
 
@@ -207,7 +218,7 @@ def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]])
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
             t_s = comparison.sequence.elapsed_s(one.t_ns)
-            stroke = style.stroke_of(comparison.estimators, row.estimator, style.shown_as(row))
+            stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
             lost = np.linalg.norm(one.excess[:, block], axis=1)
             axes.plot(t_s, scale * lost, linewidth=1.6, label=f"{row.estimator} {row.label}", **stroke)
             axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
@@ -222,7 +233,7 @@ def _bound_figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]])
     style.label_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     entries = [Entry.of_line(f"bound {output}", style.TRUTH_COLOUR, style.line_of(output), 2.0) for output in outputs]
-    entries += style.entries_of(comparison, [(row.estimator, style.shown_as(row)) for row, _ in found])
+    entries += style.entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
     entries += [Entry.of_line("thin: stated", style.MUTED_COLOUR, width=_STATED_WIDTH)]
     style.legend_below(figure, entries)
     return NamedFigure("against_bound", _OF_BOUND, figure)

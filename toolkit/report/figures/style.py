@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from toolkit.answers import Output
 
 if TYPE_CHECKING:  # with GTSAM, which figures of trajectory files do without
-    from toolkit.experiment.comparison import Comparison, Row
+    from toolkit.experiment.comparison import Comparison
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -82,11 +82,6 @@ def stroke_of(estimators: Iterable[str], estimator: str, output: Output = "final
 
     number, styles = look_numbers(estimators)[estimator], _LINE_OF[output]
     return Stroke(color=colour_at(number), linestyle=styles[number // len(_COLOURS) % len(styles)])
-
-
-def shown_as(row: "Row") -> Output:
-    """Return the kind of output whose line a row has: a filter's only answer is drawn as a final one."""
-    return "final" if row.label == "both" else row.output
 
 
 def width_of(comparison: "Comparison", estimator: str) -> float:

@@ -16,9 +16,9 @@ from toolkit.files import documents
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import usual_metrics
-from toolkit.report.curves import look_numbers
+from toolkit.report.curves import ComponentSeries, NeesSeries, look_numbers
 from toolkit.report.messages import ContestRecord, contest_text
-from toolkit.report.report_json import ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
+from toolkit.report.report_json import DrawnMap, DrawnOverSeeds, DrawnRun
 from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
 from toolkit.report.text import unit_of
