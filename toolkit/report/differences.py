@@ -17,7 +17,7 @@ from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Repeats, Where
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
-from toolkit.report.run_directory import RunFiles, SeedsFiles
+from toolkit.report.run_directory import RunFiles, SeedsFiles, repeated
 from toolkit.report.scores import MetricOverSeeds
 from toolkit.report.text import MISSING, WIDTH, Table, Width, as_text, cell, filled
 
@@ -71,7 +71,8 @@ class DiffRecord(Struct, frozen=True, kw_only=True):
 
 def differences(before: Files, after: Files) -> DiffRecord:
     lines = [_lines(files) for files in (before, after)]
-    both = [key for key in lines[0] if key in lines[1] and not all(_repeats_causal(side, key) for side in lines)]
+    twice = repeated(before) & repeated(after)
+    both = [key for key in lines[0] if key in lines[1] and not (key[0] in twice and key[1] == "final")]
     paired = _reads_the_same(before, after)
     values = [(key, metric) for key in both for metric in known_metrics()]
     raw = [_tested(lines[0][key], lines[1][key], metric, paired=paired) for key, metric in values]
@@ -157,16 +158,6 @@ def _lines(files: Files) -> dict[tuple[str, str], _Line]:
         (run.estimator, run.output): _Line(by_seed(run.status), {k: by_seed(one) for k, one in run.metrics.items()})
         for run in files.scores.runs
     }
-
-
-def _repeats_causal(lines: Mapping[tuple[str, str], _Line], key: tuple[str, str]) -> bool:
-    causal = lines.get((key[0], "causal"))
-    if key[1] == "causal" or causal is None:
-        return False
-    given = {
-        metric: values for metric, values in lines[key].values.items() if any(v is not None for v in values.values())
-    }
-    return all(causal.values.get(metric) == values for metric, values in given.items())
 
 
 def _reads_the_same(before: Files, after: Files) -> bool:

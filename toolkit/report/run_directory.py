@@ -53,6 +53,7 @@ from toolkit.report.scores import (
 )
 
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
+_ERRORS = ("ate_none_m", "ate_se3_m", "ate_yaw_m", "heldout_reproj_rmse_px", "nees_pose_mean")
 
 if TYPE_CHECKING:
     from toolkit.report.figures import FigureChoice, FigureFormat
@@ -235,6 +236,16 @@ class SeedsFiles:
     scores: Seeds
     report: SeedsReport
     manifest: Manifest
+
+
+def repeated(files: RunFiles | SeedsFiles) -> frozenset[str]:
+    """Return the estimators whose final answer is the causal one; over seeds, where all errors of all seeds are."""
+    if isinstance(files, RunFiles):
+        return frozenset(run.estimator for run in files.report.runs if run.repeats_causal)
+    of = {(run.estimator, run.output): [run.metrics[key].values for key in _ERRORS] for run in files.scores.runs}
+    return frozenset(
+        name for (name, output), values in of.items() if output == "final" and values == of.get((name, "causal"))
+    )
 
 
 def runs_in(directory: Path) -> tuple[Path, ...]:

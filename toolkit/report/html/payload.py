@@ -19,7 +19,7 @@ from toolkit.report.comparison_table import usual_metrics
 from toolkit.report.curves import ComponentSeries, NeesSeries, look_numbers
 from toolkit.report.messages import ContestRecord, contest_text
 from toolkit.report.report_json import DrawnMap, DrawnOverSeeds, DrawnRun
-from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
+from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles, repeated
 from toolkit.report.scores import MetricOverSeeds, RunOverSeeds, ScoredRun
 from toolkit.report.text import unit_of
 
@@ -95,12 +95,11 @@ def _of_one_run(files: RunFiles, rows: list[Json]) -> Json:
 
 def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     """Return a row for each kind of output that says something of its own, as in the other tables."""
-    repeated = {run.estimator for run in files.report.runs if run.repeats_causal}
-    changes = files.report.words.changes
+    twice, changes = repeated(files), files.report.words.changes
     return [
         _row(run, f"{case_id}r{i}", colours)
         | {
-            "output": "both" if run.estimator in repeated else run.output,
+            "output": "both" if run.estimator in twice else run.output,
             "good": run.status == "ok",
             "change": changes.get(run.estimator, ""),
             "track": None if drawn.trajectory is None else _drawn(files.tracks[drawn.trajectory], drawn),
@@ -202,14 +201,15 @@ def columns_of(values: Mapping[str, Sequence[float | None]], *, real: bool) -> l
 
 def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     rows: list[Json] = []
+    twice = repeated(files)
     for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
         ok, seeds = run.counts["ok"], len(run.status)
-        if i > 0 and _are_the_same(files.scores.runs[i - 1], run):
-            rows[-1]["output"] = "both"
+        if run.estimator in twice and run.output == "final":
             continue
         rows.append(
             _row(run, f"{case_id}r{i}", colours)
             | {
+                "output": "both" if run.estimator in twice else run.output,
                 "status": "ok" if ok == seeds else f"{ok} of {seeds} ok",
                 "good": ok == seeds,
                 "change": run.change or "",
@@ -221,15 +221,6 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
             }
         )
     return rows
-
-
-def _are_the_same(causal: RunOverSeeds, final: RunOverSeeds) -> bool:
-    """Say whether a final row repeats the causal one before it: every error of every seed is the same."""
-    same = causal.estimator == final.estimator and causal.output == "causal"
-    keys = ("ate_none_m", "ate_se3_m", "ate_yaw_m", "heldout_reproj_rmse_px", "nees_pose_mean")
-    pairs = [(causal.metrics[key], final.metrics[key]) for key in keys]
-    known = [(one, other) for one, other in pairs if one.n and other.n]
-    return same and bool(known) and all(one.values == other.values for one, other in known)
 
 
 def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
