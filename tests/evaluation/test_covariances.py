@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from tests.evaluation.conftest import run_of, runs_in
+from tests.frontend.test_bags import Ros
 from toolkit.datasets.trajectories import tum
 from toolkit.datasets.trajectories.covariances import CONVENTIONS, written_as
 from toolkit.estimate import Trajectory
@@ -130,27 +129,17 @@ def test_where_no_convention_is_said_the_truth_tells_which_fits(scene, vislam, c
     assert said["metrics"]["nees_pose_mean"] == pytest.approx(1.0, abs=0.06)
 
 
-def write_bag(path: Path, trajectory: Trajectory, topics: tuple[str, ...], convention: str = "pos-rot/fixed") -> None:
+def write_bag(path: Path, given: Trajectory, topics: tuple[str, ...], convention: str = "pos-rot/fixed") -> None:
     """Write the poses as odometry, each topic the same, with covariances in a convention."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-
-    def make(name: str, *values: object) -> object:
-        return store.types[name](*values)
-
-    zeros = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    twist = make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", zeros, zeros), np.zeros(36))
-    covs = written_as(CONVENTIONS[convention], trajectory.T_world_imu, trajectory.cov, 6)
-    turns = quaternion_from_rotation(trajectory.T_world_imu[:, :3, :3])
-    with Writer(path) as writer:
-        for topic in topics:
-            connection = writer.add_connection(topic, "nav_msgs/msg/Odometry", typestore=store)
-            for t_ns, at, turn, cov in zip(trajectory.t_ns.tolist(), trajectory.positions, turns, covs, strict=True):
-                stamp = make("builtin_interfaces/msg/Time", *divmod(t_ns, 10**9))
-                header = make("std_msgs/msg/Header", 0, stamp, "odom")
-                where = make("geometry_msgs/msg/Point", *at), make("geometry_msgs/msg/Quaternion", *turn)
-                pose = make("geometry_msgs/msg/PoseWithCovariance", make("geometry_msgs/msg/Pose", *where), cov.ravel())
-                message = make("nav_msgs/msg/Odometry", header, "imu", pose, twist)
-                writer.write(connection, t_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+    covs = np.ascontiguousarray(written_as(CONVENTIONS[convention], given.T_world_imu, given.cov, 6)).reshape(-1, 36)
+    turns, ros = quaternion_from_rotation(given.T_world_imu[:, :3, :3]), Ros.of("ros1")
+    ros.write(path, [
+        ros.item(t_ns, topic, "nav_msgs/Odometry", "odom", child_frame_id="imu", pose={
+            "pose": {"position": at, "orientation": turn}, "covariance": cov,
+        })
+        for topic in topics
+        for t_ns, at, turn, cov in zip(given.t_ns.tolist(), given.positions, turns, covs, strict=True)
+    ])  # fmt: skip
 
 
 def test_odometry_of_a_bag_is_scored_with_the_covariances_of_ros(scene, vislam, capsys):
