@@ -733,7 +733,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     ],
     "odometry": [
         (edit("calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
-        (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "missing P0"),
+        (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "P0 holds text, expected real numbers"),
         (text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 5 images; cut both alike, or take its own"),
         (text("times.txt", "0\n0.1\nx\n"), "times.txt: line 3 is not numeric"),
         (text("times.txt", "".join(f"{k}00000000\n" for k in range(FRAMES))), "look like nanoseconds: divide by 1e9"),
@@ -783,7 +783,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say("tracks", "@", "--out", "@/calib.txt/x"), "choose another directory with --out"),
     ],
     "day": [
-        (edit("calib_imu_to_velo.txt", "T: 0 0 0", "T: 0 O 0"), "calib_imu_to_velo.txt: missing T; it has R"),
+        (edit("calib_imu_to_velo.txt", "T: 0 0 0", "T: 0 O 0"), "T holds text, expected real numbers"),
         (gone(f"{DAY}/image_00/timestamps.txt"), "timestamps.txt: cannot be read"),
         (text(f"{DAY}/image_00/timestamps.txt", "\n\n"), "holds no stamps"),
         (text(f"{DAY}/oxts/data/0000000003.txt", "1 2 3"), "0000000003.txt: 3 numbers"),

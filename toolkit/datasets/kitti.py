@@ -17,7 +17,6 @@ at the first latitude.
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,6 +40,7 @@ from toolkit.datasets.io.image_pairs import (
     pinhole_of,
     seen_in,
 )
+from toolkit.datasets.io.tables import is_number
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.formats import read_rows
 from toolkit.errors import DataError
@@ -173,7 +173,7 @@ def _rectified_pair(file: Path, names: list[str], P: tuple[Array, Array], size_p
 
 
 def _calibration(file: Path, where: str) -> Fields:
-    """Read rows of numbers with a name, else P0, P1, ...; what is no number, such as a date, is left out."""
+    """Read rows of numbers with a name, else P0, P1, ...; a row that is none, such as a date, is a text."""
     if not file.exists():
         raise DataError(f"{file}: is missing; {where}")
     arrays: dict[str, np.ndarray] = {}
@@ -181,8 +181,9 @@ def _calibration(file: Path, where: str) -> Fields:
     # A row that is no numbers keeps its place, so that none after it is taken for another.
     for row, line in enumerate(lines):
         key, colon, rest = line.rpartition(":")
-        with suppress(ValueError):
-            arrays[key.strip() if colon else f"P{row}"] = np.array([float(word) for word in rest.split()])
+        words = rest.split()
+        values = np.array(list(map(float, words)) if all(map(is_number, words)) else words)
+        arrays[key.strip() if colon else f"P{row}"] = values
     return Fields(file, arrays)
 
 
@@ -205,9 +206,8 @@ def _of_calib(layout: _Layout, size_px: tuple[int, int]) -> _Mounted:
     file, rows = layout.root / "calib.txt", (2, 3) if layout.left.name == "image_2" else (0, 1)
     names = [f"P{row}" for row in rows]
     fields = _calibration(file, "put the calib.txt of this sequence there, with the rows P0: to P3:")
-    projections = {name: row for name, row in fields.arrays.items() if row.size == 12}
-    if lacking := [name for name in names if name not in projections]:
-        there = ", ".join(projections) or "none"
+    if lacking := [name for name in names if name not in fields]:
+        there = ", ".join(fields.arrays) or "none"
         raise DataError(f"{file}: missing {', '.join(lacking)}, twelve numbers each; it has {there}")
     left, right = (fields.array(name, 12).reshape(3, 4) for name in names)
     pair = _rectified_pair(file, names, (left, right), size_px)
