@@ -29,7 +29,6 @@ from toolkit.measurements import (
     Packet,
     Prior,
     StereoFrame,
-    TwistChangeNoise,
     TwistNoise,
 )
 from toolkit.models import stereo
@@ -106,8 +105,7 @@ def start_from_measurements(sequence: Sequence) -> Prior:
     try:
         first, cov = _found(packets, sequence)
     except NoSoundStartError as reason:
-        measured = [packet.motion for packet in packets if isinstance(packet.motion, ImuMotion)]
-        return _blind(_level_attitude(measured), str(reason), sequence)
+        return _blind(packets, str(reason), sequence)
     assert first.v_world is not None
     assert first.bias is not None
     whole = cov if len(cov) == _PRIOR_SIZE else _with_accel_bias(cov)
@@ -234,23 +232,16 @@ def _first_packets(sequence: Sequence) -> list[Packet]:
     return packets
 
 
-def _level_attitude(motions: list[ImuMotion]) -> Array:
-    """Return the attitude (3, 3) of the first frame, levelled by the mean specific force; without one the identity."""
-    turn, force = np.eye(3), np.zeros(3)
-    for motion in motions:
-        for dt_s, accel, gyro in zip(motion.dt_s, motion.accel_mps2, motion.gyro_radps, strict=True):
-            turn = turn @ so3_exp(0.5 * dt_s * gyro)
-            force = force + dt_s * (turn @ accel)
-            turn = turn @ so3_exp(0.5 * dt_s * gyro)
-    return levelling(force) if motions else np.eye(3)
-
-
-def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
-    """Return the start from the specific force alone, if there is any, and in its source why vision was not used."""
-    if isinstance(sequence.noise, TwistChangeNoise):
+def _blind(packets: list[Packet], why: str, sequence: Sequence) -> Prior:
+    """Return the start levelled by the mean specific force, if there is any; its source says why without vision."""
+    if not isinstance(sequence.noise, ImuNoise):
         sigmas = [GAUGE_SIGMA, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, TURN_SIGMA]
         source = f"the first frame as the world; velocity and turn rate unknown and assumed to be zero, because {why}"
         return Prior(np.eye(4), np.zeros(3), np.zeros(6), np.diag(np.repeat(sigmas, 3) ** 2), source)
+    params = preintegration_params(sequence.noise, sequence.gravity_world)
+    measured = [packet.motion for packet in packets if isinstance(packet.motion, ImuMotion)]
+    path = _Path.of([preintegrate(motion, np.zeros(6), params) for motion in measured])
+    attitude = levelling(path.gained_mps[-1])
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
