@@ -150,8 +150,6 @@ def test_a_truth_of_another_body_is_moved_to_the_imu(recording: Path) -> None:
     T_body_sensor = se3(so3_exp(np.array([0.0, 0.0, 0.4])), np.array([0.1, 0.0, -0.2]))
     (recording / "mav0/state_groundtruth_estimate0/sensor.yaml").write_text(camera_yaml(T_body_sensor))
     after = load_sequence(str(recording)).truth
-    assert before is not None
-    assert after is not None
     np.testing.assert_allclose(after.T_world_imu[::10] @ T_body_sensor, before.T_world_imu[::10], atol=1e-9)
     assert after.v_world is None
     assert after.bias is None
@@ -160,7 +158,6 @@ def test_a_truth_of_another_body_is_moved_to_the_imu(recording: Path) -> None:
 def test_frames_lie_inside_the_truth_which_is_interpolated_there(recording: Path) -> None:
     sequence = load_sequence(str(recording))
     truth = sequence.truth
-    assert truth is not None
     np.testing.assert_array_equal(truth.t_ns, sequence.frames_t_ns)
     t_s = (sequence.frames_t_ns - START_NS) / 1e9
     assert t_s[0] == pytest.approx(0.50125)
@@ -168,7 +165,6 @@ def test_frames_lie_inside_the_truth_which_is_interpolated_there(recording: Path
     # the swing's angular acceleration of 2 rad/s^2 leaves a chord over 5 ms by 6e-6 rad
     np.testing.assert_allclose(truth.T_world_imu[:, :3, :3], orientations(t_s), atol=1e-5)
     np.testing.assert_allclose(truth.T_world_imu[:, 0, 3], 0.5 * t_s, atol=1e-5)
-    assert truth.bias is not None
     np.testing.assert_allclose(truth.bias[3], [0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
 
 
@@ -187,7 +183,6 @@ def test_of_two_truths_the_one_that_turns_as_the_gyro_says_is_used(recording: Pa
     write(recording / "again.csv", truth_text(truth_s, good))
     sequence = load_sequence(str(recording))
     assert sequence.provenance.facts[1].startswith("the truth is again.csv, the better")
-    assert sequence.truth is not None
     t_s = (sequence.frames_t_ns - START_NS) / 1e9
     np.testing.assert_allclose(sequence.truth.T_world_imu[:, :3, :3], orientations(t_s), atol=1e-5)
 
@@ -204,7 +199,6 @@ def test_the_lean_layout_has_the_published_calibration_and_says_so(recording: Pa
 def test_tracks_have_the_stated_number_noise_and_short_lives(recording: Path) -> None:
     sequence = load_sequence(str(recording))
     truth, seen, rig = sequence.truth, sequence.observations, sequence.rig
-    assert truth is not None
     per_frame = np.bincount(seen.frame, minlength=sequence.frame_count)
     assert per_frame.max() == 100
     here, there = seen.frame == 20, seen.frame == 21
@@ -227,8 +221,6 @@ def test_the_seed_draws_the_noise_and_nothing_else(recording: Path) -> None:
     assert other.content_hash() != same.content_hash()
     assert other.provenance.source.endswith("seed 1")
     np.testing.assert_array_equal(other.motion.values, same.motion.values)
-    assert same.truth is not None
-    assert other.truth is not None
     np.testing.assert_array_equal(other.truth.T_world_imu, same.truth.T_world_imu)
 
 
@@ -255,8 +247,6 @@ def test_the_noise_covers_what_the_real_imu_and_the_truth_differ_by_between_fram
 ) -> None:
     sequence = loaded(real(f"euroc/{name}"))
     truth, noise = sequence.truth, sequence.noise
-    assert truth is not None
-    assert truth.bias is not None
     assert isinstance(noise, ImuNoise)
     R_world_imu, turned = truth.T_world_imu[:, :3, :3], np.zeros((sequence.frame_count - 1, 3))
     for packet in itertools.islice(sequence.packets(), 1, None):

@@ -84,13 +84,11 @@ def test_slow_packets_are_twists_and_fast_ones_an_imu(drive: Path) -> None:
 
 def test_the_truth_is_east_north_up_and_of_the_same_instrument(drive: Path) -> None:
     truth = load_sequence(str(drive)).truth
-    assert truth is not None
     assert not truth.independent
     np.testing.assert_allclose(truth.T_world_imu[:, :3, 3], np.outer(0.05 * np.arange(9), [1.0, 0.0, 0.0]), atol=1e-6)
     # a car that heads north has its x along the world's y
     (drive / "oxts/data/0000000000.txt").write_text(packet(0.0, yaw=np.pi / 2.0))
     turned = load_sequence(str(drive))
-    assert turned.truth is not None
     np.testing.assert_allclose(turned.truth.T_world_imu[0, :3, 0], [0.0, 1.0, 0.0], atol=1e-9)
     assert isinstance(turned.motion, TwistSamples)
     np.testing.assert_allclose(turned.motion.v_mps[0], [0.0, -SPEED_MPS, 0.0], atol=1e-9)

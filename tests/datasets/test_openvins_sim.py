@@ -16,8 +16,6 @@ from toolkit.motion_samples import ImuSamples
 def test_gravity_and_specific_force_agree_with_the_velocities_of_the_truth(real: Callable[[str], Path]) -> None:
     sequence = load_sequence(str(real("openvins_sim/euroc_V1_01_easy_rect_s0")))
     truth, motion = sequence.truth, sequence.motion
-    assert truth is not None
-    assert truth.v_world is not None
     assert isinstance(motion, ImuSamples)
     dt_s = (truth.t_ns[2:] - truth.t_ns[:-2]) / NS_PER_S
     accel_world = (truth.v_world[2:] - truth.v_world[:-2]) / dt_s[:, None] - sequence.gravity_world
@@ -45,8 +43,6 @@ def test_calibration_noise_and_truth_land_in_their_fields(openvins: Path) -> Non
     assert sequence.noise == ImuNoise(0.001, 0.001, 0.001, 0.001)
     assert sequence.gravity_world[2] == -9.8
     assert sequence.prior is None
-    assert sequence.truth is not None
-    assert sequence.truth.bias is not None
     np.testing.assert_array_equal(sequence.truth.bias[0], [0.4, 0.5, 0.6, 0.1, 0.2, 0.3])
     np.testing.assert_array_equal(sequence.truth.T_world_imu[0, :3], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]])
 

@@ -21,7 +21,6 @@ def written(folder: Path, variables: dict[str, Any]) -> Path:
 def test_indoor_twist_errors_have_the_stated_variances_under_the_stated_pairing(real: Callable[[str], Path]) -> None:
     path = real("utias/dataset3.mat")
     sequence = utias_mat.load(path)
-    assert sequence.truth is not None
     assert isinstance(sequence.motion, TwistSamples)
     assert sequence.motion.pairing == "start"
     R_world_imu = sequence.truth.T_world_imu[:, :3, :3]

@@ -342,14 +342,11 @@ def _nearest_source(path: Path, source: str) -> str:
             beside = [inside.name for inside in islice(path.parent.iterdir(), _COMPARED)]
         except OSError:  # a folder that may be entered and not listed
             return "; check the path"
-        return did_you_mean(path.name, beside) or f"; {path.parent} has {_some(beside)}"
+        shown = sorted(beside, key=lambda name: (name.startswith("."), name))[:_SHOWN]
+        some = f"{', '.join(shown)}{' and more' if len(beside) > _SHOWN else ''}" if shown else "nothing in it"
+        return did_you_mean(path.name, beside) or f"; {path.parent} has {some}"
     names = built_in_names()
     return did_you_mean(source, names) or f", and the built-in sequences are {', '.join(names)}"
-
-
-def _some(names: list[str]) -> str:
-    shown = sorted(names, key=lambda name: (name.startswith("."), name))[:_SHOWN]
-    return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"
 
 
 def _check_types(sequence: Sequence) -> None:

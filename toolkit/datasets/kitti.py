@@ -29,7 +29,6 @@ from toolkit.datasets.io.image_pairs import (
     check_both_cameras,
     check_one_clock,
     check_several_stamps,
-    first_with_images,
     image_folder,
     image_size,
     images_in,
@@ -132,8 +131,8 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
 def _layout(path: Path) -> _Layout | None:
     """Return the first pair of cameras that both have images, else the first of which one has."""
     layouts = [_Layout.of(path.resolve(), *folders) for folders in _FOLDERS]
-    place = first_with_images([(one.left, one.right) for one in layouts])
-    return None if place is None else layouts[place]
+    there = [(one, [bool(images_in(side)) for side in (one.left, one.right)]) for one in layouts]
+    return next((one for how in (all, any) for one, both in there if how(both)), None)
 
 
 def _whole(path: Path) -> _Layout:

@@ -202,8 +202,7 @@ def _is_single_precision(stamps: Array) -> bool:
 
 def probable_unit(stamps_s: Array) -> str | None:
     """Return the unit, with its remedy, that stamps (N,) are probably in, or None where seconds are plausible."""
-    unit = _unit_of(stamps_s)
-    return None if unit is None else unit[1]
+    return (_unit_of(stamps_s) or (0.0, None))[1]
 
 
 def _unit_of(stamps_s: Array) -> tuple[float, str] | None:

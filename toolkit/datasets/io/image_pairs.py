@@ -202,12 +202,6 @@ def seen_in(root: Path, filmed: ImageRecording, T_imu_left: Array, frontend: Fro
     return Seen(tracks.t_ns, sightings, _rig_of(filmed.rig, T_imu_left), _facts_of(tracks, len(filmed.pairs)))
 
 
-def first_with_images(pairs: Sequence[tuple[Path, Path]]) -> int | None:
-    """Return which pair of folders is the first that both have images, else the first of which one has."""
-    there = [[bool(images_in(folder)) for folder in pair] for pair in pairs]
-    return next((place for how in (all, any) for place, both in enumerate(there) if how(both)), None)
-
-
 def image_size(left: Path, right: Path) -> tuple[int, int]:
     """Return the size (width, height) px of the first image that can be opened; DataError has the first one's fault."""
     found = images_in(left) or images_in(right)
