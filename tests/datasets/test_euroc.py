@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.frontend.conftest import camera_yaml as yaml_of
 from toolkit.datasets import euroc, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.errors import DataError
+from toolkit.frontend import Camera
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.measurements import ImuMotion, ImuNoise
 from toolkit.models.stereo import project, triangulate
@@ -54,11 +56,8 @@ def truth_text(t_s: Array, R_world_imu: Array) -> str:
 
 
 def camera_yaml(T_body_sensor: Array) -> str:
-    data = ",\n         ".join(", ".join(f"{x:.13g}" for x in row) for row in T_body_sensor)
-    return (
-        f"%YAML:1.0\n# A camera.\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n\n"
-        "resolution: [752, 480]\nintrinsics: [458.0, 457.0, 367.0, 248.0] #fu, fv\n"
-    )
+    pinhole_px = (458.0, 457.0, 367.0, 248.0)
+    return yaml_of(Camera(pinhole_px, "none", np.zeros(4), (752, 480)), T_body_sensor)
 
 
 def imu_yaml(T_body_imu: Array) -> str:
