@@ -10,7 +10,7 @@ from toolkit.evaluation.scoring import Terms
 from toolkit.evaluation.standings import EvaluatedSystems, evaluate, read_evaluation
 from toolkit.report.figures.trajectories import draw
 
-NAMES = ["boxes", "map_truth", "errors_truth", "positions_truth", "angles_truth"]
+NAMES = ["boxes", "map_truth", "errors_truth"]
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
-"""Trajectory files of any systems: the map, errors over time, positions and angles, and every run's error as boxes.
+"""Trajectory files of any systems: the map, errors over time, and every run's error as boxes.
 
 Of each system it is the run of the middle error that is drawn, after the fit of SE(3) to its positions, as evo's -a.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from toolkit.errors import DataError
 from toolkit.evaluation.scoring import TruthFile, aligned_file
 from toolkit.evaluation.standings import EvaluatedSystems, RunRecord
 from toolkit.files.writing import plain_name
-from toolkit.geometry import Array, IntArray, yaw_of
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Unavailable
 from toolkit.metrics.parts.against_truth import Matched, angles_deg, changes, lengths, rmse
@@ -48,9 +48,6 @@ def draw(evaluation: EvaluatedSystems, *, all_sequences: bool = False) -> Iterat
         name = f"{name}-{i + 1}" if name in map(plain_name, sequences[:i]) else name
         yield _map(name, truth, drawn)
         yield _errors(name, truth, drawn)
-        yield _components(f"positions_{name}", truth, drawn, "position", lambda poses: poses[:, :3, 3])
-        if changes(truth.poses[:, :3, :3]):
-            yield _components(f"angles_{name}", truth, drawn, "angles", _roll_pitch_yaw_deg)
 
 
 def _drawn(evaluation: EvaluatedSystems, sequence: str) -> list[_Drawn]:
@@ -81,14 +78,6 @@ def _since_start(truth: TruthFile, t_ns: IntArray) -> Array:
     return since if truth.is_timed else np.arange(t_ns.size, dtype=float)
 
 
-def _x_label(truth: TruthFile) -> str:
-    return "time [s]" if truth.is_timed else "pose"
-
-
-def _entries(drawn: list[_Drawn]) -> list[Entry]:
-    return [Entry.of_line(one.system, one.colour) for one in drawn]
-
-
 def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     figure = style.new_figure(5.0)
     axes = figure.subplots()
@@ -98,7 +87,7 @@ def _map(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     axes.plot(*truth.poses[0, :2, 3], "o", color=style.TRUTH_COLOUR, markersize=5.0)
     axes.set_aspect("equal", adjustable="datalim")
     style.label_axes(axes, f"{truth.name} from above, {_FITTED}", "x [m]", "y [m]")
-    style.legend_below(figure, [_TRUTH, *_entries(drawn)])
+    style.legend_below(figure, [_TRUTH, *(Entry.of_line(one.system, one.colour) for one in drawn)])
     return NamedFigure(f"map_{name}", f"{truth.name} from above, from the dot on, {_FITTED} to all positions.", figure)
 
 
@@ -124,44 +113,13 @@ def _errors(name: str, truth: TruthFile, drawn: list[_Drawn]) -> NamedFigure:
     if with_angles:
         style.label_axes(grid[1], "rotation error", "", "rotation [deg]")
         grid[1].set_ylim(bottom=0.0)
-    grid[-1].set_xlabel(_x_label(truth))
+    grid[-1].set_xlabel("time [s]" if truth.is_timed else "pose")
     style.scale_errors(grid[0], sizes, 1.05 * largest)
     figure.align_ylabels()
     style.legend_below(figure, entries)
     return NamedFigure(
         f"errors_{name}", f"Errors on {truth.name} over time, {_FITTED}, with their RMSE and median.", figure
     )
-
-
-_ROWS = {"position": ("x [m]", "y [m]", "z [m]"), "angles": ("roll [deg]", "pitch [deg]", "yaw [deg]")}
-
-
-def _components(
-    name: str, truth: TruthFile, drawn: list[_Drawn], what: str, values_of: Callable[[Array], Array]
-) -> NamedFigure:
-    """Return three panels, one a component (n, 3) of poses (n, 4, 4), the truth's and each estimate's."""
-    figure = style.new_figure(4.6)
-    grid = figure.subplots(3, 1, sharex=True)
-    for i, (axes, row) in enumerate(zip(grid, _ROWS[what], strict=True)):
-        at_s = _since_start(truth, truth.t_ns)
-        axes.plot(at_s, values_of(truth.poses)[:, i], color=style.TRUTH_COLOUR, linewidth=2.0)
-        for one in drawn:
-            at_s = _since_start(truth, one.matched.t_ns)
-            axes.plot(at_s, values_of(one.matched.estimate)[:, i], color=one.colour, linewidth=1.2)
-        title = f"{truth.name}: {what}, {_FITTED}" if i == 0 else ""
-        style.label_axes(axes, title, _x_label(truth) if i == 2 else "", row)
-    figure.align_ylabels()
-    style.legend_below(figure, [_TRUTH, *_entries(drawn)])
-    told = "Position" if what == "position" else "Roll, pitch and yaw (about z, then y, then x)"
-    return NamedFigure(name, f"{told} on {truth.name} over time, {_FITTED}, with the truth.", figure)
-
-
-def _roll_pitch_yaw_deg(poses: Array) -> Array:
-    """Return the angles (n, 3) of R = Rz(yaw) Ry(pitch) Rx(roll), without leaps of a whole turn."""
-    rotation = poses[:, :3, :3]
-    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
-    pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
-    return np.degrees(np.unwrap(np.stack([roll, pitch, yaw_of(rotation)], axis=1), axis=0))
 
 
 def _boxes(evaluation: EvaluatedSystems) -> Iterator[NamedFigure]:
