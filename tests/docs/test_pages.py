@@ -1,8 +1,8 @@
 """The documentation works as printed: files, programs and commands run, links lead somewhere, tables are the tool's."""
 
-import inspect
 import io
 import json
+import os
 import re
 import shlex
 import shutil
@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -98,32 +98,23 @@ _NO_DIGITS = "..."
 MARKS = ("overconfident", "timid", "heavy-tailed", "contradicted")
 
 
-@pytest.fixture(scope="module")
-def first_line(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """What the first line of the README prints of the first seconds, and the folder it was run in."""
-    folder = tmp_path_factory.mktemp("readme")
-    return as_a_stranger(f"{FIRST_LINE} --max-frames 40", folder), folder
-
-
 # The page on extending drops files into the packages. A copy of them is where nothing else sees these.
 _IN_A_COPY = """
-import io, json, shlex, sys
-from collections import namedtuple
-from contextlib import redirect_stdout
+import json, sys
 from pathlib import Path
 from matplotlib.figure import Figure
-from toolkit import cli
-from toolkit.cli import main
+from tests.docs.test_pages import EXTENDING, USE, carry_out, steps_of
 from toolkit.experiment import pipeline
 
 pipeline.usable_cpus = lambda: 1
 Figure.savefig = lambda figure, path, **options: Path(path).touch()
-Sequence, Block = list, namedtuple("Block", "language title text")
-
-{carry_out}
-steps = [step if isinstance(step, str) else Block(**step) for step in json.load(sys.stdin)]
-json.dump(carry_out(steps), sys.stdout)
+json.dump(carry_out([*steps_of(EXTENDING), *USE]), sys.stdout)
 """
+# What a user does who follows the page.
+USE = (
+    *(f"vislam list {kind}" for kind in ("estimators", "formats", "metrics")),
+    "vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run",
+)
 
 
 class Extended(NamedTuple):
@@ -143,24 +134,13 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Extended:
         unfinished = shutil.ignore_patterns("*.pyc.*", "*.tmp.*")
         shutil.copytree(PROJECT / package, folder / package, ignore=unfinished)
     write_files(EXTENDING, folder)
-    compare = "vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run"
-    kinds = ("estimators", "formats", "metrics")
-    steps = [*_steps(EXTENDING), *(f"vislam list {kind}" for kind in kinds), compare]
     # -c puts the working directory first on the path, so the copy is what is imported.
-    ended = subprocess.run(
-        [sys.executable, "-c", _IN_A_COPY.format(carry_out=inspect.getsource(carry_out))],
-        cwd=folder,
-        input=json.dumps([step if isinstance(step, str) else asdict(step) for step in steps]),
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    words, path = [sys.executable, "-c", _IN_A_COPY], {**os.environ, "PYTHONPATH": str(PROJECT)}
+    ended = subprocess.run(words, cwd=folder, env=path, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 0, ended.stderr
     assert "Traceback" not in ended.stderr, ended.stderr
     printed = json.loads(ended.stdout)
-    by_page, listed = printed[: len(_steps(EXTENDING))], printed[len(_steps(EXTENDING)) : -1]
-    return Extended(by_page, "\n".join(listed), folder)
+    return Extended(printed[: -len(USE)], "\n".join(printed[-len(USE) : -1]), folder)
 
 
 def write_files(page: Path, folder: Path) -> None:
@@ -174,7 +154,7 @@ def _name(page: Path) -> str:
     return str(page.relative_to(PROJECT))
 
 
-def _steps(page: Path) -> list[str | Block]:
+def steps_of(page: Path) -> list[str | Block]:
     """Return the commands and the programs of a page, in order."""
     return [
         step
@@ -188,32 +168,31 @@ by_page = pytest.mark.parametrize("page", PAGES, ids=_name)
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if _steps(page) and page not in (README, EXTENDING, COURSE)], ids=_name
+    "page", [page for page in PAGES if steps_of(page) and page not in (README, EXTENDING, COURSE)], ids=_name
 )
 def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, alone: Path) -> None:
     write_files(page, alone)
-    steps = _steps(page)
+    steps = steps_of(page)
     assert_tables_are_those_shown(page, dict(zip(steps, carry_out(steps), strict=True)))
 
 
-def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(
-    first_line: tuple[str, Path], alone: Path
-) -> None:
-    steps = [step for step in _steps(README) if step != FIRST_LINE]
-    assert {row[:2] for row in _rows(first_line[0])} == {(name, one) for name in SEQUENCES for one in defaults()}
-    assert (first_line[1] / "runs").is_dir()
+def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(alone: Path) -> None:
+    printed = as_a_stranger(f"{FIRST_LINE} --max-frames 40", alone)
+    assert {row[:2] for row in _rows(printed)} == {(name, one) for name in SEQUENCES for one in defaults()}
+    assert (alone / "runs").is_dir()
+    steps = [step for step in steps_of(README) if step != FIRST_LINE]
     assert_tables_are_those_shown(README, dict(zip(steps, carry_out(steps), strict=True)))
 
 
 def test_everything_the_page_on_extending_shows_runs_and_prints_the_tables_shown(extended: Extended) -> None:
-    assert_tables_are_those_shown(EXTENDING, dict(zip(_steps(EXTENDING), extended.by_page, strict=True)))
+    assert_tables_are_those_shown(EXTENDING, dict(zip(steps_of(EXTENDING), extended.by_page, strict=True)))
 
 
 def test_everything_the_page_for_the_course_shows_runs_and_prints_what_is_shown(
     real: Callable[[str], Path], alone: Path
 ) -> None:
     (alone / "03.npz").symlink_to(real("ucsd/03.npz").resolve())
-    steps = _steps(COURSE)
+    steps = steps_of(COURSE)
     printed = dict(zip(steps, carry_out(steps), strict=True))
     assert_tables_are_those_shown(COURSE, printed)
     program, shown = next(pair for pair in pairwise(blocks(COURSE)) if pair[0].language == "python")
@@ -294,14 +273,6 @@ def _anchors(page: Path) -> set[str]:
     """Return what GitHub calls the headings of a page."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-@by_page
-def test_measured_numbers_that_no_test_repeats_carry_their_revision(page: Path) -> None:
-    """A mean with its error was measured; a table that a command of the page prints is compared with it above."""
-    text = page.read_text(encoding="utf-8")
-    if "±" in text and page.name != "CHANGELOG.md":
-        assert re.search(r"^Measured at revision `[0-9a-f]{8}` or before", text, flags=re.M)
 
 
 @by_page

@@ -1,4 +1,4 @@
-"""One name stands for one class; what estimators import is what the page on extending names.
+"""What estimators import is what the page on extending names.
 
 What import-linter proves, it proves of the modules that its contracts name: these are all there are.
 """
@@ -9,16 +9,6 @@ import tomllib
 from pathlib import Path
 
 PROJECT = Path(__file__).parents[2]
-FILES = sorted(path for package in ("toolkit", "filters") for path in (PROJECT / package).rglob("*.py"))
-
-
-def test_the_name_of_a_class_stands_for_one_thing() -> None:
-    places: dict[str, list[str]] = {}
-    for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                places.setdefault(node.name, []).append(path.relative_to(PROJECT).as_posix())
-    assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}
 
 
 def imports(path: Path) -> set[str]:

@@ -6,9 +6,8 @@ import os
 import re
 import runpy
 import subprocess
-import sysconfig
+import sys
 import tempfile
-import venv
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -86,23 +85,21 @@ def test_it_runs_where_no_real_recording_is(
     assert "the real" not in reported
 
 
-@pytest.mark.notebooks
-def test_the_first_cell_for_colab_installs_the_toolkit_where_it_is_not(tmp_path: Path) -> None:
-    """In an environment that has what the toolkit depends on and not the toolkit itself."""
+def test_the_first_cell_for_colab_installs_the_toolkit_where_it_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("mkdocs", reason='the site is built with mkdocs: pip install ".[docs]"')
-    if not (ROOT / ".git").exists():
-        pytest.skip("no repository that could be cloned")
-    venv.create(tmp_path / "empty", with_pip=True)
-    python = tmp_path / "empty/bin/python"
-    (site_packages,) = (tmp_path / "empty/lib").glob("python*/site-packages")
-    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
-    prepared = runpy.run_path(str(ROOT / "docs/site/repository.py"))["with_first_cell"]({"cells": []}, ROOT.as_uri())
-    uses = "from recordings import real\nimport toolkit, filters\nprint(toolkit.__file__)\n"
-    (tmp_path / "cell.py").write_text(prepared["cells"][0]["source"] + uses)
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    words = [str(python), "cell.py"]
-    done = subprocess.run(words, cwd=tmp_path, env=variables, text=True, capture_output=True, check=False)
-    if "No matching distribution found for hatchling" in done.stderr:
-        pytest.skip("no package index can be reached, from which what builds the toolkit is installed")
-    assert done.returncode == 0, done.stderr
-    assert Path(done.stdout.splitlines()[-1]).is_relative_to(site_packages)
+    with_first_cell = runpy.run_path(str(ROOT / "docs/site/repository.py"))["with_first_cell"]
+    first, second = with_first_cell({"cells": ["the first"]}, "https://example.org/owner/name")["cells"]
+    (tmp_path / "vislam-toolkit/notebooks").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    called: list[list[str]] = []
+    monkeypatch.setattr(subprocess, "run", lambda words, check: called.append(words))
+    exec(first["source"], {})
+    assert [(words[-2:], Path.cwd().name) for words in called] == [
+        (["https://example.org/owner/name", "vislam-toolkit"], "notebooks"),
+        (["-q", "./vislam-toolkit"], "notebooks"),
+    ]
+    assert second == "the first"
