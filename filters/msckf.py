@@ -133,8 +133,9 @@ class Msckf:
         kept = np.flatnonzero(found.seen[:, -1])[: self._room]
         if len(kept):
             self._joint.add_landmarks(*found.landmarks(kept))
-        first = 6 * int(np.argmax(found.seen.any(axis=0)))
-        self._joint.inform(found.information[first:, first:], found.vector[first:])
+        first = int(np.argmax(found.seen.any(axis=0)))
+        taken = found.halves[:, :, 6 * first :].reshape(-1, found.halves.shape[2] - 6 * first)
+        self._joint.inform(found.blocks[first:], taken, found.vector[6 * first :])
 
     def _forget_oldest(self, count: int) -> None:
         """Marginalise the oldest poses."""

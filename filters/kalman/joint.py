@@ -126,19 +126,18 @@ class JointBelief:
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
-    def inform(self, information: Array, vector: Array) -> None:
-        """Correct the whole state by an information matrix (k, k) and vector (k,) of the last k errors of the state.
+    def inform(self, blocks: Array, taken: Array, vector: Array) -> None:
+        """Correct the whole state by information on the last clones: a matrix L (k, k) and a vector (k,).
 
-        It equals :meth:`update` by rows H and residuals r with information ``H^T H`` and ``H^T r``, whatever their
-        number. Let P be the covariance, P_k its rows of the last k errors, R the root of their covariance,
-        ``Y = R^-1 P_k`` and ``M = 1 + R^T H^T H R``. Then the correction is ``Y^T M^-1 R^T H^T r`` and the new
-        covariance ``P - Y^T Y + Y^T M^-1 Y``. The columns of Y for the last k errors are ``R^T``.
+        L is block diagonal with ``blocks`` (k / 6, 6, 6), less ``E^T E`` with E = ``taken`` (m, k), which may be
+        overwritten. It equals :meth:`update` by rows H and residuals r with ``H^T H = L`` and ``H^T r`` the vector,
+        whatever their number. Let P be the covariance, P_k its rows of those clones, R the root of their covariance,
+        ``Y = R^-1 P_k`` and ``M = 1 + R^T L R``. Then the correction is ``Y^T M^-1 R^T H^T r`` and the new covariance
+        ``P - Y^T Y + Y^T M^-1 Y``. The columns of Y for those clones are ``R^T``.
         """
         first = self._cov.shape[0] - len(vector)
         root = regular_root(self._cov[first:, first:])
-        matrix = transposed_root_times(root, times_root(information, root))
-        matrix.flat[:: len(matrix) + 1] += 1.0
-        matrix_root = cholesky_root(matrix)
+        matrix_root = root_with_information(root, blocks, times_root(taken, root))
         to_others = divided_by_root(root, self._cov[first:, :first].copy())
         half_gain = divided_by_root(matrix_root, np.concatenate([to_others, root.T], axis=1))
         others = self._cov[:first, :first] - to_others.T @ to_others
@@ -302,10 +301,18 @@ def transposed_root_times(root: Array, right: Array) -> Array:
     return result
 
 
-def without_products(matrix: Array, rows: Array) -> Array:
-    """Return the lower half of the symmetric ``A - E^T E``, with A (n, n), which may be overwritten, and E (m, n)."""
-    result: Array = dsyrk(-1.0, rows.T, 1.0, matrix.T, overwrite_c=1).T if len(rows) else matrix
-    return result
+def root_with_information(root: Array, blocks: Array, taken: Array, weight: float = 1.0) -> Array:
+    """Return the root of ``1 + weight (R^T D R - E^T E)``: R lower triangular (6 W, 6 W), D of blocks (W, 6, 6).
+
+    E = ``taken`` (m, 6 W) is what multiplies errors of unit covariance, R times which are those of W poses.
+    """
+    size = len(root)
+    by_blocks = (blocks @ root.reshape(-1, 6, size)).reshape(size, size)
+    matrix = transposed_root_times(root, by_blocks)
+    # Of the symmetric matrix only the lower half is made.
+    matrix = dsyrk(-weight, taken.T, weight, matrix.T, overwrite_c=1).T if len(taken) else weight * matrix
+    matrix.flat[:: size + 1] += 1.0
+    return cholesky_root(matrix)
 
 
 def _symmetric(cov: Array) -> Array:

@@ -29,12 +29,10 @@ import numpy as np
 from filters.kalman.joint import (
     JointBelief,
     Linearisation,
-    cholesky_root,
     divided_by_root,
     regular_root,
+    root_with_information,
     times_root,
-    transposed_root_times,
-    without_products,
 )
 from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
@@ -152,9 +150,10 @@ def camera_for_kernels(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
 class EliminatedTracks(NamedTuple):
     """F tracks that passed, by which poses they were seen (F, W), their points (F, 3), and what they say of the poses.
 
-    ``information`` (6 W, 6 W) and ``vector`` (6 W,) are those of all the tracks, whitened and weighted, with their
-    landmarks eliminated. ``normals`` (F, 4, 4) are ``[H_f r]^T [H_f r]``; with C the root of its block ``H_f^T H_f``,
-    ``halves`` (F, 3, 6 W) is ``C^-1 H_f^T H_x``.
+    ``normals`` (F, 4, 4) are ``[H_f r]^T [H_f r]``, whitened and weighted; with C the root of its block ``H_f^T H_f``,
+    ``halves`` (F, 3, 6 W) is ``C^-1 H_f^T H_x``. With the landmarks eliminated, the information of all tracks together
+    is block diagonal with ``blocks`` (W, 6, 6), one a pose, less the sum of ``halves^T halves``; ``vector`` (6 W,)
+    belongs to it.
     """
 
     track_ids: IntArray
@@ -162,14 +161,14 @@ class EliminatedTracks(NamedTuple):
     points: Array
     normals: Array
     halves: Array
-    information: Array
+    blocks: Array
     vector: Array
 
     def joined(self, other: "EliminatedTracks") -> "EliminatedTracks":
         """Return the tracks of both."""
         ids, seen, points, normals, halves = (np.concatenate(pair) for pair in zip(self[:5], other[:5], strict=True))
-        information, vector = self.information + other.information, self.vector + other.vector
-        return EliminatedTracks(ids, seen, points, normals, halves, information, vector)
+        blocks, vector = self.blocks + other.blocks, self.vector + other.vector
+        return EliminatedTracks(ids, seen, points, normals, halves, blocks, vector)
 
     def landmarks(self, rows: IntArray) -> tuple[IntArray, Array, Array, Array]:
         """Return some tracks (K,) as landmarks: what :meth:`JointBelief.add_landmarks` takes.
@@ -201,7 +200,7 @@ def _tested(
     from filters.kalman import kernels
 
     count, width = sightings.seen.shape
-    points, reliable, nis, dof, worst, weights, (normals, halves, of_halves, of_poses, vector) = (
+    points, reliable, nis, dof, worst, weights, (normals, halves, of_halves, blocks, vector) = (
         kernels.eliminate_tracks(
             (sightings.uvs_px, sightings.seen),
             (window.poses, window.poses_at),
@@ -214,15 +213,13 @@ def _tested(
     )
     accepted = weights > 0.0
     gate.count(nis[reliable], dof[reliable], accepted[reliable])
-    information = -(halves.T @ halves)
-    information.reshape(width, 6, width, 6)[np.arange(width), :, np.arange(width)] += of_poses
     passed = EliminatedTracks(
         sightings.track_ids[accepted],
         sightings.seen[accepted],
         points[accepted],
         normals[accepted],
         halves.reshape(count, 3, 6 * width)[accepted],
-        information,
+        blocks,
         vector - halves.T @ of_halves,
     )
     mismatched = np.flatnonzero(worst >= 0)
@@ -265,32 +262,29 @@ def given_tracks_in_view(
 
     in_view = tracks.uvs_px, tracks.seen, tracks.weights, tracks.points
     poses, limits = (window.poses, window.poses_at), (LEAST_DISPARITY_PX, LEAST_DEPTH_M)
-    depths_m, *of_points, between, H_newest, of_poses, vector = kernels.normals_in_view(
+    depths_m, *of_points, between, H_newest, blocks, vector = kernels.normals_in_view(
         in_view, poses, camera_for_kernels(rig), limits
     )
     if not depths_m.any():
         return joint.core
     root = regular_root(window.cov)
-    size = len(root)
     by_root = H_newest @ root[-6:], times_root(between, root)
-    normals = depths_m, *of_points, H_newest, of_poses, vector
+    normals = depths_m, *of_points, H_newest, blocks, vector
     eliminated = kernels.add_newest(in_view, normals, by_root, gate.limits(3))
-
-    matrix = transposed_root_times(root, (of_poses @ root.reshape(-1, 6, size)).reshape(size, size))
-    matrix, vector = without_products(matrix, by_root[1]), root.T @ vector - by_root[1].T @ eliminated
-    return _corrected(joint, root, rig.track_weight * matrix, rig.track_weight * vector)
+    matrix_root = root_with_information(root, blocks, by_root[1], rig.track_weight)
+    return _corrected(joint, root, matrix_root, rig.track_weight * (root.T @ vector - by_root[1].T @ eliminated))
 
 
-def _corrected(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:
-    """Return the present state given information (6 W, 6 W), (6 W,) on errors u; the errors of the clones are R u.
+def _corrected(joint: JointBelief, root: Array, matrix_root: Array, vector: Array) -> Belief:
+    """Return the present state given an information matrix L and a vector n (6 W,) on errors u of the clones.
 
-    The update in information form with L and n on the clones moves the state's error by ``P_xc (1 + L P_cc)^-1 n`` and
-    subtracts ``P_xc (1 + L P_cc)^-1 L P_cx`` from its covariance.
+    The errors of the clones are R u, with R the ``root`` of their covariance; ``matrix_root`` is that of 1 + L. With
+    ``Y = R^-1 P_cx`` the update moves the state's error by ``Y^T (1 + L)^-1 n`` and its covariance becomes
+    ``P_xx - Y^T Y + Y^T (1 + L)^-1 Y``.
     """
     core = joint.core
     to_core = divided_by_root(root, joint.cov[joint.clone_columns, : core.layout.size].copy())
-    matrix.flat[:: len(matrix) + 1] += 1.0
-    halves = divided_by_root(cholesky_root(matrix), np.concatenate([to_core, vector[:, None]], axis=1))
+    halves = divided_by_root(matrix_root, np.concatenate([to_core, vector[:, None]], axis=1))
     half = halves[:, :-1]
     delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
     moved = core.displaced(delta, se3_exp(delta[POSE]))

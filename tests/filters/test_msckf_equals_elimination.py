@@ -109,7 +109,7 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept):
     before = joint.core, joint.clones
     track_ids, points, jacobian, covs = tracks.landmarks(np.arange(kept))
     joint.add_landmarks(track_ids, points, jacobian, covs)
-    joint.inform(tracks.information, tracks.vector)
+    joint.inform(tracks.blocks, tracks.halves.reshape(-1, len(tracks.vector)), tracks.vector)
     mean, cov = step.of(track_ids.tolist())
     # A landmark is added as if it were at its least squares; the search ends micrometres before.
     mean[step.rest :][: 3 * kept] -= (covs @ tracks.normals[:kept, 3, :3, None]).ravel()
@@ -127,7 +127,9 @@ def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(row
     H, residuals = 100.0 * rng.normal(size=(rows, end - begin)), rng.normal(size=rows)
     before, other, sigmas = (joint.core, joint.clones), copy.copy(joint), np.sqrt(np.diag(joint.cov))
     joint.update(H, residuals, slice(begin, end))
-    other.inform(H.T @ H, H.T @ residuals)
+    information, most = H.T @ H, 2.0 * (H**2).sum()
+    taken = np.linalg.cholesky(most * np.eye(len(information)) - information).T
+    other.inform(np.tile(most * np.eye(6), (len(information) // 6, 1, 1)), taken, H.T @ residuals)
     steps, others = moved(before, joint, joint.points), moved(before, other, other.points)
     assert np.abs(steps).max() > 1e-3, "there was something to agree on"
     np.testing.assert_allclose(others, steps, atol=1e-9)
