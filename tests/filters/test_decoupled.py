@@ -7,6 +7,7 @@ import pytest
 
 from filters.ekf import correct_pose
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap, correct_landmarks, first_sighting
+from tests.models.conftest import numerical_jacobian
 from toolkit.geometry import Array, se3_exp
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
@@ -149,13 +150,8 @@ def test_a_lost_landmark_keeps_its_last_value_until_its_id_comes_back_as_a_new_o
 def test_the_covariance_of_a_first_sighting_is_the_measurements_carried_through_triangulation():
     """By numerical differences of the triangulation: an independent way to the same 3x3 matrix."""
     frame = frame_of([0, 30, 200])
-    started, step = first_sighting(frame, np.arange(3), POSE, RIG), 1e-3
+    started = first_sighting(frame, np.arange(3), POSE, RIG)
     for i, uv_px in enumerate(frame.uvs_px):
-        columns = [
-            (stereo.triangulate_world(uv_px + d, POSE, RIG) - stereo.triangulate_world(uv_px - d, POSE, RIG))
-            for d in step * np.eye(3)
-        ]
-        jacobian = np.stack(columns, axis=1) / (2.0 * step)
+        jacobian = numerical_jacobian(lambda d, at=uv_px: stereo.triangulate_world(at + d, POSE, RIG), 3)
         expected = jacobian @ RIG.cov_uv_px2 @ jacobian.T
-        # Central differences at 40 px of disparity err by (1e-3 / 40)^2.
         np.testing.assert_allclose(started.covs[i], expected, atol=1e-7 * np.abs(expected).max())

@@ -24,14 +24,16 @@ def position_of(window: FixedLagTree, k: int) -> Array:
     return np.asarray(window.values().atPoint3(X(k)))
 
 
-def chain_link(k: int) -> GraphExtension:
-    """Return a position X(k), one step of a metre from the last, and a fix of it that is off by a metre times k."""
+UNIT = gtsam.noiseModel.Unit.Create(3)
+
+
+def chain_link(k: int, off_m: float = 1.0, step: gtsam.noiseModel.Base = UNIT) -> GraphExtension:
+    """Return a position X(k), one step of a metre from the last, and a fix of it that is off by so much times k."""
     extension = GraphExtension(state_keys=[X(k)])
     extension.values.insert(X(k), np.array([1.0 * k, 0.0, 0.0]))
-    unit = gtsam.noiseModel.Unit.Create(3)
     if k:
-        extension.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), unit))
-    extension.factors.addPriorPoint3(X(k), np.array([2.0 * k, 0.0, 0.0]), unit)
+        extension.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), step))
+    extension.factors.addPriorPoint3(X(k), np.array([(1.0 + off_m) * k, 0.0, 0.0]), UNIT)
     return extension
 
 
@@ -60,11 +62,7 @@ def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_ch
     window, stiff = FixedLagTree(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
     everything, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(6):
-        extension = GraphExtension(state_keys=[X(k)])
-        extension.values.insert(X(k), np.array([1.0 * k, 0.0, 0.0]))
-        if k:
-            extension.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), stiff))
-        extension.factors.addPriorPoint3(X(k), np.array([1.1 * k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
+        extension = chain_link(k, 0.1, stiff)
         everything.push_back(extension.factors)
         start.insert(extension.values)
         assert window.add(extension, k * NS_PER_S).log == []
@@ -103,7 +101,7 @@ def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_cont
     window, everything, start = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(5):
         extension = chain_link(k)
-        sighting = gtsam.BetweenFactorPoint3(X(k), L(5), np.array([7.0 - k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
+        sighting = gtsam.BetweenFactorPoint3(X(k), L(5), np.array([7.0 - k, 0.0, 0.0]), UNIT)
         extension.landmark_ids = [5]
         if k == 0:
             extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
@@ -164,8 +162,7 @@ def test_a_landmark_without_sightings_does_not_come_into_a_tree_built_anew():
     window, extension = FixedLagTree(2 * NS_PER_S), chain_link(0)
     extension.landmark_ids = [5]
     extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
-    unit = gtsam.noiseModel.Unit.Create(3)
-    extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(5), np.array([7.0, 0.0, 0.0]), unit))
+    extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(5), np.array([7.0, 0.0, 0.0]), UNIT))
     assert window.add(extension, 0).log == []
     window._isam = BrokenOff(window._isam, L(5))
     assert window.rebuild().log == []

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from filters.dead_reckoning import DeadReckoning
+from filters.kalman.online_output import OnlineOutput
 from filters.kalman.thinning import Thinned
 from toolkit import runner
-from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.estimate import Estimate, Trajectory
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.measurements import Packet
-from toolkit.models.motion import motion_model
 from toolkit.registry import find
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, noise_free, simulate
@@ -25,31 +26,22 @@ def flight():
     return simulate(noise_free(replace(FLIGHT, duration_s=2.0, camera=camera)), 0)
 
 
-class Listener:
+class Listener(DeadReckoning):
     """Integrates the motion it is given, from the truth, and remembers the packets."""
 
     def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
         self.packets: list[Packet] = []
-        self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._belief = self._motion.initial_belief(setup.prior)
-        self._reported: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
-        if packet.motion is not None:
-            increment = self._motion.integrate(packet.motion, self._belief.bias)
-            self._belief = self._belief.predicted(increment.predict(self._belief))
         self.packets.append(packet)
-        self._reported.append(self._belief.estimate(packet.frame.t_ns))
-        return self._reported[-1]
-
-    def finish(self) -> Finished:
-        return Finished(Trajectory.of(self._reported), Landmarks.none())
+        return super().step(packet)
 
 
 def thinned(sequence, window):
     setup = runner.setup_of(sequence, sequence.prior, Settings(window=window))
     listener = Listener(setup)
-    wrapped = Thinned(setup, listener)
+    wrapped = Thinned(setup, OnlineOutput(listener))
     online = [wrapped.step(packet) for packet in sequence.packets()]
     return listener, online, wrapped.finish().trajectory
 
