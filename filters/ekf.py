@@ -80,11 +80,7 @@ def as_exact(landmarks: LandmarkMap) -> LandmarkMap:
 
 
 def correct_pose(
-    belief: Belief,
-    landmarks: LandmarkMap,
-    uvs_px: Array,
-    rig: StereoRig,
-    gate: FrameGate,
+    belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
 ) -> tuple[Belief, BoolArray]:
     """Return the belief with its pose corrected by sightings (N, 3) px of N landmarks, and which of them passed (N,).
 

@@ -24,9 +24,7 @@ _FIXED_VARIANCE = 1e-16
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 10, "+ vision as in the report: map and pose updated in turn, biases fixed, no gate"
-RULES = {
-    "outliers": "the report's filter has neither gate nor loss",
-}
+RULES = {"outliers": "the report's filter has neither gate nor loss"}
 INGREDIENTS = ("long-lived landmarks",)
 
 

@@ -21,16 +21,7 @@ from copy import copy
 import numpy as np
 
 from filters.kalman.joint import JointBelief, Linearisation
-from toolkit.geometry import (
-    Array,
-    BoolArray,
-    IntArray,
-    se3_adjoint,
-    se3_inverse,
-    skew,
-    so3_left_jacobian,
-    transform,
-)
+from toolkit.geometry import Array, BoolArray, IntArray, se3_adjoint, se3_inverse, skew, so3_left_jacobian, transform
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief
 
 

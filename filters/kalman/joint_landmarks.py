@@ -29,13 +29,7 @@ class LandmarkSightings(NamedTuple):
     dof: int | IntArray
 
 
-def correct(
-    joint: JointBelief,
-    frame: StereoFrame,
-    at: Linearisation,
-    rig: StereoRig,
-    gate: FrameGate,
-) -> None:
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct the whole state by its landmarks; the frame must show every one of them."""
     if not len(joint.landmark_ids):
         return

@@ -3,22 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from filters import ekf_slam
 from toolkit.metrics import score_run
 from toolkit.simulation import DRIVE_IMU, simulate
 
 
-@pytest.fixture(scope="module")
-def noisy():
-    """Return drives with an IMU and thirty tracks that last, whose first sightings are 2 px off."""
+def test_it_states_what_it_is_off_by_where_first_sightings_are_poor(run_estimator, monkeypatch):
+    """On drives with thirty tracks that last, whose first sightings are 2 px off."""
     camera = replace(DRIVE_IMU.camera, max_tracks=30, loss_per_frame=0.0)
     rig = replace(DRIVE_IMU.rig, cov_uv_px2=4.0 * DRIVE_IMU.rig.cov_uv_px2)
-    return [simulate(replace(DRIVE_IMU, camera=camera, rig=rig, duration_s=8.0), seed) for seed in (0, 1, 2)]
+    noisy = [simulate(replace(DRIVE_IMU, camera=camera, rig=rig, duration_s=8.0), seed) for seed in (0, 1, 2)]
 
-
-def test_it_states_what_it_is_off_by_where_first_sightings_are_poor(noisy, run_estimator, monkeypatch):
     def figures():
         scores = [score_run(run_estimator("ekf-slam", drive), "causal", drive).values for drive in noisy]
         return np.mean([[s["nees_pose_mean"], s["ate_none_m"] ** 2] for s in scores], axis=0)

@@ -31,11 +31,7 @@ UP, YAW = np.eye(3)[:, 2:], 3
 
 SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=3.0)}
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
-FILTERS = {
-    "ekf-slam": JointEkf,
-    "msckf": Msckf,
-    "msckf-slam": lambda setup, at: Msckf(setup, at, landmarks=15),
-}
+FILTERS = {"ekf-slam": JointEkf, "msckf": Msckf, "msckf-slam": lambda setup, at: Msckf(setup, at, landmarks=15)}
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 every_filter = pytest.mark.parametrize("name", FILTERS)

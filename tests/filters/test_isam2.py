@@ -10,13 +10,7 @@ import pytest
 
 from filters.isam2 import Isam2
 from filters.smoothing import isam2_tree
-from filters.smoothing.isam2_tree import (
-    FROZEN_AFTER_FRAMES,
-    MOST_RECOVERIES,
-    QR_FRAMES,
-    CachedLinearisation,
-    Isam2Tree,
-)
+from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, QR_FRAMES, CachedLinearisation, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from tests.filters.conftest import off_at_the_end_m, setup_of, short
 from toolkit.errors import EstimatorError

@@ -8,13 +8,7 @@ import pytest
 
 from filters.fixed_lag import FixedLag
 from filters.isam2 import Isam2
-from filters.smoothing.outlier_check import (
-    FEWEST_REFUSED,
-    KnownLandmarks,
-    KnownSightings,
-    OutlierCheck,
-    RefusedTracks,
-)
+from filters.smoothing.outlier_check import FEWEST_REFUSED, KnownLandmarks, KnownSightings, OutlierCheck, RefusedTracks
 from toolkit import runner
 from toolkit.geometry import se3, se3_exp, transform
 from toolkit.measurements import StereoFrame

@@ -27,14 +27,7 @@ from toolkit.geometry import (
     se3_right_jacobian,
     skew,
 )
-from toolkit.measurements import (
-    Motion,
-    TwistChangeNoise,
-    TwistMotion,
-    TwistNoise,
-    UnmeasuredMotion,
-    noise_scale_of,
-)
+from toolkit.measurements import Motion, TwistChangeNoise, TwistMotion, TwistNoise, UnmeasuredMotion, noise_scale_of
 from toolkit.models.factors import B, V, X
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.state import POSE, ROTATION, TWIST_LAYOUT, Belief, Layout, Prediction

@@ -53,11 +53,7 @@ _COEFFICIENTS: dict[Distortion, tuple[float, ...]] = {
 }
 # A fisheye sees more on the same sensor.
 _FISHEYE_FOCAL = 0.72
-_EUROC_NAMES: dict[Distortion, str] = {
-    "none": "none",
-    "radtan": "radial-tangential",
-    "equidistant": "equidistant",
-}
+_EUROC_NAMES: dict[Distortion, str] = {"none": "none", "radtan": "radial-tangential", "equidistant": "equidistant"}
 _MISMATCH_PX = 3.0
 
 

@@ -122,11 +122,7 @@ class _View(NamedTuple):
 
 
 def _view(
-    scene_of: SceneOf,
-    duration_s: float,
-    rig: StereoRig,
-    camera: CameraLimits,
-    drawn: np.random.Generator | None = None,
+    scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: CameraLimits, drawn: np.random.Generator | None = None
 ) -> _View:
     scene = scene_of(duration_s) if drawn is None else scene_of(duration_s, drawn)
     frames_t_ns = sensors.stamps_ns(START_NS, camera.rate_hz, duration_s)
