@@ -1,12 +1,11 @@
 """The geometry against three independent oracles: GTSAM, scipy's matrix exponential, and differences."""
 
-from collections.abc import Callable
-
 import gtsam
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from tests.models.conftest import numerical_jacobian
 from toolkit import geometry
 from toolkit.geometry import Array
 
@@ -39,12 +38,6 @@ def hat(xi: Array) -> Array:
     return matrix
 
 
-def derivative(f: Callable[[Array], Array], at: Array, step: float = 1e-5) -> Array:
-    """Central differences; their error is about step^2 plus rounding / step: 1e-10."""
-    columns = [(f(at + step * e) - f(at - step * e)) / (2.0 * step) for e in np.eye(at.size)]
-    return np.stack(columns, axis=-1)
-
-
 @pytest.mark.parametrize("angle", ANGLES)
 def test_se3_exp_equals_the_matrix_exponential(angle: float) -> None:
     for xi in twists(angle):
@@ -71,11 +64,10 @@ def test_so3_left_jacobian_equals_differences_and_gtsam(angle: float) -> None:
     for phi in angle * unit_directions():
         J_l, rotation = geometry.so3_left_jacobian(phi), geometry.so3_exp(phi)
         np.testing.assert_allclose(J_l, rotation @ gtsam.Rot3.ExpmapDerivative(phi), atol=1e-11)
-
-        def moved(x: Array, inverse: Array = rotation.T) -> Array:
-            return geometry.so3_log(geometry.so3_exp(x) @ inverse)
-
-        np.testing.assert_allclose(J_l, derivative(moved, phi), atol=1e-9)
+        moved = numerical_jacobian(
+            lambda x, at=phi: geometry.so3_log(geometry.so3_exp(at + x) @ geometry.so3_exp(-at)), 3
+        )
+        np.testing.assert_allclose(J_l, moved, atol=1e-9)
         np.testing.assert_allclose(J_l, rotation @ geometry.so3_left_jacobian(-phi), atol=ROUNDING)
 
 

@@ -14,7 +14,7 @@ from toolkit import verify as promises
 from toolkit.answers import Run
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Trajectory
-from toolkit.estimator import Build, Estimator
+from toolkit.estimator import Build
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models.stereo import triangulate_world
 from toolkit.progress import SILENT
@@ -151,11 +151,11 @@ def with_nan(sequence: Sequence, where: str) -> Sequence:
 @pytest.mark.parametrize("where", ["observation", "motion sample"])
 def test_a_measurement_that_is_not_a_number_reaches_no_estimator(scenario: str, where: str) -> None:
     with pytest.raises(DataError, match=f"{where} .*not finite"):
-        run_on("none", _never, with_nan(recording(scenario).truncated(FRAMES_WITH_NAN), where))
-
-
-def _never(_setup: object) -> Estimator:
-    raise AssertionError("it was built")
+        run_on(
+            "none",
+            lambda _: pytest.fail("it was built"),
+            with_nan(recording(scenario).truncated(FRAMES_WITH_NAN), where),
+        )
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

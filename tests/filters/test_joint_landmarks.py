@@ -8,34 +8,14 @@ import pytest
 
 from filters import iekf
 from filters.kalman import joint_landmarks
-from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates, JointBelief
+from filters.kalman.joint import AtFirstEstimates, AtLatestEstimates
 from filters.kalman.tracks import correct_by_landmarks
 from tests.filters.conftest import with_clones
-from toolkit.geometry import Array, transform
+from toolkit.geometry import transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
 from toolkit.models.gating import FrameGate
-from toolkit.models.motion import motion_model
-from toolkit.simulation import FLIGHT, simulate
-
-SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)
-
-
-def belief_with_a_landmark(depth_m: float) -> JointBelief:
-    """Return a belief whose only landmark has that depth in the camera and is uncertain by 0.1 m."""
-    model = motion_model(SEQUENCE.noise, SEQUENCE.gravity_world)
-    joint = JointBelief(model.initial_belief(SEQUENCE.prior))
-    joint.clone()
-    point = transform(joint.clones[0] @ SEQUENCE.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]]))
-    joint.add_landmarks(np.array([7]), point, np.zeros((3, 6)), 0.01 * np.eye(3)[None])
-    return joint
-
-
-def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
-    """Return a frame that shows the landmark where the projection's formula puts it, but for ``off_px`` (3,)."""
-    uv_px = stereo.predict(joint.points, joint.clones[0], SEQUENCE.rig).uv_px + off_px
-    return StereoFrame(0, np.array([7]), uv_px)
-
+from toolkit.simulation import FLIGHT
 
 CORRECT = {"single": joint_landmarks.correct, "compiled": correct_by_landmarks, "iterated": iekf.correct}
 
@@ -44,9 +24,12 @@ CORRECT = {"single": joint_landmarks.correct, "compiled": correct_by_landmarks, 
 @pytest.mark.parametrize(("depth_m", "accepted"), [(4.0, 1), (-4.0, 0)], ids=["in front", "behind"])
 def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residual(correct, depth_m, accepted):
     """A residual of half a pixel passes the gate on either side: what differs is the side alone."""
-    joint, gate = belief_with_a_landmark(depth_m), FrameGate(0.95)
-    cov, point = joint.cov.copy(), joint.points.copy()
-    correct(joint, frame_of(joint, np.array([0.5, 0.0, 0.5])), AtLatestEstimates(), SEQUENCE.rig, gate)
+    sequence, joint = with_clones(replace(FLIGHT, duration_s=1.0), 0, 1)
+    point, rig = transform(joint.clones[0] @ sequence.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]])), sequence.rig
+    joint.add_landmarks(np.array([7]), point, np.zeros((3, 6)), 0.01 * np.eye(3)[None])
+    uv_px = stereo.predict(point, joint.clones[0], rig).uv_px + np.array([0.5, 0.0, 0.5])
+    cov, gate = joint.cov.copy(), FrameGate(0.95)
+    correct(joint, StereoFrame(0, np.array([7]), uv_px), AtLatestEstimates(), rig, gate)
     assert (gate.tested, gate.accepted) == (1, accepted)
     assert np.array_equal(joint.cov, cov) == (not accepted)
     assert np.array_equal(joint.points, point) == (not accepted)

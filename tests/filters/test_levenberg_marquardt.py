@@ -132,11 +132,6 @@ RIG, SEEN = DRIVE.rig, 6
 TO_THE_END = Stopping(0.0, 40, decrease=1e-9)
 
 
-def frame_of(k: int, rows: list[tuple[int, Array]]) -> StereoFrame:
-    ids, seen_px = zip(*rows, strict=True) if rows else ((), ())
-    return StereoFrame(k, np.array(ids, dtype=np.int64), np.array(seen_px).reshape(-1, 3))
-
-
 def bent_drive(seed: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FirstImages]:
     """Return 200 m straight ahead, told by five tracks a frame and a vague twist, and a start that turns by 0.4 rad."""
     rng, count = np.random.default_rng(seed), 200
@@ -162,7 +157,8 @@ def bent_drive(seed: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Fir
         start.insert(X(k), gtsam.Pose3(bent[k]))
         if k:
             graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(step), twist))
-        frames.append(frame_of(k, row))
+        ids, seen_px = [i for i, _ in row], [seen_px for _, seen_px in row]
+        frames.append(StereoFrame(k, np.array(ids, dtype=np.int64), np.array(seen_px).reshape(-1, 3)))
         for factor in StereoFactors(RIG).of(frames[k], k):
             graph.add(factor)
     return graph, start, FirstImages.of(frames, RIG)

@@ -9,7 +9,7 @@ import pytest
 from toolkit.geometry import se3_exp, transform
 from toolkit.measurements import StereoFrame
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.factors import L, StereoFactors, X, ordering_of
 from toolkit.models.stereo_adjustment import (
     Ending,
     Evaluated,
@@ -48,16 +48,8 @@ def gtsam_values(poses, points):
     return values
 
 
-def ordering(*kinds_and_counts):
-    result = gtsam.Ordering()
-    for kind, count in kinds_and_counts:
-        for i in range(count):
-            result.push_back(kind(i))
-    return result
-
-
-def projection_factors(seen, huber=HUBER):
-    graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, huber)
+def projection_factors(seen):
+    graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, HUBER)
     for k in range(POSES):
         rows = seen.pose == k
         for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows]), k):
@@ -72,7 +64,9 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
     factors, values = projection_factors(outlying), gtsam_values(poses, points)
     vision = Vision.at(poses, points, outlying, CAMERA)
     assert vision.losses.sum() == pytest.approx(factors.error(values), rel=1e-9)
-    information, vector = factors.linearize(values).hessian(ordering((X, POSES), (L, POINTS)))
+    information, vector = factors.linearize(values).hessian(
+        ordering_of([*map(X, range(POSES)), *map(L, range(POINTS))])
+    )
     n, reduced = 6 * POSES, vision.reduced()
     across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
     # Rounding, relative to the largest entry.
@@ -91,9 +85,8 @@ def test_a_landmark_that_overshoots_behind_a_camera_does_not_keep_a_window_from_
     centre = transform(RIG.T_imu_cam, np.zeros((1, 3)))[0]
     start = points.copy()
     start[0] = centre + 3.0 * (points[0] - centre)
-    values, motion = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    values, motion = gtsam_values(poses, []), gtsam.NonlinearFactorGraph()
     for k, pose in enumerate(poses):
-        values.insert(X(k), gtsam.Pose3(pose))
         motion.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, 1e-2)))
     keys, empty = tuple((X(k),) for k in range(POSES)), StereoWindow.empty()
     ends = []
