@@ -169,7 +169,7 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | No
     best, (least, turning) = ranked[0]
     if not np.isfinite(least):
         raise DataError(
-            f"{best}: it and the IMU have no time in common; check that both are of one recording and clock"
+            f"{best}: it and the IMU have less than 0.3 s in common; check that both are of one recording and clock"
         )
     scatters = "; ".join(f"{path.relative_to(root)} by {off:.4f} rad/s" for path, (off, _) in ranked)
     among = "" if len(ranked) == 1 else ", the better of those in the folder"
@@ -225,7 +225,7 @@ def _read_csv(path: Path) -> TruthRead:
 def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
     """Return how far a truth's rates of rotation are from the gyro's, and how far these vary: RMS about the median.
 
-    The first is infinite where the two share no time.
+    The first is infinite where the two share no two steps.
     """
     sample_t_ns, gyro_radps = _usable(imu)
     within = stamps_among(truth.t_ns, sample_t_ns)
