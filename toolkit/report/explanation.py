@@ -265,7 +265,7 @@ def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
         if clauses:
             told.append(f"{name} is {_joined(clauses)}")
     if told:
-        yield f"More than chance, where the error shows nothing: {'; '.join(told)}."
+        yield f"Other figures show more than the error, beyond chance: {'; '.join(told)}."
 
 
 def _size_told(change: FactorRecord, where: str = "") -> str:
@@ -279,7 +279,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     silent = [part for part in found.parts if part.effects and not _is_shown(part)]
     if likely := [part for part in silent if any(one.error and one.error.is_off for one in part.effects)]:
         by_size = {"smaller": list(filter(_helps, likely)), "larger": [part for part in likely if not _helps(part)]}
-        said = " and ".join(f"{size} with {_listed(some)}" for size, some in by_size.items() if some)
+        said = " and ".join(f"{size} with {_where_likely(found, some)}" for size, some in by_size.items() if some)
         yield f"Perhaps the error is {said}; among {_tests(found)} tests that may be chance: more data would tell."
     rest = [part for part in silent if part not in likely]
     if still_open := [
@@ -289,7 +289,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     ]:
         yield f"Too few data to tell of {_listed(still_open)}: a factor of two is not excluded."
     if rest := [part for part in rest if part not in still_open]:
-        yield f"The error does not show with {over(found)} that anything is brought by {_listed(rest)}."
+        yield f"With {over(found)} the error shows no effect of {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
         yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
 
@@ -297,9 +297,8 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
 def _beside(found: ExplanationRecord) -> Iterator[str]:
     if found.gap.error is not None and _tests(found) > 1:
         yield (
-            "Bare ranges are of the error without an ingredient over that with it, near the former estimator and near "
-            "the latter; each effect holds beside what else the estimators there have, so they need not multiply to "
-            "the whole."
+            "A range alone is of the error without an ingredient over that with it; each effect holds beside what else "
+            "the estimators there have, so they need not multiply to the whole."
         )
 
 
@@ -307,10 +306,24 @@ def _helps(part: IngredientRecord) -> bool:
     return any(one.error is not None and one.error.low > 1.0 for one in part.effects)
 
 
+def _where_likely(found: ExplanationRecord, parts: Sequence[IngredientRecord]) -> str:
+    """Return ingredients with what does not contain 1, and near which of the two estimators it was found."""
+    texts = []
+    for part in parts:
+        ends = [(of_second, one.error) for of_second, _, one in placed(found, part) if one.error and one.error.is_off]
+        ranges = [f"{error.range()} near {found.gap.more if last else found.gap.less}" for last, error in ends]
+        texts.append(f"{part.ingredient} ({', '.join(ranges)})")
+    return _joined(texts)
+
+
 def _listed(parts: Sequence[IngredientRecord]) -> str:
-    ranges = [dict.fromkeys(one.error.range() for one in part.effects if one.error) for part in parts]
-    told = zip(parts, (" and ".join(known) or "too few runs ended well" for known in ranges), strict=True)
-    return _joined([f"{part.ingredient} ({text})" for part, text in told])
+    """Return ingredients, each with the range of all its intervals."""
+    texts = []
+    for part in parts:
+        known = [one.error for one in part.effects if one.error]
+        whole = known and FactorRecord(factor=1.0, low=min(e.low for e in known), high=max(e.high for e in known))
+        texts.append(f"{part.ingredient} ({whole.range() if whole else 'too few runs ended well'})")
+    return _joined(texts)
 
 
 def _joined(texts: Sequence[str]) -> str:
