@@ -147,6 +147,7 @@ class InBody(Coordinates):
 
     T_imu_cam: Array
     _anchors: dict[int, Array] = field(default_factory=dict)
+    _to_anchors: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def errors(self, at: Place, now: Place) -> tuple[Array, Blocks]:
         """Return the errors (n,) and their exact Jacobian."""
@@ -159,17 +160,18 @@ class InBody(Coordinates):
             v_body = to_body @ now.state.atVector(velocity)
             error[6:9] = v_body - before[:3, :3].T @ at.state.atVector(velocity)
             H.state[6:9, :3], H.state[6:9, 6:9] = skew(v_body), to_body
-        to_anchors = se3_inverse(np.array(list(self._anchors.values())).reshape(-1, 4, 4))
         seen, old = transform(se3_inverse(after), now.points), transform(se3_inverse(before), at.points)
-        seen_there = transform(to_anchors, seen)
-        error[d:] = (inverse_depth(seen_there) - inverse_depth(transform(to_anchors, old))).ravel()
-        by_seen = inverse_depth_jacobian(seen_there) @ to_anchors[:, :3, :3]
+        seen_there = transform(self._to_anchors, seen)
+        error[d:] = (inverse_depth(seen_there) - inverse_depth(transform(self._to_anchors, old))).ravel()
+        by_seen = inverse_depth_jacobian(seen_there) @ self._to_anchors[:, :3, :3]
         H.state[d:, :3], H.state[d:, 3:6] = (by_seen @ skew(seen)).reshape(-1, 3), -by_seen.reshape(-1, 3)
         return error, Blocks(H.state, by_seen @ to_body)
 
     def pass_on(self, T_new_old: Array, track_ids: IntArray) -> None:
         """Leave the cameras where they are in the world; landmarks that are new were seen first from the old state."""
-        self._anchors = {i: T_new_old @ self._anchors.get(i, self.T_imu_cam) for i in track_ids.tolist()}
+        cameras = [self._anchors.get(i, self.T_imu_cam) for i in track_ids.tolist()]
+        anchors = T_new_old @ np.array(cameras).reshape(-1, 4, 4)
+        self._anchors, self._to_anchors = dict(zip(track_ids.tolist(), anchors, strict=True)), se3_inverse(anchors)
 
 
 class Gaussian(NamedTuple):

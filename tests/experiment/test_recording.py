@@ -13,7 +13,7 @@ from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measurements import MotionNoise
 from toolkit.sequence import Observations, Sequence
-from toolkit.settings import Noise, SettingsError, TrackUse
+from toolkit.settings import Noise, Settings, SettingsError, TrackUse
 from toolkit.simulation import SCENARIOS, faults, simulate
 
 FOUND = Finding("time-gap", 1, repaired=False, detail="a gap", blocking=False)
@@ -179,3 +179,8 @@ def test_tracks_whose_ids_no_graph_can_have_are_numbered_anew_and_estimators_run
     assert "tracks are numbered anew" in prepared.provenance.facts[-1]
     compared = run(Plan((named,), ("batch", "fixed-lag", "isam2"), workers=1))[0]
     assert [one.status for one in compared.runs] == ["ok"] * 3
+
+
+def test_what_estimators_do_about_biases_needs_no_recording_of_its_own() -> None:
+    fixed = Settings(noise=Noise(biases="fixed"))
+    assert Recording.under(fixed, "flight", 3) == Recording.under(Settings(), "flight", 3)

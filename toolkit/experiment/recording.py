@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from toolkit.answers import Run
@@ -91,8 +92,10 @@ class Recording:
     @classmethod
     def under(cls, settings: Settings, source: str | Sequence, seed: int, **others: Any) -> "Recording":
         """Return a source as the settings prepare it; ``others`` are the fields that are no settings."""
-        own = {name: getattr(settings, name) for name in ("start", "noise", "frontend", "tracks", "vary")}
-        return cls(source, seed, **own, **others)
+        own = {name: getattr(settings, name) for name in ("start", "frontend", "tracks", "vary")}
+        # What estimators do about biases changes no recording: those that differ in it share one, and its bound.
+        noise = msgspec.structs.replace(settings.noise, biases=Noise().biases)
+        return cls(source, seed, noise=noise, **own, **others)
 
 
 _NO_RECORDING = Recording("")

@@ -185,7 +185,7 @@ def eliminated(
     coupling = np.zeros((pose_count, 6, point_count, 3))
     to_pose, per_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2)), _summation(pose, pose_count)
     J_root = J_point @ root[point]
-    coupling[pose, :, point, :] += to_pose @ J_root
+    coupling[pose, :, point, :] = to_pose @ J_root
     vector = (per_pose @ (to_pose @ residual[..., None])[..., 0]).ravel()
     across = coupling.reshape(6 * pose_count, 3 * point_count)
     own, here = np.zeros((pose_count, 6, pose_count, 6)), np.arange(pose_count)
