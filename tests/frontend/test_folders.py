@@ -18,7 +18,6 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.frontend import rectified, track_images, tracking
 from toolkit.frontend.cameras import Image
 from toolkit.geometry import se3_inverse
-from toolkit.sequence import Sequence
 from toolkit.settings import Frontend
 
 FRAMES = 10
@@ -257,24 +256,6 @@ def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: 
         load_sequence(str(asl), 0, Frontend(tracks="images"))
 
 
-def kalibr(root: Path, rows: Callable[[int], str], model: str = "radtan") -> None:
-    """Put Kalibr's files in the place of sensor.yaml."""
-    for camera in (0, 1):
-        (root / YAML.format(camera)).unlink()
-    (root / "mav0/imu0/sensor.yaml").unlink()
-    lens = "distortion_coeffs: [-0.28, 0.07, 2.0e-4, 1.0e-4]\n"
-    common = (
-        f"  camera_model: pinhole\n  {lens}  distortion_model: {model}\n"
-        "  intrinsics: [230.0, 228.0, 163.0, 118.0]\n  resolution: [320, 240]\n  rostopic: /cam/image_raw\n"
-    )
-    chain = "".join(f"cam{c}:\n{rows(c)}  cam_overlaps: [{1 - c}]\n{common}" for c in (0, 1))
-    (root / "camchain-imucam.yaml").write_text(f"%YAML:1.0\n{chain}")
-    (root / "imu0.yaml").write_text(
-        "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\ngyroscope_noise_density: 1.7e-4\n"
-        "gyroscope_random_walk: 1.9e-5\nrostopic: /imu0\nupdate_rate: 200.0\n"
-    )
-
-
 def as_rows(key: str, T: Any) -> str:
     return f"  {key}:\n" + "".join(f"  - [{', '.join(f'{x:.12g}' for x in row)}]\n" for row in T)
 
@@ -284,85 +265,73 @@ def as_opencv(key: str, T: Any) -> str:
     return f"  {key}: !!opencv-matrix\n    rows: 4\n    cols: 4\n    dt: d\n    data: [{numbers}]\n"
 
 
+def camchain(
+    root: Path, key: str = "T_cn_cnm1", write: Callable[..., str] = as_rows, more: tuple[str, str] = ("", "")
+) -> None:
+    """Put Kalibr's files in the place of sensor.yaml, with more of each camera."""
+    T_left_imu = se3_inverse(load_sequence(str(root), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
+    T_right_left = read_calibration(root, root / "mav0").T_right_left
+    T = T_right_left if key == "T_cn_cnm1" else T_right_left @ T_left_imu
+    for sensor in ("cam0", "cam1", "imu0"):
+        (root / "mav0" / sensor / "sensor.yaml").unlink()
+    common = (
+        "  camera_model: pinhole\n  distortion_coeffs: [-0.28, 0.07, 2.0e-4, 1.0e-4]\n  distortion_model: radtan\n"
+        "  intrinsics: [230.0, 228.0, 163.0, 118.0]\n  resolution: [320, 240]\n  rostopic: /cam/image_raw\n"
+    )
+    of_each = (more[0] + write("T_cam_imu", T_left_imu), more[1] + write(key, T))
+    chain = "".join(f"cam{c}:\n{of_each[c]}  cam_overlaps: [{1 - c}]\n{common}" for c in (0, 1))
+    (root / "camchain-imucam.yaml").write_text(f"%YAML:1.0\n{chain}")
+    (root / "imu0.yaml").write_text(
+        "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\ngyroscope_noise_density: 1.7e-4\n"
+        "gyroscope_random_walk: 1.9e-5\nrostopic: /imu0\nupdate_rate: 200.0\n"
+    )
+
+
 @pytest.mark.parametrize("write", [as_rows, as_opencv])
 @pytest.mark.parametrize("key", ["T_cam_imu", "T_cn_cnm1"])
 def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str, write: Callable[..., str]) -> None:
     before = load_sequence(str(asl))
-    T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
-    T_right_left = _right_left(asl)
-    second = T_right_left if key == "T_cn_cnm1" else T_right_left @ T_left_imu
-    kalibr(asl, lambda c: write("T_cam_imu", T_left_imu) if c == 0 else write(key, second))
+    camchain(asl, key, write)
     after = load_sequence(str(asl))
     np.testing.assert_allclose(after.rig.T_imu_cam, before.rig.T_imu_cam, atol=1e-9)
     assert after.rig.baseline_m == pytest.approx(before.rig.baseline_m, rel=1e-9)
     # twelve printed digits move a rectified pixel by nothing that shows
-    np.testing.assert_allclose(np.sort(after.observations.uv_px[:, 0])[::50], _left_columns(before)[::50], atol=0.05)
+    columns = (np.sort(one.observations.uv_px[:, 0])[::50] for one in (after, before))
+    np.testing.assert_allclose(*columns, atol=0.05)
     assert any("camchain-imucam.yaml" in fact for fact in after.provenance.facts)
-
-
-def camchain(root: Path, more: str = "", of_both: str = "") -> None:
-    """Put Kalibr's files in the place of sensor.yaml, with more of cam0, and of both cameras."""
-    T_left_imu = se3_inverse(load_sequence(str(root), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
-    T_right_left = _right_left(root)
-    kalibr(
-        root,
-        lambda c: (
-            of_both + more + as_rows("T_cam_imu", T_left_imu)
-            if c == 0
-            else of_both + as_rows("T_cn_cnm1", T_right_left)
-        ),
-    )
 
 
 @pytest.mark.parametrize(("shift_s", "frames"), [(0.0, 10), (0.0052, 9), (-0.0208, 9)])
 def test_the_time_shift_that_kalibr_found_is_applied_and_told(asl: Path, shift_s: float, frames: int) -> None:
     """A frame at an end of the motion may fall out of it."""
     before = load_sequence(str(asl)).frames_t_ns
-    camchain(asl, of_both=f"  timeshift_cam_imu: {shift_s}\n")
+    camchain(asl, more=2 * (f"  timeshift_cam_imu: {shift_s}\n",))
     after = load_sequence(str(asl))
     assert after.frame_count >= frames
     assert np.isin(after.frames_t_ns - round(shift_s * 1e9), before).all()
     told = [fact for fact in after.provenance.facts if "timeshift_cam_imu" in fact]
-    assert told == (
-        [f"{1e3 * shift_s:+.3f} ms are added to the stamps of images: timeshift_cam_imu in camchain-imucam.yaml"]
-        if shift_s
-        else []
-    )
-
-
-def test_a_time_shift_of_one_camera_alone_and_one_beyond_the_recording_are_told(asl: Path) -> None:
-    camchain(asl)
-    edit(asl / "camchain-imucam.yaml", "cam0:\n", "cam0:\n  timeshift_cam_imu: 0.004\n")
-    edit(asl / "camchain-imucam.yaml", "cam1:\n", "cam1:\n  timeshift_cam_imu: 0.009\n")
-    facts = load_sequence(str(asl)).provenance.facts
-    assert any("states another timeshift_cam_imu for cam1, +9.000 ms; cam0's is that of both" in fact for fact in facts)
-    edit(asl / "camchain-imucam.yaml", "0.004", "500.0")
-    with pytest.raises(DataError, match=r"timeshift_cam_imu, 500 s, is added to the images'"):
-        load_sequence(str(asl))
+    words = f"{1e3 * shift_s:+.3f} ms are added to the stamps of images: timeshift_cam_imu in camchain-imucam.yaml"
+    assert told == ([words] if shift_s else [])
 
 
 def test_what_a_calibration_states_and_nobody_uses_is_named(asl: Path) -> None:
-    camchain(asl, more="  line_delay: 1.0e-5\n")
+    camchain(asl, more=("  line_delay: 1.0e-5\n  timeshift_cam_imu: 0.004\n", "  timeshift_cam_imu: 0.009\n"))
     edit(
         asl / "imu0.yaml",
         "update_rate",
         "T_i_b: [[1.0, 0.0], [0.0, 1.0]]\ntime_offset: 0.0\ngyro_skew: 0.1\nupdate_rate",
     )
-    unused = [fact for fact in load_sequence(str(asl)).provenance.facts if fact.startswith("not used of")]
-    assert unused == [
+    facts = load_sequence(str(asl)).provenance.facts
+    assert any("states another timeshift_cam_imu for cam1, +9.000 ms; cam0's is that of both" in fact for fact in facts)
+    assert [fact for fact in facts if fact.startswith("not used of")] == [
         "not used of camchain-imucam.yaml: cam0.line_delay",
         f"not used of {asl.name}/imu0.yaml: gyro_skew",
     ]
     (asl / "imu0.yaml").unlink()
     assert any("that of a MEMS unit in motion is assumed" in fact for fact in load_sequence(str(asl)).provenance.facts)
-
-
-def _right_left(root: Path) -> Any:
-    return read_calibration(root, root / "mav0").T_right_left
-
-
-def _left_columns(sequence: Sequence) -> Any:
-    return np.sort(sequence.observations.uv_px[:, 0])
+    edit(asl / "camchain-imucam.yaml", "0.004", "500.0")
+    with pytest.raises(DataError, match=r"timeshift_cam_imu, 500 s, is added to the images'"):
+        load_sequence(str(asl))
 
 
 def test_the_first_seconds_of_a_real_flight_have_tracks_enough(real: Callable[[str], Path]) -> None:
