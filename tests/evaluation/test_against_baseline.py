@@ -1,4 +1,4 @@
-"""``vislam check --trajectories``: files of a system that is not run here, against a baseline of such files."""
+"""``vislam check --trajectories``: files of a system that is not run here against a baseline, and what that finds."""
 
 import json
 from collections.abc import Callable
@@ -10,7 +10,15 @@ import pytest
 from toolkit.cli import main
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
-from toolkit.evaluation.against_baseline import load_trajectory_baseline, to_text
+from toolkit.evaluation.against_baseline import (
+    CHANGES_PERCENT,
+    SequenceRecord,
+    check_trajectories,
+    load_trajectory_baseline,
+    new_trajectory_baseline,
+    planned,
+    to_text,
+)
 from toolkit.evaluation.scoring import TIME_COVERAGE
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.significance import Repeats, Where, check_metrics
@@ -179,3 +187,59 @@ def test_five_runs_raise_no_more_alarms_than_stated_and_show_growth_as_a_one_sid
     assert all((check_metrics([one], 0.05)[0].finding == "regressed") == (p <= 0.025) for one, p in grown[:50])
     # 66 % by 1500 such checks; three standard deviations below.
     assert np.mean([p <= 0.025 for _, p in grown]) > 0.66 - 3.0 * np.sqrt(0.66 * 0.34 / len(grown))
+
+
+class Runs:
+    """Runs of a system whose errors scatter by 8 % and are ``grown``, on as many sequences as are named."""
+
+    def __init__(self, runs: int, rng: np.random.Generator, grown: float = 1.0, sequences: int = 4) -> None:
+        self.runs, self.rng, self.grown = runs, rng, grown
+        self.sequences = tuple(f"S{i}" for i in range(sequences))
+
+    def scored(self, sequence, align, gap_s, before) -> SequenceRecord:
+        values = {key: 100.0 * np.ones(self.runs) for key in ("ate_se3_deg", "rpe_100m_percent", TIME_COVERAGE)}
+        values["ate_se3_m"] = self.grown * np.exp(0.08 * self.rng.standard_normal(self.runs))
+        files = tuple(f"{sequence}/{i}.tum" for i in range(self.runs))
+        scores = {key: tuple(one.tolist()) for key, one in values.items()}
+        return SequenceRecord(sequence=sequence, truth="t", truth_hash="", files=files, scores=scores)
+
+
+def baseline(given: Runs):
+    return new_trajectory_baseline(given, "se3", 5.0, {}, bound_percent=1.0)
+
+
+def position(plan, sequence: str):
+    return next(one for one in plan if one.where.metric == "ate_se3_m" and one.where.sequence == sequence)
+
+
+def test_a_growth_is_found_as_often_as_was_planned():
+    runs = 8
+    rng = np.random.default_rng(runs)
+    made = [baseline(Runs(runs, rng)) for _ in range(30)]
+    expected = np.mean([position(planned(one), "all sequences").seen for one in made[:8]], axis=0)
+    for change, chance in zip(CHANGES_PERCENT, expected, strict=True):
+        found = np.mean([
+            any(v.sequence == "all sequences" and v.finding == "regressed" for v in check.verdicts)
+            for one in made
+            for check in [check_trajectories(one, "", Runs(runs, rng, 1.0 + change / 100.0))]
+        ])  # fmt: skip
+        # Nearly three standard errors of 30 checks; Holm leaves later tests more of the rate than is planned with.
+        assert chance - 0.2 <= found <= chance + 0.25
+
+
+def test_all_sequences_together_need_fewer_runs_than_one():
+    plan = planned(baseline(Runs(10, np.random.default_rng(1), sequences=9)))
+    together, alone = position(plan, "all sequences"), position(plan, "S0")
+    assert together.scatter_percent == pytest.approx(8.0 / 3.0, rel=0.3)
+    assert together.needed[1] is not None
+    assert alone.needed[2] is not None
+    assert together.needed[2] < alone.needed[2]
+    assert together.seen[1] > 0.9
+
+
+def test_what_is_within_the_bound_is_never_found_and_no_scatter_finds_all_else():
+    still = new_trajectory_baseline(Runs(3, np.random.default_rng(2)), "se3", 5.0, {}, bound_percent=7.0)
+    angle = next(one for one in planned(still) if one.where.metric == "ate_se3_deg")
+    assert angle.seen == (0.0, 1.0, 1.0)
+    assert angle.needed == (None, 3, 3)
+    assert angle.is_allowed(0)

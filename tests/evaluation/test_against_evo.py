@@ -78,11 +78,13 @@ def test_kitti_files_are_paired_line_by_line_as_in_evo(tmp_path):
     assert scores.values["kitti_t_percent"] is not None
 
 
-def euroc_files(folder: Path, t_ns: IntArray, late_ns: int = 0) -> tuple[Path, Path]:
-    """Write a truth at 200 Hz as EuRoC has it, and an estimate at other stamps, on a clock that is late, as TUM."""
-    dense = START_NS + np.arange(12_000) * (S // 200)
+AT_200_HZ = START_NS + np.arange(12_000) * (S // 200)
+
+
+def euroc_files(folder: Path, t_ns: IntArray, late_ns: int = 0, truth_t_ns: IntArray = AT_200_HZ) -> tuple[Path, Path]:
+    """Write a truth as EuRoC has it, and an estimate at other stamps, on a clock that is late, as TUM."""
     truth, other = folder / "data.csv", folder / "other.tum"
-    truth.write_text(euroc.text(Trajectory(dense, poses_at(dense))))
+    truth.write_text(euroc.text(Trajectory(truth_t_ns, poses_at(truth_t_ns))))
     other.write_text(tum.text(Trajectory(t_ns - late_ns, drifted(t_ns))))
     return truth, other
 
@@ -107,8 +109,7 @@ def test_with_max_dt_the_nearest_poses_are_paired_as_in_evo(tmp_path, keyframes)
     """Stamps lie anywhere between those of the truth, on a clock of their own; some have none near enough."""
     t_ns = START_NS + np.arange(600) * (S // 10) + np.random.default_rng(1).integers(0, S // 200, 600)
     truth, other = euroc_files(tmp_path, t_ns[::keyframes], S // 4)
-    terms = Terms(max_dt_s=0.002, offset_s=0.25)
-    ours = score_file(other, read_truth("MH_01", truth), terms)
+    ours = score_file(other, read_truth("MH_01", truth), Terms(max_dt_s=0.002, offset_s=0.25))
     pair = evo_pair(truth, other, 0.002, 0.25)
     assert ours.values["pairs"] == pair[0].num_poses < t_ns[::keyframes].size
     assert_equal(ours.values, evo_scores(*pair, ten_frames_are_a_second=False))
@@ -117,9 +118,7 @@ def test_with_max_dt_the_nearest_poses_are_paired_as_in_evo(tmp_path, keyframes)
 
 def test_a_truth_sparser_than_the_trajectory_has_the_roles_exchanged(tmp_path):
     sparse, dense = START_NS + np.arange(60) * S, START_NS + np.arange(1200) * (S // 20) + 7_000_000
-    truth, other = tmp_path / "truth.csv", tmp_path / "other.tum"
-    truth.write_text(euroc.text(Trajectory(sparse, poses_at(sparse))))
-    other.write_text(tum.text(Trajectory(dense, drifted(dense))))
+    truth, other = euroc_files(tmp_path, dense, truth_t_ns=sparse)
     ours = score_file(other, read_truth("x", truth), Terms(max_dt_s=0.02))
     pair = evo_pair(truth, other, 0.02)
     assert ours.values["pairs"] == pair[0].num_poses

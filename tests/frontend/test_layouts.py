@@ -12,9 +12,6 @@ from toolkit.datasets import load_images, load_sequence
 from toolkit.errors import DataError
 from toolkit.frontend.tracking import ImageRecording
 
-FRAMES = 10
-CAMERAS = ("cam0", "cam1")
-
 
 def recording(root: Path) -> ImageRecording:
     found = load_images(str(root))
@@ -26,35 +23,36 @@ def stamps(root: Path) -> list[int]:
     return [pair.t_ns for pair in recording(root).pairs]
 
 
-@pytest.mark.parametrize("folder", ["images", "."])
-def test_images_need_not_be_in_a_folder_called_data(asl: Path, folder: str) -> None:
-    """TUM-VI's dso has them in ``images``, extractors of bags in the camera's own folder."""
+def moved(path: Path, folder: str) -> None:
+    """Move an image, as into TUM-VI's ``images`` of dso, or into the camera's own folder, as extractors of bags do."""
+    target = path.parent.parent / folder
+    target.mkdir(exist_ok=True)
+    shutil.move(path, target / path.name)
+
+
+def converted(path: Path, suffix: str) -> None:
+    cv2.imwrite(str(path.with_suffix(suffix)), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    path.unlink()
+
+
+def named_in_seconds(path: Path, _: str) -> None:
+    (path.parent.parent / "data.csv").unlink(missing_ok=True)
+    path.rename(path.with_name(f"{path.stem[:-9]}.{path.stem[-9:]}.png"))
+
+
+@pytest.mark.parametrize(
+    ("change", "how"),
+    [(moved, "images"), (moved, "."), *((converted, end) for end in (".jpg", ".pgm", ".tiff")), (named_in_seconds, "")],
+)
+def test_images_laid_out_otherwise_are_the_same_recording(
+    asl: Path, change: Callable[[Path, str], None], how: str
+) -> None:
+    """Tables go on to name data/*.png."""
     expected = stamps(asl)
-    for camera in CAMERAS:
-        data = asl / "mav0" / camera / "data"
-        (asl / "mav0" / camera / folder).mkdir(exist_ok=True)
-        for image in list(data.iterdir()):
-            shutil.move(image, asl / "mav0" / camera / folder / image.name)
-        data.rmdir()
-    assert stamps(asl) == expected
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".pgm", ".tiff"])
-def test_images_that_were_converted_are_found_though_their_tables_name_png(asl: Path, suffix: str) -> None:
-    expected = stamps(asl)
-    for camera in CAMERAS:
-        for image in list((asl / "mav0" / camera / "data").iterdir()):
-            cv2.imwrite(str(image.with_suffix(suffix)), cv2.imread(str(image), cv2.IMREAD_GRAYSCALE))
-            image.unlink()
-    assert stamps(asl) == expected
-
-
-def test_names_may_be_stamps_in_seconds_to_the_nanosecond(asl: Path) -> None:
-    expected = stamps(asl)
-    for camera in CAMERAS:
-        (asl / "mav0" / camera / "data.csv").unlink()
-        for image in list((asl / "mav0" / camera / "data").iterdir()):
-            image.rename(image.with_name(f"{image.stem[:-9]}.{image.stem[-9:]}.png"))
+    for image in asl.glob("mav0/cam*/data/*.png"):
+        change(image, how)
+    for empty in (data for data in asl.glob("mav0/cam*/data") if not any(data.iterdir())):
+        empty.rmdir()
     assert stamps(asl) == expected
 
 
