@@ -24,7 +24,7 @@ from toolkit.answers import Output, Run
 from toolkit.errors import VislamError, no_such, type_of
 from toolkit.estimator import Build
 from toolkit.experiment.comparison import Comparison, Record
-from toolkit.experiment.configuration import Configuration, Request, plan_of, record_of
+from toolkit.experiment.configuration import Request, plan_of, record_of
 from toolkit.experiment.explanation import Explanation, default_ends, run_explanation
 from toolkit.experiment.pipeline import Plan
 from toolkit.experiment.pipeline import run as run_plan
@@ -182,7 +182,8 @@ def _planned(source: Source, estimators: Names | None, **options: Any) -> tuple[
     given |= {"estimators": _names("estimators", estimators), "keep": _names("keep", given.get("keep", ()))}
     asked = record_of(_Asked, _plain({key: value for key, value in given.items() if value is not None}))
     plan = plan_of(
-        Configuration(asked, _with_seeds(options.get("settings", DEFAULTS), asked)),
+        asked,
+        _with_seeds(options.get("settings", DEFAULTS), asked),
         (source if isinstance(source, Sequence) else str(source),),
         _checked_own(options.get("own"), asked.estimators or ()),
         asked.workers,
@@ -299,8 +300,7 @@ class Result:
                 raise SettingsError(f"{what} is {value!r}; there are {', '.join(get_args(known))}")
         if not isinstance(directory, str | Path):
             raise SettingsError(f"directory is {type_of(directory)}; give a path")
-        requested = Configuration(Request(), self.comparison.settings)
-        write_run(self.comparison, Path(directory), MadeBy("toolkit.compare", requested, figure_format, figures))
+        write_run(self.comparison, Path(directory), MadeBy("toolkit.compare", Request(), figure_format, figures))
         return Path(directory)
 
     def __repr__(self) -> str:

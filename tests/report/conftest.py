@@ -14,7 +14,6 @@ from toolkit.answers import Run, Timings
 from toolkit.audit import Finding
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.metrics import Scores
@@ -61,7 +60,7 @@ def run_directory(
     """The run directory of the comparison; it is shared and must not be changed. Nobody looks at its figures."""
     target = tmp_path_factory.mktemp("runs") / "made-up"
     with without_pixels():
-        write_run(comparison, target, MadeBy("vislam compare made-up --seed 3", Configuration()))
+        write_run(comparison, target, MadeBy("vislam compare made-up --seed 3"))
     return target
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.noise import card_of, measured_noise
 from toolkit.report.card import card_lines, card_record
@@ -83,7 +82,7 @@ def test_a_report_and_its_page_have_the_card_on_request(walking: Sequence, tmp_p
     assert report_document(comparison).card == card_record(comparison.card)
     assert "## Its tracks" in report_text(comparison, {})
     assert all(line in comparison_text(comparison, width=None) for line in words)
-    write_run(comparison, tmp_path / "run", MadeBy("vislam compare", Configuration()))
+    write_run(comparison, tmp_path / "run", MadeBy("vislam compare"))
     assert tuple(payload_of([read_run(tmp_path / "run")])["cases"][0]["card"]) == words
 
 

@@ -15,7 +15,6 @@ from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.experiment.references import ExternalFile, external_runs, reference_runs
 from toolkit.experiment.units import outcome_of
@@ -189,7 +188,7 @@ def export(flight: Sequence, tmp_path: Path) -> Path:
 def compared(export: Path) -> tuple[Comparison, Path]:
     out = export.parent / "run"
     (comparison,) = run(Plan((str(export),), ("dead-reckoning",), truth=export.parent / "truth.csv", workers=1))
-    write_run(comparison, out, MadeBy("vislam compare", Configuration()))
+    write_run(comparison, out, MadeBy("vislam compare"))
     return comparison, out
 
 

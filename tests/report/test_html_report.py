@@ -12,7 +12,6 @@ import pytest
 
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
 from toolkit.report.html import page_text
 from toolkit.report.html.payload import highlights, payload_of, running_median, with_peaks
 from toolkit.report.messages import ContestRecord, Rival
@@ -34,7 +33,7 @@ def page(run_directory: Path) -> str:
 
 
 def written(comparison: Comparison, target: Path) -> Path:
-    write_run(comparison, target, MadeBy("vislam compare", Configuration()))
+    write_run(comparison, target, MadeBy("vislam compare"))
     return target
 
 

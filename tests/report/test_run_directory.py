@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from toolkit.errors import OutputError
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
 from toolkit.report import figures, run_directory
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
@@ -31,7 +30,7 @@ def _one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(comparison: Comparison, target: Path) -> None:
-    write_run(comparison, target, MadeBy("vislam compare", Configuration()))
+    write_run(comparison, target, MadeBy("vislam compare"))
 
 
 def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:

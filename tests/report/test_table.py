@@ -11,7 +11,6 @@ from tests.report.conftest import rescored
 from toolkit.audit import Finding
 from toolkit.errors import VislamError
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import Scores, known_metrics, metrics_called
@@ -240,5 +239,5 @@ def test_the_manifest_has_what_was_measured_and_the_table_says_it_once(tmp_path:
     assert comparison.measured is not None
     assert comparison.sequence.rig.track_weight == comparison.measured.tracks.value < 0.5
     assert [line.startswith("noise: ") for line in header_lines(comparison)].count(True) == 1
-    write_run(comparison, tmp_path / "run", MadeBy("vislam compare", Configuration()))
+    write_run(comparison, tmp_path / "run", MadeBy("vislam compare"))
     assert read_manifest(tmp_path / "run" / "manifest.json").noise == comparison.measured

@@ -40,8 +40,9 @@ if TYPE_CHECKING:
     from msgspec import Struct
 
     from toolkit.experiment.comparison import Comparison
-    from toolkit.experiment.configuration import Configuration
+    from toolkit.experiment.configuration import Request
     from toolkit.report.comparison_table import Columns
+    from toolkit.settings import Settings
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
@@ -120,9 +121,9 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.report.scores import scores_document
 
     columns = requested_columns(options.columns)
-    requested = _requested_configuration(options)
-    plan = plan_of(requested, SEQUENCES, workers=options.workers, scheduler=options.scheduler)
-    made_by = MadeBy(shlex.join(options.command_line), requested, options.figure_format, options.figures)
+    request, settings = _requested(options)
+    plan = plan_of(request, settings, SEQUENCES, workers=options.workers, scheduler=options.scheduler)
+    made_by = MadeBy(shlex.join(options.command_line), request, options.figure_format, options.figures)
     progress_for, all_ok = of_this_process(), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
@@ -200,7 +201,7 @@ def explain(options: argparse.Namespace) -> int:
 
     options.sequences = [options.sequence]
     options.estimators = options.estimators or tuple(discover())
-    plan = plan_of(_requested_configuration(options), (), workers=options.workers, scheduler=options.scheduler)
+    plan = plan_of(*_requested(options), (), workers=options.workers, scheduler=options.scheduler)
     usual = default_ends()
     ends = options.start_at or usual[0], options.goal or usual[1]
     target, progress_for = options.out or _new_run(), of_this_process()
@@ -264,7 +265,7 @@ def sweep(options: argparse.Namespace) -> int:
     if len(axes) < len(options.over):
         raise UsageError("--over names the same twice; give all its values at once")
     options.sequences = None if options.sequence is None else [options.sequence]
-    plan = plan_of(_requested_configuration(options), (), workers=options.workers, scheduler=options.scheduler)
+    plan = plan_of(*_requested(options), (), workers=options.workers, scheduler=options.scheduler)
     if not plan.sources:
         raise UsageError("name the sequence to sweep, a path or a built-in name as drive")
     target, progress_for = options.out or _new_run(), of_this_process()
@@ -296,11 +297,11 @@ def _print(document: Struct, text: str, target: Path, options: argparse.Namespac
         print_above(f"{text}\n\nresults: {where}; as a page: vislam report {shlex.quote(where)}")
 
 
-def _requested_configuration(options: argparse.Namespace) -> Configuration:
+def _requested(options: argparse.Namespace) -> tuple[Request, Settings]:
     """Return what is to be compared and how: the file of --config, and over it the command line."""
-    from toolkit.experiment.configuration import Request, configuration, read_configuration
+    from toolkit.experiment.configuration import COMPARE, Request, read_configuration, record_of
     from toolkit.metrics import requests_of
-    from toolkit.settings.reading import with_changes
+    from toolkit.settings.reading import settings_of, with_changes
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
     columns = getattr(options, "columns", ())
@@ -312,7 +313,7 @@ def _requested_configuration(options: argparse.Namespace) -> Configuration:
     given = {name: value for name, value in given.items() if value not in (None, [], {})}
     places = ([] if options.config is None else [str(options.config)]) + (["the command line"] if changes else [])
     place = " or ".join(places) or "the command line"
-    return configuration({**request, **given}, with_changes(settings, changes), place)
+    return record_of(Request, {**request, **given}, place, COMPARE), settings_of(with_changes(settings, changes), place)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from toolkit.errors import DataError, did_you_mean
 from toolkit.files.documents import Record, readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings import Scalar, Settings, SettingsError
-from toolkit.settings.reading import read_toml, settings_of, without_removed
+from toolkit.settings.reading import read_toml, without_removed
 
 if TYPE_CHECKING:
     from toolkit.estimator import Build
@@ -48,13 +48,6 @@ class SweepRequest(Struct, frozen=True):
     each: bool = False
 
 
-class Configuration(Struct, frozen=True):
-    """What to compare, and with which settings."""
-
-    request: Request = Request()
-    settings: Settings = Settings()
-
-
 def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Return the comparison and the settings in a file, as nested values not yet checked.
 
@@ -74,11 +67,6 @@ def read_sweep_request(path: Path) -> SweepRequest:
     return record_of(SweepRequest, values, str(path), SWEEP)
 
 
-def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place: str) -> Configuration:
-    """Return nested values as records, the defaults where nothing is given; raises SettingsError as settings_of."""
-    return Configuration(record_of(Request, request, place, COMPARE), settings_of(settings, place))
-
-
 def record_of(record: type[Record], values: Mapping[str, Any], place: str = "", table: str = "") -> Record:
     """Return values as a record; raises SettingsError, with place and table, for one that it cannot have."""
     before, of = f"{place}: " if place else "", f"{table}." if table else ""
@@ -92,13 +80,14 @@ def record_of(record: type[Record], values: Mapping[str, Any], place: str = "", 
 
 
 def plan_of(
-    requested: Configuration,
+    request: Request,
+    settings: Settings,
     default: "Sequence[str | Recorded]",
     own: "Mapping[str, Build] | None" = None,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> "Plan":
-    """Return the plan of a configuration; where it names no sequences ``default`` are compared.
+    """Return the plan of a request; where it names no sequences ``default`` are compared.
 
     ``own`` are further estimators as functions by name. Raises SettingsError for what does not go together.
     """
@@ -107,13 +96,12 @@ def plan_of(
     from toolkit.experiment.recording import Part
     from toolkit.registry import defaults
 
-    request = requested.request
     usual = () if own else defaults()
     return Plan(
         sources=tuple(request.sequences or default),
         estimators=usual if request.estimators is None else request.estimators,
         own=own or {},
-        settings=requested.settings,
+        settings=settings,
         truth=None if request.truth is None else Path(request.truth),
         trajectories={name: Path(file) for name, file in request.trajectories.items()},
         keep=frozenset(request.keep),

@@ -17,7 +17,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration, Request
+from toolkit.experiment.configuration import Request
 from toolkit.experiment.workers import usable_cpus
 from toolkit.files.documents import Json, reader
 from toolkit.noise import MeasuredNoise
@@ -80,18 +80,18 @@ def _of_today(manifest: Json) -> Json:
 read_manifest = reader(Manifest, "repeat the comparison", older={"vislam.manifest/1": _of_today})
 
 
-def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:
+def manifest_document(comparison: Comparison, command: str, requested: Request) -> Manifest:
     from_files = {run.estimator for run in comparison.runs if run.timings is None}
     here = tuple(name for name in comparison.estimators if name not in from_files)
     variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     versions = {name: installed_version(package) for name, package in _PACKAGES.items()}
     words = tuple(comparison.own_files.get(name, name) for name in here)
-    request = msgspec.structs.replace(requested.request, sequences=(comparison.source,), estimators=words)
+    request = msgspec.structs.replace(requested, sequences=(comparison.source,), estimators=words)
     return Manifest(
         schema="vislam.manifest/1",
         command=command,
         compare=request,
-        settings=requested.settings,
+        settings=comparison.settings,
         date=_now(),
         versions={"python": platform.python_version(), **versions},
         git_revision=_git_revision(),

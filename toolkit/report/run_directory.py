@@ -7,7 +7,7 @@ import io
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,7 +20,7 @@ from toolkit.datasets.trajectories import openvins, tum
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.configuration import Request
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.recording import Prepared
 from toolkit.files.documents import to_line, to_text
@@ -124,13 +124,13 @@ def unique_names(names: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class MadeBy:
-    """The command line that made a comparison, and what it came to: what to compare, with which settings.
+    """The command line that made a comparison, and what it asked for.
 
     ``figures`` is the kind of files that figures are written as, ``choice`` which of them.
     """
 
     command: str
-    requested: Configuration
+    request: Request = field(default_factory=Request)
     figures: "FigureFormat" = "png"
     choice: "FigureChoice" = "few"
 
@@ -154,7 +154,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             _write_trajectories(comparison, directory)
         captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
-        manifest = manifest_document(comparison, made_by.command, made_by.requested)
+        manifest = manifest_document(comparison, made_by.command, made_by.request)
         written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
         manifest = msgspec.structs.replace(manifest, files=tuple(sorted([*written, MANIFEST])))
         _write_text(directory / MANIFEST, to_text(manifest))
