@@ -9,7 +9,7 @@ the window. Three faults are recovered from, and the log lists them:
 - a landmark whose gate has rejected more sightings than it was built from is started again, if the rejected ones agree.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Protocol
 
@@ -23,7 +23,6 @@ from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S, Packet
-from toolkit.models.factors import points_of
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation; sightings used at once; all landmarks; gate once frame is solved"
@@ -49,7 +48,10 @@ class LagWindow(Protocol):
         """Remove landmarks and their sightings in the window."""
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of the window."""
+        """Return the latest values, those of the states at least."""
+
+    def points(self, track_ids: Iterable[int]) -> dict[int, Array]:
+        """Return the latest points (3,) of landmarks of the window."""
 
     def cov(self, keys: list[int]) -> Array:
         """Return the joint covariance of the variables of a state of the window, in GTSAM's tangent spaces."""
@@ -119,7 +121,7 @@ class FixedLag:
         # Copied, because each is a row of one array: a view would keep the whole array alive.
         self._points |= {i: self._in_window[i].copy() for i in left}
         self._forget(left)
-        self._in_window = points_of(self._values, self._last_seen_ns)
+        self._in_window = self._tree.points(self._last_seen_ns)
         self._builder.update(newest, self._in_window)
         return newest
 

@@ -9,7 +9,7 @@ between the state and the landmarks are kept. Answers are read as in `fixed-lag`
 are eliminated as in `smart`; the rest of the system is dense.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, cast
@@ -27,7 +27,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_right_jacobian, skew, transform
 from toolkit.measurements import NS_PER_S
-from toolkit.models.factors import L, kind_of
+from toolkit.models.factors import kind_of
 from toolkit.models.motion import motion_model
 from toolkit.models.stereo_adjustment import (
     Eliminated,
@@ -347,11 +347,13 @@ class SlidingWindow:
         return self._solved()
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of the window."""
-        values = gtsam.Values(self._window.values)
-        for track_id, point in self._window.points_by_id().items():
-            values.insert(L(track_id), point)
-        return values
+        """Return the latest values of the states."""
+        return self._window.values
+
+    def points(self, track_ids: Iterable[int]) -> dict[int, Array]:
+        """Return the latest points (3,) of landmarks of the window."""
+        known = self._window.points_by_id()
+        return {i: known[i] for i in track_ids}
 
     def cov(self, keys: list[int]) -> Array:
         """Return the joint covariance of the variables of a state, in GTSAM's tangent spaces."""

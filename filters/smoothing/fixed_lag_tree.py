@@ -32,7 +32,7 @@ from filters.smoothing.indeterminate import (
 )
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
-from toolkit.models.factors import L, joint_cov, key_list, kind_of
+from toolkit.models.factors import L, joint_cov, key_list, kind_of, points_of
 
 MOST_RECOVERIES = 20
 # How many landmarks with a marginal on them are eliminated in one clique: with fewer, copying from clique to clique
@@ -108,6 +108,10 @@ class FixedLagTree:
     def values(self) -> gtsam.Values:
         """Return the latest values of the window, and of the variables that left it with the last packet."""
         return self._values
+
+    def points(self, track_ids: Iterable[int]) -> dict[int, Array]:
+        """Return the latest points (3,) of landmarks of the window."""
+        return points_of(self._values, track_ids)
 
     def cov(self, keys: list[int]) -> Array:
         """Return the joint covariance of some variables of the window, in GTSAM's tangent spaces."""
