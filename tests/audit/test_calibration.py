@@ -228,7 +228,7 @@ def test_a_parameter_counts_beyond_its_limit_and_its_standard_errors(
     one, rig = JUDGED[name], recorded(FLIGHT, 0).rig
     limit, row = one.limits[kind] if np.isfinite(one.limits[kind]) else 0.0, one.rows.start
     wrongs = wrong(sure(row, -1.01 * limit if limit else 1.0), rig, kind)
-    assert [found.check for found in wrongs] == ([one.check] if limit else [])
+    assert [check for _, check in wrongs] == ([one.check] if limit else [])
     assert wrong(sure(row, 0.98 * limit), rig, kind) == []
     for beyond, wanted in ((sigmas - 0.1, False), (sigmas + 0.1, bool(limit))):
         value = (limit + beyond * (error := 0.1 * limit + 1e-9)) * np.eye(COMMON)[row]
@@ -238,8 +238,8 @@ def test_a_parameter_counts_beyond_its_limit_and_its_standard_errors(
 def test_what_is_below_its_limit_is_doubted_and_the_error_that_is_reported_has_half_of_the_limit_in_it() -> None:
     rig = recorded(FLIGHT, 0).rig
     assert "right" in (doubtful(sure(RIGHT_SHIFT, 0.049), rig, "imu") or "")
-    (reported,) = wrong(sure(0, 0.2), rig, "twist")
-    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in reported.summary
+    ((reported, _),) = wrong(sure(0, 0.2), rig, "twist")
+    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in reported
 
 
 def with_position(lacking_m: Array, error_m: float, T_imu_cam: Array | None = None) -> Symptom | Undecided | None:

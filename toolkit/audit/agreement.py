@@ -12,7 +12,7 @@ from toolkit.audit.alignment import ForceBesideCamera
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import FORCE, LEAST_INTERVALS, RATE, SPEED, Intervals
 from toolkit.audit.one_step import errors_are_independent
-from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, MEDIAN_TO_MEAN_ERROR, Scalar, median_error
+from toolkit.audit.robust import MEDIAN_TO_MEAN_ERROR, Scalar, median_error, regression
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import STRETCHES
 from toolkit.measurements import NS_PER_S
@@ -349,19 +349,11 @@ def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
 
 
 def _read(t_s: Array, fallen: Array) -> tuple[float, float]:
-    """Return the size of the slope (m/s^2) of velocities (n, 3) at times (n,), and its error, with Cauchy weights."""
-    weight = np.ones(len(t_s))
-    for _ in range(ITERATIONS):
-        share = weight / weight.sum()
-        since_s, apart = t_s - share @ t_s, fallen - share @ fallen
-        moment = weight * since_s
-        slope = moment @ apart / float(moment @ since_s)
-        residual = apart - since_s[:, None] * slope
-        sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), 1e-9)
-        weight = 1.0 / (1.0 + np.sum((residual / sigma) ** 2, axis=1) / (3.0 * CAUCHY_SIGMAS**2))
-    size = float(np.linalg.norm(slope))
-    error = float(np.linalg.norm(sigma * slope / max(size, 1e-9)))
-    return size, error / float(np.sqrt(np.sum(since_s**2)))
+    """Return the size of the slope (m/s^2) of velocities (n, 3) at times (n,), and its error."""
+    line = np.stack([np.ones(t_s.size), t_s - t_s.mean()], axis=1)
+    found, cov = regression(fallen, np.kron(line, np.eye(3)).reshape(-1, 3, 6))
+    slope, size = found[3:], float(np.linalg.norm(found[3:]))
+    return size, float(np.sqrt(slope @ cov[3:, 3:] @ slope)) / max(size, 1e-9)
 
 
 # An interval is a candidate beyond this many standard deviations of all and beyond this angle (rad). Single intervals

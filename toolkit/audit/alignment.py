@@ -12,13 +12,11 @@ import numpy as np
 
 from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided
 from toolkit.audit.robust import (
-    CAUCHY_SIGMAS,
-    ITERATIONS,
     Scalar,
     chance_bound,
     in_motion,
+    regression,
     slip_stretches,
-    spread,
 )
 from toolkit.geometry import Array, IntArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
@@ -94,7 +92,7 @@ def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
     measured, seen = intervals.v_measured_mps, intervals.v_seen_mps
     pose = np.concatenate([-skew(intervals.w_seen_radps), skew(seen)], axis=2)
     response, jacobian = measured - seen, np.concatenate([-seen[:, :, None], pose], axis=2)
-    found, formal = _robust_with_formal_cov(response, jacobian)
+    found, formal = regression(response, jacobian)
     stretches = slip_stretches(len(seen) * step_s)
     lasting = jackknife_cov(_robust_solution, response, jacobian, stretches=stretches)
     cov = lasting if stretches == STRETCHES else jackknife_cov(_robust_solution, response, jacobian)
@@ -121,27 +119,8 @@ def _tested(rad: Array, formal: Array, cov: Array, stretches: float) -> Turn:
     return Turn((axes.T @ rad)[decidable], error_rad[decidable], np.maximum(by_chance_rad, LEAST_BOUND_RAD))
 
 
-def _robust_with_formal_cov(response: Array, jacobian: Array) -> tuple[Array, Array]:
-    """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights.
-
-    The covariance (m, m) assumes that errors of rows are independent.
-    """
-    unknowns = jacobian.shape[2]
-    rows, flat = jacobian.reshape(-1, unknowns), response.ravel()
-    found = np.linalg.lstsq(rows, flat)[0]
-    for _ in range(ITERATIONS):
-        residual = (flat - rows @ found).reshape(response.shape)
-        scale = np.maximum(spread(residual), 1e-9)
-        weight = 1.0 / (1.0 + (residual / scale) ** 2 / CAUCHY_SIGMAS**2) / scale**2
-        weighted = rows * weight.reshape(-1, 1)
-        information: Array = weighted.T @ rows
-        information += 1e-12 * np.trace(information) * np.eye(unknowns)
-        found = np.linalg.solve(information, weighted.T @ flat)
-    return np.asarray(found), np.asarray(np.linalg.inv(information))
-
-
 def _robust_solution(response: Array, jacobian: Array) -> Array:
-    return _robust_with_formal_cov(response, jacobian)[0]
+    return regression(response, jacobian)[0]
 
 
 def way_gone(intervals: Intervals, position: Position, way_m: Array) -> Scalar:

@@ -89,11 +89,8 @@ JUDGED = {
 BESIDE = {"imu": "IMU", "twist": "odometry"}
 
 
-class Wrong(NamedTuple):
-    """One wrong part: the message, and what to check."""
-
-    summary: str
-    check: str
+# One wrong part: the message, and what to check.
+Wrong = tuple[str, str]
 
 
 def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wrong]:
@@ -106,7 +103,7 @@ def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wron
 
 def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | None:
     differences = _beyond(found, rig, kind, {name: 0.0 for name, one in JUDGED.items() if one.unseen})
-    summary = "; ".join(one.summary for one in differences)
+    summary = "; ".join(told for told, _ in differences)
     return f"{summary}: that is more than chance and no more than in recordings without faults" if differences else None
 
 
@@ -131,7 +128,7 @@ def _beyond(found: SelfCalibration, rig: StereoRig, kind: MotionKind, limits: di
         rows, check = JUDGED[name].rows, JUDGED[name].check
         value, error = found.value[rows], found.error[rows]
         if (np.abs(value) > limit + RIGHT_SIGMAS[kind] * error).any():
-            wrongs.append(Wrong(_summary(name, value, np.hypot(error, 0.5 * limit), rig, BESIDE[kind]), check))
+            wrongs.append((_summary(name, value, np.hypot(error, 0.5 * limit), rig, BESIDE[kind]), check))
     return wrongs
 
 
@@ -432,20 +429,20 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
         rate = rotation_ratio(intervals)
         if 1.0 + RATIO_SIGMAS * rate.error + SYSTEMATIC_RATE < rate.value < MOST_RATIO:
             summary = f"the gyro turns {rate.value:.3f} +- {rate.error:.3f} times as fast as the camera"
-            wrongs.append(Wrong(summary, "the scale of the gyro and the focal length"))
+            wrongs.append((summary, "the scale of the gyro and the focal length"))
     elif found is not None:
         unseen = [doubtful(found, rig, kind), *unseen]
     force = force_ratio(sequence)
     near = force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO  # else a `disagreement`
     if force is not None and near and abs(force.value - 1.0) > RATIO_SIGMAS * force.error + SYSTEMATIC_FORCE:
         summary = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
-        wrongs.append(Wrong(summary, "the scale and the bias of the accelerometer"))
+        wrongs.append((summary, "the scale and the bias of the accelerometer"))
     if not wrongs:
         return Undecided("; ".join(filter(None, unseen))) if any(unseen) else None
     return Symptom.warning(
         count=len(wrongs),
-        detail="; ".join(one.summary for one in wrongs),
-        treatment=f"check {', '.join(dict.fromkeys(part for one in wrongs for part in one.check.split(', ')))}",
+        detail="; ".join(told for told, _ in wrongs),
+        treatment=f"check {', '.join(dict.fromkeys(part for _, check in wrongs for part in check.split(', ')))}",
     )
 
 
@@ -458,7 +455,7 @@ def _by_turn(turn: Turn, rig: StereoRig) -> tuple[list[Wrong], str]:
             f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
             f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
         )
-        return [Wrong(summary, "the extrinsic and the principal point")], ""
+        return [(summary, "the extrinsic and the principal point")], ""
     if least < LARGEST_RAD:
         return [], ""
     unseen = f"a rotation of it by less than {least:.2f} rad" if np.isfinite(least) else "any rotation of it"

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.intervals import LEAST_INTERVALS, Integral, Intervals, usual_step_s
-from toolkit.audit.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, slope, spread
+from toolkit.audit.robust import Scalar, regression, slope, spread
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.jackknife import jackknife_error
 from toolkit.measurements import NS_PER_S
@@ -214,7 +214,7 @@ def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar
                 at = _linearised(as_gyro, seen, found, np.arange(aside, count - aside))
                 if at is None:
                     return None
-                found = found + _solved(*at)
+                found = found + regression(*at)[0]
                 found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
         if at is None or abs(found[1]) >= MOST_RATE:
             return None
@@ -224,7 +224,7 @@ def rate_of_clock(as_gyro: Sequence, seen: Intervals, offset_s: float) -> Scalar
             left, without = (np.inf if one is None else float(np.sum(spread(one[0]) ** 2)) for one in both)
             if not left < MOST_UNEXPLAINED * without:
                 return None
-        return Scalar(float(found[1]), SCATTER * jackknife_error(lambda *rows: float(_solved(*rows)[1]), *at))
+        return Scalar(float(found[1]), SCATTER * jackknife_error(lambda *rows: float(regression(*rows)[0][1]), *at))
     except np.linalg.LinAlgError:  # the truth rotates in at most one stretch
         return None
 
@@ -252,15 +252,3 @@ def _linearised(as_gyro: Sequence, seen: Intervals, found: Array, rows: IntArray
     middle_s = 0.5 * (since_s[:-1] + since_s[1:])[seen.interval[used]]
     unexplained = seen.w_seen_radps[used] - (1.0 + found[1]) * now
     return unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2)
-
-
-def _solved(unexplained: Array, jacobian: Array) -> Array:
-    """Return offset and rate (2,) by least squares with Cauchy weights; raises LinAlgError where nothing turns."""
-    scale = np.maximum(spread(unexplained), 1e-9)
-    x, y = (jacobian / scale[:, None]).reshape(-1, 2), (unexplained / scale).ravel()
-    weight = np.ones(y.size)
-    for _ in range(ITERATIONS):
-        weighted = x.T * weight
-        found = np.linalg.solve(weighted @ x, weighted @ y)
-        weight = 1.0 / (1.0 + (y - x @ found) ** 2 / CAUCHY_SIGMAS**2)
-    return np.asarray(found)

@@ -118,6 +118,25 @@ def chance_bound(error: Array, formal: Array, stretches: float) -> Array:
     return np.asarray(np.minimum(float(stdtrit(dof, 1.0 - 0.5 * LEVEL)) * pooled, by_own))
 
 
+def regression(response: Array, jacobian: Array) -> tuple[Array, Array]:
+    """Solve response (M, k) = jacobian (M, k, m) x by least squares with Cauchy weights.
+
+    The covariance (m, m) assumes that errors of rows are independent.
+    """
+    unknowns = jacobian.shape[2]
+    rows, flat = jacobian.reshape(-1, unknowns), response.ravel()
+    found = np.linalg.lstsq(rows, flat)[0]
+    for _ in range(ITERATIONS):
+        residual = (flat - rows @ found).reshape(response.shape)
+        scale = np.maximum(spread(residual), 1e-9)
+        weight = 1.0 / (1.0 + (residual / scale) ** 2 / CAUCHY_SIGMAS**2) / scale**2
+        weighted = rows * weight.reshape(-1, 1)
+        information: Array = weighted.T @ rows
+        information += 1e-12 * np.trace(information) * np.eye(unknowns)
+        found = np.linalg.solve(information, weighted.T @ flat)
+    return np.asarray(found), np.asarray(np.linalg.inv(information))
+
+
 def slope(instrument: Array, regressor: Array, response: Array) -> Scalar:
     """Estimate s in response = s * regressor + noise, all (M, d), with Cauchy weights.
 

@@ -497,11 +497,8 @@ IN_A_PART = " in a part of the recording and not in another"
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
 
 
-class _WrongUnit(NamedTuple):
-    """A unit that is wrong: what was measured, and the sequence in SI, or None where two units are as likely."""
-
-    summary: str
-    remedy: Sequence | None
+# A unit that is wrong: what was measured, and the sequence in SI, or None where two units are as likely.
+_WrongUnit = tuple[str, Sequence | None]
 
 
 def units(evidence: Evidence) -> Symptom | Undecided | None:
@@ -518,12 +515,12 @@ def units(evidence: Evidence) -> Symptom | Undecided | None:
         wrong = measure(now)
         if wrong is not None:
             found.append(wrong)
-            now = now if wrong.remedy is None else now.after(wrong.remedy)
+            now = now if wrong[1] is None else now.after(wrong[1])
     if not found:
         return evidence.blind if evidence.intervals is None else None
-    certain = all(wrong.remedy is not None for wrong in found)
+    certain = all(remedy is not None for _, remedy in found)
     treatment = "converted to SI" if certain else "no single unit fits all of it: correct the recording"
-    detail = "; ".join(wrong.summary for wrong in found)
+    detail = "; ".join(summary for summary, _ in found)
     return Symptom(len(found), detail, treatment, now.sequence if certain else None, spoils_vision=True)
 
 
@@ -539,7 +536,7 @@ def _stamps(evidence: Evidence) -> _WrongUnit | None:
         return None
     rates = f"their rate of rotation {rotation.value:.3g} +- {rotation.error:.1g} times the camera's"
     fast = f"the stamps run {speed.value:.3g} times as fast as time, so they are not in seconds"
-    return _WrongUnit(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and {rates}: {fast}", None)
+    return (f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and {rates}: {fast}", None)
 
 
 def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
@@ -549,7 +546,7 @@ def _frame_rate(evidence: Evidence) -> _WrongUnit | None:
     if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
         return None
     summary = f"by the stamps frames come every {step_s:.2g} s, which no camera does: they are not in seconds"
-    return _WrongUnit(summary, None)
+    return (summary, None)
 
 
 def _baseline(evidence: Evidence) -> _WrongUnit | None:
@@ -566,10 +563,10 @@ def _baseline(evidence: Evidence) -> _WrongUnit | None:
         fitting = [unit] if unit is not None else []
         summary += f", and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
     if len(fitting) != 1:
-        return _WrongUnit(f"{summary}: it is not in metres", None)
+        return (f"{summary}: it is not in metres", None)
     baseline_m = rig.baseline_m / LENGTHS[fitting[0]]
     remedy = replace(evidence.sequence, rig=replace(rig, baseline_m=baseline_m))
-    return _WrongUnit(f"{summary}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
+    return (f"{summary}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
 
 
 def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
@@ -582,7 +579,7 @@ def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
     summary = f"T_imu_cam puts the camera {distance_m:.3g} m from the IMU"
     unit = "millimetres"
     if distance_m / LENGTHS[unit] > MOST_LEVER_M:
-        return _WrongUnit(f"{summary}: it is not in metres", None)
+        return (f"{summary}: it is not in metres", None)
     T_imu_cam = se3(rig.T_imu_cam[:3, :3], position / LENGTHS[unit])
     if evidence.intervals is not None:
         camera = evidence.camera_motion
@@ -591,7 +588,7 @@ def _lever_arm(evidence: Evidence) -> _WrongUnit | None:
             return None  # a long vehicle: the tracks follow the motion as the arm is given
         summary += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
     remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=T_imu_cam))
-    return _WrongUnit(f"{summary}: its translation is in {unit}", remedy)
+    return (f"{summary}: its translation is in {unit}", remedy)
 
 
 def _of_samples(evidence: Evidence, quantity: Quantity) -> _WrongUnit | None:
@@ -608,10 +605,10 @@ def _of_samples(evidence: Evidence, quantity: Quantity) -> _WrongUnit | None:
         first = np.arange(intervals.interval.size) < intervals.interval.size // 2
         halves = (quantity.ratio_of(sequence, intervals.select(rows)) for rows in (first, ~first))
         if any(half is not None and (half.value > np.sqrt(factor)) != (factor > 1.0) for half in halves):
-            return _WrongUnit(f"{summary}{IN_A_PART}", None)
+            return (f"{summary}{IN_A_PART}", None)
     scale = np.ones(6)
     scale[quantity.columns] /= factor
-    return _WrongUnit(summary, _with_columns(sequence, lambda columns: columns * scale))
+    return (summary, _with_columns(sequence, lambda columns: columns * scale))
 
 
 def _truth(evidence: Evidence) -> _WrongUnit | None:
@@ -635,7 +632,7 @@ def _truth(evidence: Evidence) -> _WrongUnit | None:
     v_world = None if truth.v_world is None else scale * truth.v_world
     remedy = replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
     summary = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
-    return _WrongUnit(summary, remedy)
+    return (summary, remedy)
 
 
 def _in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
