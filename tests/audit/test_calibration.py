@@ -315,14 +315,6 @@ def test_beside_odometry_the_windows_that_turn_are_taken() -> None:
     assert fitted(recorded(DRIVE, 0, 60.0)).error[0] < 0.003
 
 
-def test_a_turned_camera_is_no_late_one() -> None:
-    """Rotations alone have it 57 +- 5 ms late."""
-    outcome = audit(faults.turned_camera(recorded(FLIGHT, 7, 6.0), 0.1, 7))
-    found = {finding.fault for finding in outcome.findings}
-    assert "miscalibration" in found
-    assert "time-offset" not in found
-
-
 def test_an_offset_between_chance_and_certainty_is_not_decidable() -> None:
     """A car that hardly turns knows it to 5 ms: what is 3.7 standard errors is neither told nor ruled out."""
     late = faults.camera_clock(simulate(replace(DRIVE_IMU, duration_s=14.0, varied=True), 7301), 0.02)

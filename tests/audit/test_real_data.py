@@ -1,6 +1,7 @@
 """The audit on the real recordings: the counts that were measured by hand, and no finding where there is no fault."""
 
 import os
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -153,6 +154,16 @@ def test_the_indoor_recording_whose_gyro_is_late_keeps_its_stamps() -> None:
 def test_a_disparity_that_is_off_is_reported_on_a_shaken_imu() -> None:
     reported = warnings_of(audit(faults.stretched_disparity(part(GORE, 900, 1200), 1.1)))
     assert "% shorter than the IMU's" in reported["vision-scale"]
+
+
+def test_a_late_camera_on_a_shaken_imu_is_shifted_by_what_it_is_late() -> None:
+    """The self-calibration is linear in the delay: by itself it is a quarter off."""
+    outcome = audit(faults.camera_clock(part(GORE, 0, 250), 0.02))
+    (found,) = [finding for finding in outcome.findings if finding.fault == "time-offset"]
+    match = re.search(r"shifted by (\S+) \+- (\S+) ms", found.detail)
+    assert found.repaired and match is not None
+    assert float(match[1]) == pytest.approx(-20.0, abs=0.5)
+    assert warnings_of(outcome) == {}
 
 
 @pytest.mark.parametrize(

@@ -54,13 +54,6 @@ def test_the_more_tracks_walk_the_less_they_count(drive: Sequence) -> None:
         assert weight.error < 0.2 * weight.value
 
 
-@pytest.mark.parametrize("name", ["drive-realistic", "flight-realistic"])
-def test_tracks_that_err_as_those_of_real_images_count_for_a_third_or_less(name: str) -> None:
-    weight = measured_noise(recorded(name, 5.0)).tracks
-    assert 0.1 < weight.value < 0.4
-    assert weight.correlation > 0.8
-
-
 def along_tracks(sequence: Sequence, cause: IntArray, sigma_px: float = 1.0, correlation: float = 0.6) -> Sequence:
     """Return a recording without noise whose sightings (N,) err by a first-order autoregression of their cause (N,)."""
     rng, seen = np.random.default_rng(0), sequence.observations
