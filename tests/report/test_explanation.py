@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toolkit.experiment.comparison import Row
-from toolkit.experiment.contests import Advantage, Contest
+from toolkit.experiment.contests import HELD_OUT, Advantage, Contest
 from toolkit.experiment.units import Outcome
 from toolkit.registry import discover
 from toolkit.report.explanation import (
@@ -100,13 +100,8 @@ def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
     lost = msgspec.structs.replace(effect(A, BETWEEN, 1.0), ok=2, error=None, shown=False)
     perhaps = msgspec.structs.replace(effect(A, BETWEEN, 1.2), shown=False)
     wide = msgspec.structs.replace(effect(A, BETWEEN, 1.1, 3.0), shown=False)
-    found = explanation(
-        part("salt", effect(A, BETWEEN, 1.0)),
-        part("pepper", lost),
-        part("tea", None),
-        part("oil", perhaps),
-        part("flour", wide),
-    )
+    given = {"salt": effect(A, BETWEEN, 1.0), "pepper": lost, "tea": None, "oil": perhaps, "flour": wide}
+    found = explanation(*(part(name, one) for name, one in given.items()))
     words = in_words(found)
     assert "With 8 seeds the error shows no effect of salt (0.952 to 1.05) and pepper (too few runs" in words
     assert "Too few data to tell of flour (0.367 to 3.30): a factor of two is not excluded." in words
@@ -133,14 +128,10 @@ def test_other_measures_tell_of_what_the_error_does_not_show_and_only_of_that() 
     assert "Other figures show" not in in_words(explanation(part("tea", clear), part("oil", silent)))
 
 
-def test_two_estimators_that_do_not_differ_are_not_ranked() -> None:
-    assert "8 seeds show no difference of ATE yaw between a and b (0.917 to 1.32)" in in_words(
-        explanation(gap=effect(A, B, 1.1, 1.2))
-    )
-
-
-def test_without_a_truth_the_error_is_that_of_withheld_tracks_and_called_so() -> None:
-    words = in_words(explanation(metric="heldout_reproj_median_px", intervals="stretches"))
+def test_what_does_not_differ_is_not_ranked_and_without_a_truth_the_error_is_that_of_withheld_tracks() -> None:
+    equal = in_words(explanation(gap=effect(A, B, 1.1, 1.2)))
+    assert "8 seeds show no difference of ATE yaw between a and b (0.917 to 1.32)" in equal
+    words = in_words(explanation(metric=HELD_OUT, intervals="stretches"))
     assert "b predicts withheld tracks 5.10 times as well as a" in words
     assert "the error of withheld tracks, for there is no truth, stretches of the one recording" in words
 

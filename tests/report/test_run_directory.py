@@ -124,40 +124,29 @@ def test_what_is_not_ours_is_refused(tmp_path: Path, name: str) -> None:
 
 
 @one_figure
-def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("meanwhile", ["an interrupt between the renames", "a file of the user's own"])
+def test_an_earlier_run_stays_where_the_next_cannot_take_its_place(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, meanwhile: str
 ) -> None:
     target = tmp_path / "run"
     write(comparison, target)
-    rename = Path.rename
+    rename, report_text = Path.rename, run_directory.report_text
 
     def interrupted(self: Path, other: Path) -> Path:
         if ".partial-" in self.name:
             raise KeyboardInterrupt
         return rename(self, other)
 
-    monkeypatch.setattr(Path, "rename", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write(comparison, target)
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert (target / "metrics.json").is_file()
-
-
-@one_figure
-def test_a_file_that_comes_while_the_run_is_written_is_not_lost(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target = tmp_path / "run"
-    write(comparison, target)
-    report_text = run_directory.report_text
-
-    def meanwhile(*given: Any) -> str:
+    def writes_another(*given: Any) -> str:
         (target / "notes.txt").write_text("just now")
         return report_text(*given)
 
-    monkeypatch.setattr(run_directory, "report_text", meanwhile)
-    with pytest.raises(OutputError, match=r"notes\.txt"):
+    if meanwhile == "a file of the user's own":
+        monkeypatch.setattr(run_directory, "report_text", writes_another)
+    else:
+        monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises((KeyboardInterrupt, OutputError), match=r"^$|notes\.txt"):
         write(comparison, target)
-    assert (target / "notes.txt").read_text() == "just now"
+    assert (target / "notes.txt").is_file() == (meanwhile == "a file of the user's own")
     assert (target / "metrics.json").is_file()
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
