@@ -144,17 +144,7 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
         lines += ["no fault found"]
     lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
     lines += section("facts", audited.sequence.provenance.facts, width)
-    if any(f.blocking for f in findings):
-        lines += [""]
-        for how in ("not repaired", "too much lost"):
-            names = ", ".join(f.fault for f in findings if outcome(f) == how)
-            lines += [f"{how}: {names}"] if names else []
-    elif any(f.warning for f in findings):
-        lines += [
-            "",
-            f"read the results with these findings in mind: {', '.join(f.fault for f in findings if f.warning)}",
-        ]
-    elif findings and not audited.undecided:
+    if findings and not audited.undecided and not any(f.blocking or f.warning for f in findings):
         lines += ["", "no fault is left that invalidates a result"]
     return "\n".join(lines)
 

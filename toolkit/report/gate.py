@@ -71,10 +71,18 @@ def _row(verdict: Verdict) -> tuple[str, ...]:
     return (*(_escaped(label) or MISSING for label in labels), *numbers)
 
 
+def _metrics() -> dict[str, Metric]:
+    return {metric.key: metric for metric in known_metrics()}
+
+
+def _name(key: str) -> str:
+    return _metrics()[key].name if key in _metrics() else key
+
+
 def _values(verdict: Verdict) -> tuple[str, str]:
     """Return the value before and now with their unit, and with enough digits that a difference shows."""
     given = [value for value in (verdict.before, verdict.after) if value is not None and math.isfinite(value)]
-    metric = _metric(verdict.metric)
+    metric = _metrics().get(verdict.metric)
     unit, factor = metric.unit if metric is not None and metric.unit != "1" else "", 1.0
     if unit == "m" and max(map(abs, given), default=1.0) < _SHORT_M:
         unit, factor = "mm", 1e3
@@ -89,15 +97,6 @@ def _values(verdict: Verdict) -> tuple[str, str]:
         for value in (verdict.before, verdict.after)
     )
     return before, now
-
-
-def _metric(key: str) -> Metric | None:
-    return next((metric for metric in known_metrics() if metric.key == key), None)
-
-
-def _name(key: str) -> str:
-    metric = _metric(key)
-    return key if metric is None else metric.name
 
 
 def _percent(value: float | None, sign: str = "") -> str:

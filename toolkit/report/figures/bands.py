@@ -54,7 +54,7 @@ def _figure(comparison: Comparison, found: Sequence[tuple[Row, Normalised]], wha
     shares: dict[str, list[str]] = {}
     least = most = 1.0
     for row, series in found:
-        axes, colour = panels[row.estimator], style.colour_of(comparison, row.estimator)
+        axes, colour = panels[row.estimator], style.stroke_of(comparison.estimators, row.estimator)["color"]
         shown = np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=style.BAND_COLOUR, linewidth=0.0, zorder=1)
         axes.plot(series.t_s, shown, color=colour, linestyle=style.line_of(shown_as(row)), linewidth=1.0)
@@ -116,11 +116,8 @@ def _errors(over: Comparison) -> NamedFigure:
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
         kind = shown_as(group)
-        axes, t_s, colour = (
-            panels[group.estimator],
-            over.sequence.frames_s[known],
-            style.colour_of(over, group.estimator),
-        )
+        axes, t_s = panels[group.estimator], over.sequence.frames_s[known]
+        colour = style.stroke_of(over.estimators, group.estimator)["color"]
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(t_s, median, color=colour, linestyle=style.line_of(kind), linewidth=1.2)
         kinds.add(kind)

@@ -135,7 +135,7 @@ def _components_of(comparison: Comparison, name: str) -> Iterator[NamedFigure]:
         return
     reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
     what = "error" if reference is None else f"difference from {reference.name}"
-    figure, colour, entries = style.new_figure(4.6), style.colour_of(comparison, name), []
+    figure, colour, entries = style.new_figure(4.6), style.stroke_of(comparison.estimators, name)["color"], []
     grid = figure.subplots(3, 2, sharex=True)
     in_order = [*grid[:, 1], *grid[:, 0]]  # rotations first, as in COMPONENTS
     shown: dict[str, list[tuple[Array, Array]]] = {name: [] for name in COMPONENTS}

@@ -57,10 +57,6 @@ def colour_at(place: int) -> str:
     return _COLOURS[place % len(_COLOURS)]
 
 
-def colour_of(comparison: "Comparison", estimator: str) -> str:
-    return stroke_of(comparison.estimators, estimator)["color"]
-
-
 def line_of(output: Output) -> Dashes:
     """Return the line style of a kind of output: dashed while it knew the past only, solid at the end."""
     return _LINE_OF[output][0]
