@@ -1,18 +1,17 @@
 """Tables: columns by name, of a CSV file, plain or gzipped, or of a program's own values; a complaint names the place.
 
-Tables of one's own may be written in several ways, and are read value by value. Those of the ASL format have stamps in
-whole nanoseconds and are read at once: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016), section 3.
+Columns of numbers are read at once; where that fails the cell is found and named, and stamps keep all their digits.
 """
 
 import codecs
 import csv
 import gzip
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from functools import cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +68,15 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
 class Columns:
     """A table: what it is called in a complaint, the names of its columns, and what is in them and in its rows.
 
-    ``given`` are the columns (N,) of a program, ``rows`` the cells of a file's lines, by ``numbers_of_rows`` as an
-    editor counts them. ``plain`` are these lines where nothing in them is quoted, with what separates their cells.
+    ``given`` are the columns (N,) of a program, ``lines`` the rows of a file, with ``numbers_of_rows`` as an editor
+    counts them.
     """
 
     what: Path
     names: tuple[str, ...]
     given: Mapping[str, npt.NDArray[Any]] | None = None
-    rows: Callable[[], Sequence[Sequence[str]]] = tuple
-    plain: tuple[Sequence[str], str] | None = None
+    lines: Sequence[str] = ()
+    separator: str = ","
     numbers_of_rows: Sequence[int] | None = None
 
     def __contains__(self, name: str) -> bool:
@@ -105,11 +104,12 @@ class Columns:
         Raises DataError naming the columns that are missing, or the row of a text.
         """
         self.require(*names)
-        if self.plain is not None:
-            lines, separator = self.plain
+        if self.given is None:
+            at = list(map(self.names.index, names))
             with suppress(ValueError):  # the cell is named below
-                at = list(map(self.names.index, names))
-                return np.loadtxt(lines, delimiter=separator, usecols=at, comments=None, ndmin=2)
+                return np.loadtxt(
+                    self.lines, delimiter=self.separator, quotechar='"', usecols=at, comments=None, ndmin=2
+                )
         return self.numbers_or_none(*names, empty="")
 
     def numbers_or_none(self, *names: str, empty: str = "nan") -> Array:
@@ -143,6 +143,11 @@ class Columns:
             raise DataError(f"{self.what}: {SECONDS} must be in seconds, but the stamps look like {unit}")
         return exact_ns(list(map(str, self._cells(SECONDS))), NS_PER_S, lambda row: f"{self.what}: {self.at(row)}")
 
+    @cached_property
+    def rows(self) -> list[list[str]]:
+        """The cells of a file's lines."""
+        return [_cells(line, self.separator) for line in self.lines]
+
     def at(self, row: int) -> str:
         return f"row {row}" if self.numbers_of_rows is None else f"line {self.numbers_of_rows[row]}"
 
@@ -150,7 +155,7 @@ class Columns:
         """Return the texts, or a program's values, in a column."""
         if self.given is None:
             at = self.names.index(name)
-            return [row[at] for row in self.rows()]
+            return [row[at] for row in self.rows]
         values = self.given[name]
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
@@ -201,15 +206,13 @@ def columns_of_file(path: Path) -> Columns:
     if separator not in heading and len(heading.split()) > 1:
         raise DataError(f"{path}: its columns are separated by blanks; separate them by commas, semicolons or tabs")
     names = tuple(_canonical(_cells(heading, separator)))
-    if '"' not in text and {line.count(separator) for line in lines} == {len(names) - 1}:
-        rows = cache(lambda: [line.split(separator) for line in lines])
-        return Columns(path, names, None, rows, (lines, separator), numbers)
-    cells = [_cells(line, separator) for line in lines]
-    cells = [row[:-1] if len(row) == len(names) + 1 and not row[-1].strip() else row for row in cells]
-    for number, row in zip(numbers, cells, strict=True):
-        if len(row) != len(names):
-            raise DataError(f"{path}: line {number} has {len(row)} columns, expected {len(names)}")
-    return Columns(path, names, None, lambda: cells, None, numbers)
+    table = Columns(path, names, None, lines, separator, numbers)
+    if '"' in text or {line.count(separator) for line in lines} != {len(names) - 1}:
+        for number, row in zip(numbers, table.rows, strict=True):
+            width = len(row) - (len(row) == len(names) + 1 and not row[-1].strip())  # some end lines with a separator
+            if width != len(names):
+                raise DataError(f"{path}: line {number} has {len(row)} columns, expected {len(names)}")
+    return table
 
 
 def _canonical(heading: Sequence[str]) -> list[str]:
