@@ -41,24 +41,20 @@ def test_a_file_that_opens_and_cannot_be_read_is_named(tmp_path: Path, monkeypat
         load_sequence(str(tmp_path / "drive"))
 
 
-def test_a_path_that_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
-    for name in ("drive_10.npz", "drive_12.npz"):
-        (tmp_path / name).touch()
-    with pytest.raises(DataError, match=r"no such file or directory; did you mean drive_12\.npz\?"):
-        load_sequence(tmp_path / "drive12.npz")
-    with pytest.raises(DataError, match=r"directory; .* has drive_10\.npz, drive_12\.npz"):
-        load_sequence(tmp_path / "utias")
-    with pytest.raises(DataError, match=r"there is no folder .*recordings"):
-        load_sequence(tmp_path / "recordings" / "drive.npz")
-
-
-def test_a_path_that_is_not_there_in_a_folder_that_cannot_be_listed_is_reported_plainly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_that_is_not_there_is_answered_with_what_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(_folder: Path) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "iterdir", refused)
+    for name in ("drive_10.npz", "drive_12.npz"):
+        (tmp_path / name).touch()
+    for name, answer in (
+        ("drive12.npz", r"no such file or directory; did you mean drive_12\.npz\?"),
+        ("utias", r"directory; .* has drive_10\.npz, drive_12\.npz"),
+        ("recordings/drive.npz", r"there is no folder .*recordings"),
+    ):
+        with pytest.raises(DataError, match=answer):
+            load_sequence(tmp_path / name)
+    monkeypatch.setattr(Path, "iterdir", refused)  # of a folder that may be entered and not listed
     with pytest.raises(DataError, match=r"no such file or directory; check the path$"):
         load_sequence(tmp_path / "drive.npz")
 

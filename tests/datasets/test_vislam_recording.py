@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,9 @@ def test_a_noise_of_tracks_that_an_earlier_version_kept_is_passed_over(
     drive: Sequence, tmp_path: Path, stated: dict[str, list[float]] | None
 ) -> None:
     vislam_recording.save(drive, tmp_path / "drive")
-    edit_text(lambda t: t["rig"].update(track_noise=stated))(tmp_path / "drive")
+    text = json.loads((tmp_path / "drive/recording.json").read_text())
+    text["rig"]["track_noise"] = stated
+    (tmp_path / "drive/recording.json").write_text(json.dumps(text))
     assert_same(vislam_recording.load(tmp_path / "drive"), drive)
 
 
@@ -81,13 +82,12 @@ def test_a_round_trip_changes_no_bit(
 
 def test_only_recordings_are_recognised(drive: Sequence, tmp_path: Path) -> None:
     vislam_recording.save(drive, tmp_path / "drive")
-    assert vislam_recording.recognises(tmp_path / "drive")
-    assert vislam_recording.recognises(tmp_path / "drive" / "recording.json")
-    assert not vislam_recording.recognises(tmp_path)
-    assert not vislam_recording.recognises(tmp_path / "absent")
-    assert not vislam_recording.recognises(tmp_path / "drive" / "recording.npz")
     (tmp_path / "recording.json").write_text('{"schema": "another.recording/1"}')
-    assert not vislam_recording.recognises(tmp_path)
+    inside = ("drive", "drive/recording.json", "drive/recording.npz", ".", "absent", "recording.json")
+    assert [name for name in inside if vislam_recording.recognises(tmp_path / name)] == [
+        "drive",
+        "drive/recording.json",
+    ]
 
 
 @pytest.mark.parametrize("interrupted", ["numpy.savez_compressed", "json.dumps", "pathlib.Path.rename", ".partial-"])
@@ -131,16 +131,6 @@ def test_a_folder_with_other_things_is_not_touched(drive: Sequence, tmp_path: Pa
     (tmp_path / "other/recording.json").write_text('{"tracks": 4}')  # of another program
     with pytest.raises(OutputError, match=r"recording\.json"):
         vislam_recording.save(drive, tmp_path / "other")
-
-
-def edit_text(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    def damage(folder: Path) -> None:
-        file = folder / "recording.json"
-        text = json.loads(file.read_text())
-        change(text)
-        file.write_text(json.dumps(text))
-
-    return damage
 
 
 @pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 20.0), ("flight", 8.0)])

@@ -41,20 +41,19 @@ def test_any_part_counts(other: Part, digits: int | None) -> None:
     assert content_digest([other], digits) != content_digest([ONE], digits)
 
 
-def test_last_bits_count_only_where_nothing_is_rounded() -> None:
-    nearly = Part("a", ONE.values * (1.0 + 1e-15), Part("b", np.array([3]), 0.125 * (1.0 + 1e-15)))
-    assert content_digest([nearly]) != content_digest([ONE])
-    assert content_digest([nearly], 6) == content_digest([ONE], 6)
-
-
-def test_zero_has_no_sign_where_it_is_rounded() -> None:
-    for array in (np.array([0.0, 1.0]), np.array([0.0])):
-        assert content_digest([-0.0 * array], 6) == content_digest([0.0 * array], 6)
-
-
-def test_an_array_that_is_not_finite_everywhere_is_rounded_by_what_is() -> None:
-    array = np.array([np.nan, np.inf, 1.0])
-    assert content_digest([array * (1.0 + 1e-12)], 6) == content_digest([array], 6)
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (ONE, Part("a", ONE.values * (1.0 + 1e-15), Part("b", np.array([3]), 0.125 * (1.0 + 1e-15)))),
+        (np.array([0.0, 1.0]), np.array([-0.0, 1.0])),
+        (np.array([0.0]), np.array([-0.0])),
+        (np.array([np.nan, np.inf, 1.0]), np.array([np.nan, np.inf, 1.0 + 1e-12])),
+    ],
+    ids=["last bits", "sign of a zero", "sign of zero alone", "what is finite"],
+)
+def test_what_is_rounded_away_does_not_count(one: object, other: object) -> None:
+    assert content_digest([one], 6) == content_digest([other], 6)
+    assert content_digest([one]) != content_digest([other])
 
 
 def test_of_a_link_the_file_behind_it_is_replaced(tmp_path: Path) -> None:
