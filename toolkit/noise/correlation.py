@@ -19,7 +19,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from toolkit.geometry import Array, IntArray
 from toolkit.jackknife import STRETCHES, jackknife_error
@@ -111,6 +110,8 @@ def _neighbours(frame: IntArray, uv_px: Array, freed: Array, count: int) -> tupl
         return np.zeros((count, _RINGS)), np.zeros((count, _RINGS))
     apart_px = (2.0 * _RADII_PX[-1] + float(np.ptp(uv_px[:, 0]))) * frame
     places = np.column_stack([uv_px[:, 0] + apart_px, uv_px[:, 2]])
+    from scipy.spatial import KDTree  # 7 MB, which no process that only runs estimators needs
+
     one, other = KDTree(places).query_pairs(_RADII_PX[-1], output_type="ndarray").T
     ring = np.searchsorted(_RADII_PX[:-1], np.linalg.norm(places[one] - places[other], axis=1))
     cell, cells = frame[one] * _RINGS + ring, count * _RINGS

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from toolkit.geometry import Array, BoolArray, about_z, so3_exp
 from toolkit.simulation.trajectory import SPLINE_ORDER as ORDER
@@ -170,6 +169,8 @@ def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
     The nearest pose is looked up first, because all distances between an hour's path and its points would take 25 GB.
     """
     along = path[:, :2, 3]
-    _, nearest = cKDTree(along).query(points[:, :2])
+    from scipy.spatial import KDTree  # 7 MB, which no process that only runs estimators needs
+
+    _, nearest = KDTree(along).query(points[:, :2])
     squared = ((points[:, :2] - along[nearest]) ** 2).sum(axis=-1)
     return np.asarray(squared < radius_m**2)
