@@ -20,7 +20,7 @@ from toolkit.datasets.trajectories.formats import PosesFile, check_order, read_f
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import is_regular
-from toolkit.geometry import Array, IntArray, se3_inverse
+from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S
 from toolkit.metrics import (
     Metric,
@@ -41,12 +41,10 @@ from toolkit.metrics.parts.against_truth import (
     changes,
     distance_along,
     median_period_ns,
-    place_first,
     poses_at,
 )
 from toolkit.metrics.parts.consistency import (
     NOT_MET,
-    NOT_PLACED,
     OTHER_WORLD,
     BodyErrors,
     StatedErrors,
@@ -347,63 +345,42 @@ def _how_matched(estimate: Trajectory, truth: TruthFile, max_dt_s: float | None)
 def _nees_scores(file: PosesFile, estimate: Trajectory, truth: TruthFile, *, level: bool) -> Scores:
     """Return the scores of the stated covariances, None with the reason.
 
-    The remark on them is where their convention, by the truth, is another one.
+    Errors are in the truth's world, or placed by the first pose if that is not plausible there under its own
+    covariance. The remark is where their convention, by the truth, is another one.
     """
     covariances = file.covariances
     if covariances is None:
         return Scores.none(_NEES_KEYS, NO_COVARIANCE)
+    met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
+    if not met.any():
+        return Scores.none(_NEES_KEYS, NOT_MET)
+    rows = np.flatnonzero(met)
+    compared = estimate.t_ns[rows], rows, estimate.T_world_imu[rows], true
 
-    def errors(cov: Array, *, placed: bool | None) -> StatedErrors:
-        return stated_against(cov, estimate, truth, level=level, placed=placed)
+    def errors(cov: Array, *, placed: bool) -> StatedErrors:
+        if truth.cov is not None:
+            cov = cov[:, :6, :6] + truth.cov[_nearest(truth.t_ns, estimate.t_ns), :6, :6]
+        return with_covariances(BodyErrors.between(*compared, placed=placed, level=level), cov)
 
-    def allows_the_truths_world(reading: CovConvention) -> bool:
+    def is_in_the_truths_world(cov: Array) -> bool:
         with suppress(Unavailable):
-            return _is_in_the_truths_world(errors(covariances.read_as(reading, file.T_world_imu), placed=False))
+            first = nees_of(errors(cov, placed=False))
+            return bool(max(first.orientation[0], first.position[0]) <= chi2_bound(3, 1.0 - OTHER_WORLD) / 3.0)
         return False
 
     # The same errors for all readings: in the truth's world if any of them allows it.
-    placed = not any(map(allows_the_truths_world, CONVENTIONS.values()))
+    readings = (covariances.read_as(one, file.T_world_imu) for one in CONVENTIONS.values())
+    placed = not any(map(is_in_the_truths_world, readings))
     likelier = likelier_reading(covariances, file.T_world_imu, partial(errors, placed=placed))
     if estimate.cov is None:
         return Scores.none(_NEES_KEYS, "; ".join(filter(None, (_NO_CONVENTION, likelier))))
     try:
-        stated = errors(estimate.cov, placed=None)
+        stated = errors(estimate.cov, placed=not is_in_the_truths_world(estimate.cov))
     except Unavailable as reason:
         return Scores.none(_NEES_KEYS, str(reason))
     scores = nees.of_stated(stated) | uncertainty.of_stated(stated)
     remark = "; ".join(filter(None, (likelier, "" if truth.cov is None else _OF_TWO)))
     return scores.remarked(_NEES_KEYS, remark)
-
-
-def stated_against(
-    cov: Array, estimate: Trajectory, truth: TruthFile, *, level: bool, placed: bool | None = None
-) -> StatedErrors:
-    """Return the errors of the poses that have a covariance, of (N, d, d), and a true pose, with the covariances.
-
-    They are in the truth's world, or ``placed``: the first pose is then moved to the truth's, by heading and position
-    alone where the vertical is measured (``level``). Where it is not said they are placed if the first pose is not
-    plausible in the truth's world under its own covariance. Raises Unavailable where there are none.
-    """
-    met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
-    if not met.any():
-        raise Unavailable(NOT_MET)
-    if truth.cov is not None:
-        cov = cov[:, :6, :6] + truth.cov[_nearest(truth.t_ns, estimate.t_ns), :6, :6]
-    poses, rows, t_ns = estimate.T_world_imu[met], np.flatnonzero(met), estimate.t_ns[met]
-    if not placed:
-        stated = with_covariances(BodyErrors(t_ns, rows, se3_inverse(poses) @ true, poses, placed=False), cov)
-        if placed is False or _is_in_the_truths_world(stated):
-            return stated
-    if not met[0]:
-        raise Unavailable(NOT_PLACED)
-    moved = place_first(true[0], poses[0], level).apply(poses)
-    return with_covariances(BodyErrors(t_ns, rows, se3_inverse(moved) @ true, moved, placed=True), cov)
-
-
-def _is_in_the_truths_world(stated: StatedErrors) -> bool:
-    """Say whether the first error is plausible under its covariance, in each block."""
-    first = nees_of(stated)
-    return bool(max(first.orientation[0], first.position[0]) <= chi2_bound(3, 1.0 - OTHER_WORLD) / 3.0)
 
 
 def _nearest(t_ns: IntArray, at_ns: IntArray) -> IntArray:

@@ -6,7 +6,7 @@ error is the motion, or the difference, from the estimate to the truth, in the b
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -51,6 +51,16 @@ class BodyErrors:
     T_estimate_truth: Array
     T_world_imu: Array
     placed: bool
+
+    @classmethod
+    def between(
+        cls, t_ns: IntArray, rows: IntArray, poses: Array, true_poses: Array, *, placed: bool, level: bool
+    ) -> Self:
+        """Compare poses (n, 4, 4), ``placed`` by the first of all or not; raises Unavailable if it has no truth."""
+        if placed and rows[0] != 0:
+            raise Unavailable(NOT_PLACED)
+        placed_poses = place_first(true_poses[0], poses[0], level).apply(poses) if placed else poses
+        return cls(t_ns, rows, se3_inverse(placed_poses) @ true_poses, placed_poses, placed)
 
     @property
     def distance_m(self) -> Array:
@@ -185,12 +195,9 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
         raise Unavailable(NOT_MET)
     if len(evaluation.matched) > 1:
         evaluation.oriented  # noqa: B018 - raises where the truth is of positions alone
-    poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
-    if placed:
-        if rows[0] != 0:
-            raise Unavailable(NOT_PLACED)
-        poses = place_first(true_poses[0], poses[0], evaluation.level).apply(poses)
-    return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, poses, placed)
+    placed = not starts_in_the_truths_world(evaluation.sequence)
+    compared = estimate.t_ns[rows], rows, estimate.T_world_imu[rows], true_poses
+    return BodyErrors.between(*compared, placed=placed, level=evaluation.level)
 
 
 def starts_in_the_truths_world(sequence: Sequence) -> bool:
