@@ -22,8 +22,6 @@ from toolkit.sequence import Sequence
 
 # A ratio must be this many standard errors beyond its limit; the noise of the camera's rotation lowers that of rates.
 RATIO_SIGMAS = 5.0
-# Vision's speed is accurate to 5 % in sound recordings. A unit is named where the ratio is this near to its factor.
-NEAR_UNIT = 0.08
 
 
 @beside_camera
@@ -47,9 +45,7 @@ def _ratios(sequence: Sequence, intervals: Intervals) -> Iterator[str]:
         margin = np.inf if ratio is None else RATIO_SIGMAS * ratio.error
         if ratio is None or quantity.least - margin <= ratio.value <= quantity.most + margin:
             continue
-        factors = {**quantity.units, **quantity.named}
-        units = [unit for unit, factor in factors.items() if abs(ratio.value / factor - 1.0) < NEAR_UNIT]
-        yield quantity.summary.format(*ratio) + (f", as if in {' or '.join(units)}" if units else "")
+        yield quantity.summary.format(*ratio)
 
 
 # A mean is reported from this many of its standard deviations on; the largest mean of a sound recording has 3 to 9.

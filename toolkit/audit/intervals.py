@@ -228,8 +228,8 @@ def stated_densities(noise: MotionNoise) -> Array:
 class Quantity(NamedTuple):
     """A size of the motion by the samples: its ratio to another source in words, where that is sound, and its units.
 
-    ``units`` have the factors of those to convert from, ``named`` of those whose factors are too near to others'. A
-    ratio ``within`` a factor of a unit's is of that unit. ``columns`` are those of the samples.
+    ``units`` have the factors of those to convert from. A ratio ``within`` a factor of a unit's is of that unit.
+    ``columns`` are those of the samples.
     """
 
     summary: str
@@ -237,7 +237,6 @@ class Quantity(NamedTuple):
     least: float
     most: float
     units: Mapping[str, float]
-    named: Mapping[str, float]
     within: float
     columns: slice
     by_camera: bool = True
@@ -251,7 +250,6 @@ SPEED = Quantity(
     least=1.0 / MOST_RATIO,
     most=MOST_RATIO,
     units={"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0},
-    named={"knots": 1.944},
     within=1.08,
     columns=slice(0, 3),
 )
@@ -261,7 +259,6 @@ RATE = Quantity(
     least=0.0,
     most=MOST_RATIO,
     units={"deg/s": 180.0 / np.pi},
-    named={"turns a minute": 30.0 / np.pi, "mrad/s": 1000.0},
     within=1.25,
     columns=slice(3, 6),
 )
@@ -271,7 +268,6 @@ FORCE = Quantity(
     least=1.0 / MOST_FORCE_RATIO,
     most=MOST_FORCE_RATIO,
     units={"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665, "cm/s^2": 100.0, "mm/s^2": 1000.0},
-    named={"ft/s^2": 3.281},
     within=1.25,
     columns=slice(0, 3),
     by_camera=False,

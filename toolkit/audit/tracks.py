@@ -1,7 +1,5 @@
 """Faults of the tracks: sightings that repeat, lack an image, have exchanged coordinates or fit no motion."""
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -199,14 +197,13 @@ ROW_SIGMAS = 5.0
 FEWEST_FILLED, FEWEST_PLACES, TIMES_AS_FREQUENT = 10, 5, 10
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
-NAMES = ("uL", "uR", "v")
 
 
 def swapped_coordinates(evidence: Evidence) -> Symptom | None:
     """Find coordinates in the wrong columns: left and right images exchanged, or rows and columns.
 
-    Nearly every disparity uL - uR is positive. Where many are not, the right one of the other orders is that under
-    which the tracks follow the measured motion. Of exchanged rows and columns the depth is lost.
+    Nearly every disparity uL - uR is positive. Where many are not, left and right are exchanged back if the tracks then
+    follow the measured motion. Of exchanged rows and columns the depth is lost.
     """
     sequence = evidence.sequence
     if (filled := _filled_right(sequence)) is not None:
@@ -224,14 +221,15 @@ def swapped_coordinates(evidence: Evidence) -> Symptom | None:
         detail += f" and uL differs from uR by {apart_px:.1f} px only, as the rows of a pair do: u and v are exchanged"
         why = "the depth is lost with the exchange: correct the file"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
-    explained = [remedy for remedy in _reordered(sequence) if _is_sound(remedy[1])]
-    if len(explained) != 1:
-        why = "no order of the coordinates makes the tracks agree with the measured motion: correct the file"
+    # A sighting without the right image has nothing to be exchanged with.
+    both = sequence.observations.select(~is_left_only(sequence.observations.uv_px))
+    remedy = replace(sequence, observations=replace(both, uv_px=both.uv_px[:, [1, 0, 2]]))
+    if not _is_sound(remedy):
+        why = "exchanged back, the tracks do not agree with the measured motion: correct the file"
         detail += ": left and right, or u and v, are exchanged"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
-    order_name, remedy = explained[0]
     treatment = "exchanged back, and the tracks agree with the measured motion"
-    return Symptom(count, f"{detail}: {order_name}", treatment, remedy, spoils_vision=True)
+    return Symptom(count, f"{detail}: left and right are exchanged", treatment, remedy, spoils_vision=True)
 
 
 def _filled_right(sequence: Sequence) -> Symptom | None:
@@ -272,17 +270,6 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
         why = "without the right image there is no depth: correct the file, or leave uR empty"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
     return None
-
-
-def _reordered(sequence: Sequence) -> Iterator[tuple[str, Sequence]]:
-    """Yield the recording in every other order of coordinates, and what is wrong then."""
-    # A sighting without the right image has nothing to be exchanged with.
-    both = sequence.observations.select(~is_left_only(sequence.observations.uv_px))
-    for order in itertools.permutations(range(3)):
-        named = f"they are in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
-        if order != (0, 1, 2):
-            other = replace(sequence, observations=replace(both, uv_px=both.uv_px[:, list(order)]))
-            yield "left and right are exchanged" if order == (1, 0, 2) else named, other
 
 
 def _is_sound(sequence: Sequence) -> bool:
