@@ -6,6 +6,7 @@ estimator's are. A truth that states some is another estimate of the same run, a
 of both: errors that both share cancel in it, so that this finds too little, and never too much.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -83,13 +84,12 @@ _OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRIC
 _OF_POSITIONS = tuple(metric.key for metric in ate.METRICS)
 _OF_ORIENTATIONS = ("ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
 # Metrics that depend on the body's axes, and not on its position alone.
-_OF_THE_BODY = ("ate_none_m", *_OF_ORIENTATIONS, "end_drift_percent", *_NEES_KEYS)
-# Remark where the truth repeats one position.
+OF_THE_BODY = ("ate_none_m", *_OF_ORIENTATIONS, "end_drift_percent")
+# Remarks where the truth repeats one position, where an estimate repeats one pose, or leaps. It leaps where one of its
+# steps is this much longer (m) than the truth's, and this many times as long as its usual step.
 _STANDS = (
     "the truth stands still, all its positions are one: these are the estimate's own motion, unless it ought to stand"
 )
-# Remarks where an estimate repeats one pose, or leaps. It leaps where one of its steps is this much longer (m) than the
-# truth's, and this many times as long as its usual step.
 _STAYS = "the estimate stands still, all its positions are one: its errors are the truth's own motion"
 _LOOKS_ONE_WAY = (
     "the estimate's orientations are all one, as where none was written: these are the truth's own rotations"
@@ -237,32 +237,31 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
     if turn is not None and turn.is_other_body:
-        scores = scores.without(_OF_THE_BODY, f"{_OTHER_AXES}: {other_axes(turn.R_truth_body)}")
+        scores = scores.without((*OF_THE_BODY, *_NEES_KEYS), f"{_OTHER_AXES}: {other_axes(turn.R_truth_body)}")
     elif turn is not None and turn.is_told:
         off_deg, scatter_deg = np.degrees((turn.angle_rad, turn.scatter_rad))
         scores = scores.remarked(_OF_ORIENTATIONS, _OFF.format(off_deg, scatter_deg))
-    if changes(matched.estimate[:, :3, 3]) and not changes(matched.truth[:, :3, 3]):
-        scores = scores.remarked(_OF_POSITIONS, _STANDS)
-    scores = _with_the_estimates_own(scores, matched)
+    for keys, remark in _on_standstill_and_leaps(matched):
+        scores = scores.remarked(keys, remark)
     left_out = truth.left_out and f"left out of the truth: {truth.left_out}"
     paired = filter(None, (_how_matched(estimate, truth, terms.max_dt_s), left_out))
     return scores.remarked([_PAIRS.key], "; ".join(paired))
 
 
-def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
-    """Remark on an estimate that never moves or turns while the truth does, and on one that leaps."""
+def _on_standstill_and_leaps(matched: Matched) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield remarks, with the metrics they are on: truth or estimate never moves or turns, or the estimate leaps."""
     truth, estimate = matched.truth, matched.estimate
-    if changes(truth[:, :3, 3]) and not changes(estimate[:, :3, 3]):
-        return scores.remarked(_OF_POSITIONS, _STAYS)
-    if changes(truth[:, :3, :3]) and not changes(estimate[:, :3, :3]):
-        scores = scores.remarked(_OF_ORIENTATIONS, _LOOKS_ONE_WAY)
+    moves, true_moves = changes(estimate[:, :3, 3]), changes(truth[:, :3, 3])
+    if moves != true_moves:
+        yield _OF_POSITIONS, _STANDS if moves else _STAYS
+    if moves and changes(truth[:, :3, :3]) and not changes(estimate[:, :3, :3]):
+        yield _OF_ORIENTATIONS, _LOOKS_ONE_WAY
     true_m, step_m = (np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (truth, estimate))
     leaps = (step_m > true_m + _LEAST_LEAP_M) & (step_m > _TIMES_USUAL * np.median(step_m))
-    if not leaps.any():
-        return scores
-    row = int(np.argmax(np.where(leaps, step_m, 0.0)))
-    at_s = float(matched.t_ns[row] - matched.t_ns[0]) / NS_PER_S
-    return scores.remarked(_OF_POSITIONS, _LEAPS.format(int(leaps.sum()), step_m[row], at_s))
+    if leaps.any():
+        row = int(np.argmax(np.where(leaps, step_m, 0.0)))
+        at_s = float(matched.t_ns[row] - matched.t_ns[0]) / NS_PER_S
+        yield _OF_POSITIONS, _LEAPS.format(int(leaps.sum()), step_m[row], at_s)
 
 
 def _matched(path: Path, estimate: Trajectory, truth: TruthFile, max_dt_s: float | None) -> Matched:

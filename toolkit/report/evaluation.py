@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from toolkit.errors import DataError
-from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE
+from toolkit.evaluation.scoring import METRICS, NO_COVARIANCE, OF_THE_BODY
 from toolkit.evaluation.standings import (
     EvaluatedSystems,
     OverRuns,
@@ -67,10 +67,6 @@ _BLOCKS = {
     "pos": ("position", 3, "energy_pos_m"),
 }
 _UNCERTAINTY = "Stated uncertainty: means over the runs (95 % interval over the runs)"
-_OF_ORIENTATION = (
-    *("ate_none_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent"),
-    *("kitti_r_deg_per_m", "end_drift_percent"),
-)
 # What is told of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
@@ -251,7 +247,7 @@ def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
         # listed already.
         lacks = run.notes.get("ate_se3_deg")
         told = [key for key in scored if run.notes.get(key)] + [
-            k for k in _OF_ORIENTATION if lacks and run.notes.get(k) == lacks
+            k for k in OF_THE_BODY if lacks and run.notes.get(k) == lacks
         ]
         told += ["nees_pose_mean"] if run.notes.get("nees_pose_mean", NO_COVARIANCE) != NO_COVARIANCE else []
         for key in (key for key in dict.fromkeys(told) if run.notes[key] not in run.log):
