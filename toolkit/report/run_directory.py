@@ -28,17 +28,20 @@ from toolkit.files.reading import read_input
 from toolkit.files.writing import check_parent, check_replaceable, plain_name, replaced_directory
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
-from toolkit.report import report_json
 from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.manifest import Manifest, manifest_document, read_manifest
 from toolkit.report.report_json import (
+    TRUTH_FILE,
     DrawnOverSeeds,
     DrawnRun,
     Report,
     SeedsReport,
+    file_of,
     read_report,
     read_seeds_report,
+    report_document,
+    seeds_report_document,
 )
 from toolkit.report.results_folder import PAGE, own_files, take_over
 from toolkit.report.scores import (
@@ -143,15 +146,9 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
     """
     with replaced_directory(target, written_by_us) as directory:
         _take_over(comparison, target, directory)
-        if comparison.over_seeds:
-            _write_text(directory / SEEDS, to_text(seeds_document(comparison)))
-            _write_text(directory / REPORT, to_line(report_json.seeds_report_document(comparison)))
-            if any(outcome.files for outcome in comparison.outcomes):
-                _write_truth(comparison, directory)
-        else:
-            _write_text(directory / METRICS, to_text(metrics_document(comparison)))
-            _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
-            _write_trajectories(comparison, directory)
+        for name, text in _texts(comparison):
+            (directory / name).parent.mkdir(exist_ok=True)
+            _write_text(directory / name, text)
         captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.request)
@@ -177,32 +174,32 @@ def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
         take_over(target / name, directory / name)
 
 
-def _write_trajectories(comparison: Comparison, directory: Path) -> None:
-    for folder in ("trajectories", "states", "landmarks"):
-        (directory / folder).mkdir()
-    _write_truth(comparison, directory)
+def _texts(comparison: Comparison) -> Iterator[tuple[str, str]]:
+    """Yield name and content of every document and table, one after the other."""
+    truth = truth_during(comparison.sequence)
+    if truth is not None and (not comparison.over_seeds or any(outcome.files for outcome in comparison.outcomes)):
+        yield TRUTH_FILE, tum.text(Trajectory(truth.t_ns, truth.T_world_imu))
+    if comparison.over_seeds:
+        yield SEEDS, to_text(seeds_document(comparison))
+        yield REPORT, to_line(seeds_report_document(comparison))
+        return
+    yield METRICS, to_text(metrics_document(comparison))
+    yield REPORT, to_line(report_document(comparison))
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            _write_text(directory / report_json.file_of("trajectory", row.estimator, row.output), tum.text(trajectory))
-        if trajectory is not None and trajectory.cov is not None and not row.repeats_causal:
-            states = openvins.text_with_covariances(trajectory)
-            _write_text(directory / report_json.file_of("states", row.estimator, row.output), states)
+            yield file_of("trajectory", row.estimator, row.output), tum.text(trajectory)
+            if trajectory.cov is not None and not row.repeats_causal:
+                yield file_of("states", row.estimator, row.output), openvins.text_with_covariances(trajectory)
     for run in comparison.runs:
-        _write_landmarks(run.landmarks, directory / report_json.file_of("landmarks", run.estimator))
+        yield file_of("landmarks", run.estimator), _landmarks_text(run.landmarks)
 
 
-def _write_truth(comparison: Comparison, directory: Path) -> None:
-    truth = truth_during(comparison.sequence)
-    if truth is not None:
-        _write_text(directory / report_json.TRUTH_FILE, tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
-
-
-def _write_landmarks(landmarks: Landmarks, path: Path) -> None:
-    """Write landmarks as CSV, one a row: track id and position in the world in metres."""
+def _landmarks_text(landmarks: Landmarks) -> str:
+    """Return landmarks as CSV, one a row: track id and position in the world in metres."""
     rows = zip(landmarks.track_ids.tolist(), landmarks.points_world.tolist(), strict=True)
     lines = [f"{track_id},{x:.15g},{y:.15g},{z:.15g}" for track_id, (x, y, z) in rows]
-    _write_text(path, "\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n")
+    return "\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n"
 
 
 def _write_text(path: Path, text: str) -> None:
