@@ -16,7 +16,7 @@ from toolkit.answers import Run
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.configuration import configuration, read_configuration
+from toolkit.experiment.configuration import Request, read_configuration, record_of
 from toolkit.files.documents import parse, read, to_line, to_text
 from toolkit.gate import baseline
 from toolkit.metrics import Evaluation, Scores, describe
@@ -27,6 +27,7 @@ from toolkit.report.records import RECORDS, read_card, read_check, read_manifest
 from toolkit.report.report_json import report_document
 from toolkit.report.scores import MetricsDocument, metrics_document
 from toolkit.settings import Noise, Settings
+from toolkit.settings.reading import settings_of
 
 Document = dict[str, Any]
 
@@ -94,9 +95,8 @@ def test_a_manifest_with_settings_of_then_that_changed_no_answer_is_read_and_rep
     given["settings"]["noise"]["biases"] = "estimated"  # a setting since then
     assert json.loads(to_text(read_manifest(path))) == given
     request, settings = read_configuration(path)
-    repeated = configuration(request, settings, str(path))
-    assert to_builtins(repeated.settings) == given["settings"]
-    assert repeated.request.estimators == ("ekf", "msckf")
+    assert to_builtins(settings_of(settings, str(path))) == given["settings"]
+    assert record_of(Request, request).estimators == ("ekf", "msckf")
 
 
 def test_a_baseline_that_chose_the_arithmetic_is_read_without() -> None:
