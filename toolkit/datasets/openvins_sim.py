@@ -7,20 +7,18 @@ the IMU to the world: so read, the truth reprojects the next frame to 1.2 px wit
 Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
-import json
 from collections.abc import Iterator
-from json import JSONDecodeError
 from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, flattened, rectified_observations, stamps_ns
+from toolkit.datasets.io.fields import Fields, check_frame_count, read_fields, rectified_observations, stamps_ns
 from toolkit.datasets.io.tables import columns_of_file, find_table, headings_of
 from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.formats import checked_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
-from toolkit.files.reading import read_input, read_text_input
+from toolkit.files.reading import read_input
 from toolkit.geometry import IntArray, se3, se3_inverse
 from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.motion_samples import ImuSamples
@@ -65,7 +63,8 @@ def load(path: Path) -> Sequence:
     Raises DataError where files or columns are missing, damaged or not numeric, or the pair is not rectified.
     """
     imu_path, features_path = _tables(path)
-    calibration = _calibration(path / _CALIBRATION)
+    calibration = read_fields(path / _CALIBRATION)  # JSON is YAML
+    calibration.require(*_REQUIRED)
     imu = columns_of_file(imu_path).numbers(*_IMU_COLUMNS)
     motion = ImuSamples(stamps_ns(imu_path, "timestamp", imu[:, 0]), imu[:, 1:4], imu[:, 4:7])
     frames_t_ns, sightings = _frames(features_path, motion.t_ns)
@@ -101,18 +100,6 @@ def _tables(folder: Path) -> tuple[Path, Path]:
         missing = ", ".join(name for name, found in there.items() if not found)
         raise DataError(f"{folder}: missing {missing} (tables may be gzipped); copy the whole export")
     return imu, features
-
-
-def _calibration(path: Path) -> Fields:
-    try:
-        content = json.loads(read_text_input(path, "export it again"))
-    except (JSONDecodeError, RecursionError) as error:
-        raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path}: holds a JSON {type(content).__name__}, expected an object; export it again")
-    fields = Fields(path, dict(flattened(content)))  # without what is no number and no list of them
-    fields.require(*_REQUIRED)
-    return fields
 
 
 def _unused(calibration: Fields) -> Iterator[str]:

@@ -315,8 +315,8 @@ def read_fields(path: Path) -> Fields:
     text = read_text_input(path, "copy it again")
     if len(text) > _MOST_CHARACTERS:
         raise DataError(f"{path}: {len(text)} characters are no calibration; name another file")
-    # The line is kept, so that errors name the file's own lines.
-    plain = "\n".join("" if line.startswith(_DIALECT) else line for line in text.split("\n"))
+    # The line is kept, so that errors name the file's own lines; JSON may be indented by tabs.
+    plain = "\n".join("" if line.startswith(_DIALECT) else line for line in text.replace("\t", " ").split("\n"))
     try:
         document = yaml.load(plain, _Loader)
     except yaml.MarkedYAMLError as error:
