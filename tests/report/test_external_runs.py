@@ -16,7 +16,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.pipeline import Plan, run
-from toolkit.experiment.references import ExternalFile, external_runs, reference_runs
+from toolkit.experiment.references import ExternalFile, runs_of_others
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
 from toolkit.measurements import NS_PER_S
@@ -48,7 +48,7 @@ def read_as_run(
     path = folder / f"other.{name}"
     path.write_text(FORMATS[name].text(trajectory))
     sequence = recording if frames is None else recording.truncated(frames)
-    (run,) = external_runs({"other": ExternalFile(read_poses(path))}, recording, sequence)
+    (run,) = runs_of_others({}, {"other": ExternalFile(read_poses(path))}, recording, sequence)
     return run
 
 
@@ -231,7 +231,8 @@ def test_a_malformed_one_gets_one_line_before_anything_runs(
 def test_without_truth_the_others_are_not_measured_against_it(without_truth: Comparison) -> None:
     steady = without_truth.runs[0]
     assert steady.causal is not None
-    (read,) = reference_runs({NAME: Trajectory(steady.causal.t_ns, steady.causal.T_world_imu)}, without_truth.sequence)
+    brought, sequence = {NAME: Trajectory(steady.causal.t_ns, steady.causal.T_world_imu)}, without_truth.sequence
+    (read,) = runs_of_others(brought, {}, sequence, sequence)
     other = outcome_of(read, without_truth.sequence, seed=without_truth.seeds[0])
     mixed = replace(without_truth, outcomes=(*without_truth.outcomes, other))
     (drawn,) = over_time.draw_errors(mixed)
@@ -244,7 +245,7 @@ def test_the_estimates_beside_the_real_exports_are_as_good_as_openvins_is(
 ) -> None:
     source = str(real(f"openvins_sim/{name}"))
     sequence = load_sequence(source)
-    (run,) = reference_runs(load_references(source), sequence)
+    (run,) = runs_of_others(load_references(source), {}, sequence, sequence)
     values = score_run(run, "causal", sequence).values
     # three decimals as published with the exports; a quaternion read the other way round is 100 degrees off
     assert values["ate_yaw_m"] == pytest.approx(ate_yaw_m, abs=1e-3)

@@ -14,14 +14,7 @@ from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import Conditions, OutcomeStore
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
-from toolkit.experiment.references import (
-    ExternalFile,
-    check_file_names,
-    check_names,
-    external_runs,
-    read_external,
-    reference_runs,
-)
+from toolkit.experiment.references import ExternalFile, check_file_names, read_external, runs_of_others
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import LostUnit, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
@@ -151,9 +144,7 @@ def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress
 def _with_references(plan: Plan, case: Prepared, files: Mapping[str, ExternalFile]) -> Prepared:
     source, sequence = case.source, case.sequence
     brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
-    check_names(brought, files)
-    runs = reference_runs(brought, sequence) + external_runs(files, case.whole, sequence)
-    return replace(case, references=runs)
+    return replace(case, references=runs_of_others(brought, files, case.whole, sequence))
 
 
 def stores_of(plan: Plan, cases: Sequence[Prepared], directories: Sequence[Path]) -> list[OutcomeStore]:

@@ -39,12 +39,6 @@ _NO_CONVENTION = "what its covariances mean is not said: name it with --cov-conv
 _AS_FINAL = "it is listed as final, because a file does not show whether its poses use later measurements"
 
 
-def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each estimate in a recording, with its poses at the frames as causal output."""
-    read = "read from a file of the recording"
-    return tuple(_run(name, trajectory, sequence, "causal", read) for name, trajectory in references.items())
-
-
 @dataclass(frozen=True, eq=False)
 class ExternalFile:
     """The file of another system, and which kind of output it is, None where that is not said."""
@@ -64,13 +58,22 @@ def read_external(given: Path, cov_convention: CovConvention | None = None) -> E
     return ExternalFile(read_poses(given, cov_convention))
 
 
-def external_runs(files: Mapping[str, ExternalFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each trajectory file, with its poses at the frames as final output, or as it is said to be.
+def runs_of_others(
+    brought: Mapping[str, Trajectory], files: Mapping[str, ExternalFile], recording: Sequence, sequence: Sequence
+) -> tuple[Run, ...]:
+    """Return a run for each estimate that a recording brings, as causal output, and for each trajectory file.
 
-    ``recording`` is the whole of it, of which ``sequence`` may be a part. Raises DataError where a file
-    is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
+    A file is final output, or what it is said to be. ``recording`` is the whole of it, of which ``sequence`` may be a
+    part. Raises DataError where a file has the name of an estimate, or is not of this recording: a wrong clock, unit of
+    time, order of quaternions, body or number of rows is named.
     """
-    return tuple(_external(name, file, recording, sequence) for name, file in files.items())
+    taken = {plain_name(name): name for name in brought}
+    for name in files:
+        if plain_name(name) in taken:
+            raise DataError(f"the recording contains an estimate {taken[plain_name(name)]}; give {name} another name")
+    read = "read from a file of the recording"
+    ours = [_run(name, trajectory, sequence, "causal", read) for name, trajectory in brought.items()]
+    return (*ours, *(_external(name, file, recording, sequence) for name, file in files.items()))
 
 
 def check_file_names(names: Iterable[str], estimators: Iterable[str]) -> None:
@@ -84,14 +87,6 @@ def check_file_names(names: Iterable[str], estimators: Iterable[str]) -> None:
             why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
             raise SettingsError(f"a trajectory's name {name} {why}; choose another")
         taken[plain] = f"another trajectory, {name}"
-
-
-def check_names(references: Mapping[str, Trajectory], files: Iterable[str]) -> None:
-    """Raise DataError where a trajectory file is given the name of an estimate that the recording brings."""
-    taken = {plain_name(name): name for name in references}
-    for name in files:
-        if plain_name(name) in taken:
-            raise DataError(f"the recording contains an estimate {taken[plain_name(name)]}; give {name} another name")
 
 
 def _external(name: str, file: ExternalFile, recording: Sequence, sequence: Sequence) -> Run:
