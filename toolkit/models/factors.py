@@ -89,15 +89,15 @@ class StereoFactors:
     def of(self, frame: StereoFrame, k: int) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the factors between the pose X(k) and the landmarks L(track id) the frame shows."""
         pose = X(k)
-        for track_id, uv_px in zip(frame.track_ids.tolist(), frame.uvs_px.tolist(), strict=True):
+        for landmark, uv_px in zip(landmark_keys(frame.track_ids.tolist()), frame.uvs_px.tolist(), strict=True):
             if isnan(uv_px[1]):
                 left = np.array([uv_px[0], uv_px[2]]), self._left_noise
                 yield gtsam.GenericProjectionFactorCal3_S2(
-                    *left, pose, L(track_id), self._left_calibration, self._T_imu_cam
+                    *left, pose, landmark, self._left_calibration, self._T_imu_cam
                 )
             else:
                 both = gtsam.StereoPoint2(*uv_px), self._noise
-                yield gtsam.GenericStereoFactor3D(*both, pose, L(track_id), self._calibration, self._T_imu_cam)
+                yield gtsam.GenericStereoFactor3D(*both, pose, landmark, self._calibration, self._T_imu_cam)
 
 
 def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.noiseModel.Base:
