@@ -68,7 +68,7 @@ def score(evaluation: AgainstTruth) -> Scores:
         {
             "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
             "rpe_1s_deg": lambda: rmse(angles_deg(errors_of_a_second()[:, :3, :3])),
-            "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.oriented),
+            "rpe_100m_percent": lambda: _hundred_metres_percent(evaluation.oriented),
         }
     )
     return rpe | Scores.attempt(KITTI, lambda: _kitti(evaluation.oriented))
@@ -88,12 +88,6 @@ def _kitti(matched: Matched) -> Scores:
     return Scores({"kitti_t_percent": 100.0 * float(t_per_m.mean()), "kitti_r_deg_per_m": float(r_deg_per_m.mean())})
 
 
-def hundred_metres_percent(matched: Matched) -> float:
-    """Return the RMSE of the translation error over 100 m of true path, in percent; may raise Unavailable."""
-    errors = relative_errors(matched, *_hundred_metres(matched))
-    return rmse(lengths(errors[:, :3, 3])) / INTERVAL_M * 100.0
-
-
 def _one_second(matched: Matched) -> _Intervals:
     """Pair each stamp with the first one a second later, allowing for rounding of the stamps."""
     latest_ns = NS_PER_S + _LATEST_IN_STEPS * median_period_ns(matched.t_ns)
@@ -103,13 +97,13 @@ def _one_second(matched: Matched) -> _Intervals:
     return intervals
 
 
-def _hundred_metres(matched: Matched) -> _Intervals:
-    """Pair each stamp with the first one 100 m further along the truth."""
+def _hundred_metres_percent(matched: Matched) -> float:
+    """Return the RMSE of the translation error from each stamp to the first one 100 m further along the truth."""
     intervals = _first_reaching(matched.path_m, INTERVAL_M, _LONGEST_OVER_INTERVAL * INTERVAL_M)
     if not intervals.first.size:
         length_m = matched.path_m[-1] - matched.path_m[0]
         raise Unavailable(f"no two matched poses are 100 m apart; the matched path is {length_m:.1f} m")
-    return intervals
+    return rmse(lengths(relative_errors(matched, *intervals)[:, :3, 3])) / INTERVAL_M * 100.0
 
 
 def _first_reaching(along: Array | IntArray, least: float, most: float) -> _Intervals:

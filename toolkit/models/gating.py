@@ -59,11 +59,6 @@ def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
     return distance
 
 
-def huber_threshold(dof: IntArray | int, sigma: float) -> Array:
-    """Return the threshold (N,) for residuals of ``dof`` (N,) that is exceeded as often as ``sigma`` is for three."""
-    return np.asarray(np.sqrt(chdtri(dof, chdtrc(3, sigma**2))), dtype=float)
-
-
 def huber_weights(distances_squared: Array, threshold: Array | float | None) -> Array:
     """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,); 1 without a loss.
 
@@ -180,5 +175,6 @@ def _table(probability: float | None, huber: float | None, bits: int) -> _Table:
     gate.
     """
     dof = np.arange(2**bits)
-    threshold = np.full(dof.size, np.inf) if huber is None else huber_threshold(dof, huber)
+    # Exceeded as often as ``huber`` is by residuals of three degrees of freedom.
+    threshold = np.full(dof.size, np.inf) if huber is None else np.sqrt(chdtri(dof, chdtrc(3, huber**2)))
     return _Table(chi2_bound(dof, probability), mean_below_bound(dof, probability), threshold)

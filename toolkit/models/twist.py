@@ -105,12 +105,6 @@ def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFa
     return gtsam.CustomFactor(noise, [X(k - 1), X(k), B(k - 1)], residual)
 
 
-def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float | Array, k: int) -> gtsam.NonlinearFactor:
-    """Return the random walk of the gyro bias from B(k - 1) to B(k), both (3,)."""
-    covariance = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(noise, dt_s))
-    return gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), covariance)
-
-
 @dataclass(frozen=True, eq=False)
 class TwistIncrement:
     """The step between two frames, or several, and the gyro bias (..., 3) it was integrated about."""
@@ -137,7 +131,8 @@ class TwistIncrement:
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
         graph.add(twist_factor(self.step, self.gyro_bias, k))
-        graph.add(gyro_bias_walk_factor(self.noise, self.step.dt_s, k))
+        walk = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(self.noise, self.step.dt_s))
+        graph.add(gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), walk))
         return graph
 
 

@@ -98,6 +98,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
     view = _view(*parts, world_rng) if scenario.varied else _view_of_all_seeds(*parts)
     frames_t_ns, motion = view.frames_t_ns, view.motion
     measured = _measure_motion(scenario, view.scene.trajectory, frames_t_ns, motion_rng)
+    last_sample = np.searchsorted(measured.samples.t_ns, frames_t_ns, side="right") - 1
     return Sequence(
         name=scenario.name,
         rig=scenario.rig,
@@ -107,7 +108,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
         motion=measured.samples,
         provenance=_provenance(scenario, seed),
         prior=_prior(scenario, motion, prior_rng),
-        truth=Truth(frames_t_ns, motion.T_world_imu, motion.v_world, _at_frames(measured, frames_t_ns)),
+        truth=Truth(frames_t_ns, motion.T_world_imu, motion.v_world, measured.bias[last_sample]),
         gravity_world=scenario.gravity_world,
     )
 
@@ -162,12 +163,6 @@ def _observe(scenario: Scenario, view: _View, streams: list[np.random.Generator]
         return noisy
     slipped = sensors.with_slips(noisy, scenario.slip_share, rig, slips_rng)
     return sensors.while_in_image(slipped, camera.size_px)
-
-
-def _at_frames(measured: MotionMeasurements, frames_t_ns: IntArray) -> Array:
-    """Return the bias (K, 6) of the last motion sample at or before each frame."""
-    bias: Array = measured.bias[np.searchsorted(measured.samples.t_ns, frames_t_ns, side="right") - 1]
-    return bias
 
 
 def _prior(scenario: Scenario, motion: Kinematics, rng: np.random.Generator) -> Prior:
