@@ -252,8 +252,9 @@ def test_the_examples_of_extending_do_what_the_page_says(extended: Extended) -> 
 
 
 @by_page
-def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+def test_links_lead_somewhere_and_files_that_are_named_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
         name, _, anchor = target.partition("#")
         if name.startswith("https:"):
             continue
@@ -261,12 +262,8 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert linked.exists(), target
         assert linked.is_relative_to(PROJECT), target
         assert not anchor or anchor in _anchors(linked), target
-
-
-@by_page
-def test_files_that_a_page_names_exist(page: Path) -> None:
-    named = re.findall(r"`((?:toolkit|filters|tests|notebooks|docs)/[\w/.]+)`", page.read_text(encoding="utf-8"))
-    assert [name for name in named if not (PROJECT / name).exists()] == []
+    for name in re.findall(r"`((?:toolkit|filters|tests|notebooks|docs)/[\w/.]+)`", text):
+        assert (PROJECT / name).exists(), name
 
 
 def _anchors(page: Path) -> set[str]:

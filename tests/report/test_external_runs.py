@@ -208,22 +208,12 @@ def test_it_has_a_causal_line_of_its_own_that_says_it_was_read(export: Path) -> 
     assert f"{NAME}: read from a file of the recording, not run here" in report_text(comparison, {})
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda lines: [], "holds no poses; .* remove it"),
-        (lambda lines: [lines[0], lines[1] + "x"], "line 2 is not numeric"),
-    ],
-    ids=["empty", "words"],
-)
-def test_a_malformed_one_gets_one_line_before_anything_runs(
-    export: Path, spoil: Callable[[list[str]], list[str]], message: str
-) -> None:
-    path = export / "est.txt"
-    path.write_text("\n".join(spoil(path.read_text().splitlines())) + "\n")
-    with pytest.raises(DataError, match=message) as raised:
+def test_a_malformed_one_gets_one_line_before_anything_runs(export: Path) -> None:
+    head, *rows = (export / "est.txt").read_text().splitlines()
+    (export / "est.txt").write_text("\n".join([head, rows[0] + "x", *rows[1:]]))
+    with pytest.raises(DataError, match="line 2 is not numeric") as raised:
         compared(export)
-    assert str(path) in str(raised.value)
+    assert str(export / "est.txt") in str(raised.value)
     assert "\n" not in str(raised.value)
     assert not (export.parent / "run").exists()
 
