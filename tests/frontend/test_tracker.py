@@ -9,15 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from tests.frontend.conftest import BOARD_M, FRAMES, WALL_M, Filmed
 from toolkit.errors import DataError
 from toolkit.frontend import StampedPair, motion, track_images
 from toolkit.frontend.tracker import TrackedCorners, Tracker
 from toolkit.geometry import Array
 from toolkit.settings import DEFAULTS, Frontend
-
-Filmed = Any
-WALL_M, BOARD_M = 3.0, 1.6
-FRAMES = 10
 
 
 def tracked(filmed: Filmed, settings: Frontend = DEFAULTS.frontend) -> list[TrackedCorners]:
