@@ -13,7 +13,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pytest
 
-from tests.audit.conftest import recording
+from tests.audit.conftest import recording, with_pixels
+from tests.audit.conftest import with_values as other_values
 from toolkit.audit import Audit, audit
 from toolkit.audit.agreement import accelerometer_change, scale_change
 from toolkit.audit.calibration import gyro_scale, miscalibration, steady_difference
@@ -67,29 +68,22 @@ def mirrored(sequence: Sequence, dose: float, seed: int) -> Sequence:
     u_left, u_right, v = sequence.observations.uv_px.T
     twice = 2.0 * sequence.rig.cx_px
     uv_px = np.stack([twice - u_right, twice - u_left, v], axis=1)
-    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+    return with_pixels(sequence, uv_px)
 
 
 def with_values(change: Callable[[Array], Array]) -> Callable[..., Sequence]:
     """Return what changes the values (S, 6) of the motion samples."""
-
-    def planted(sequence: Sequence, dose: float, seed: int) -> Sequence:
-        values = change(sequence.motion.values.copy())
-        return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
-
-    return planted
+    return lambda sequence, dose, seed: other_values(sequence, change)
 
 
 def normalised(sequence: Sequence, dose: float, seed: int) -> Sequence:
-    rig, seen = sequence.rig, sequence.observations
-    uv_px = (seen.uv_px - [rig.cx_px, rig.cx_px, rig.cy_px]) / rig.fx_px
-    return replace(sequence, observations=replace(seen, uv_px=uv_px))
+    rig, uv_px = sequence.rig, sequence.observations.uv_px
+    return with_pixels(sequence, (uv_px - [rig.cx_px, rig.cx_px, rig.cy_px]) / rig.fx_px)
 
 
 def one_camera(sequence: Sequence, dose: float, seed: int) -> Sequence:
     """Write the left image's columns for both."""
-    seen = sequence.observations
-    return replace(sequence, observations=replace(seen, uv_px=seen.uv_px[:, [0, 0, 2]]))
+    return with_pixels(sequence, sequence.observations.uv_px[:, [0, 0, 2]])
 
 
 def unlike_rows(sequence: Sequence, dose: float, seed: int) -> Sequence:

@@ -12,7 +12,7 @@ from toolkit.audit.alignment import ForceBesideCamera
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import FORCE, LEAST_INTERVALS, RATE, SPEED, Intervals
 from toolkit.audit.one_step import errors_are_independent
-from toolkit.audit.robust import MEDIAN_TO_MEAN_ERROR, Scalar, median_error, regression
+from toolkit.audit.robust import LEVEL, MEDIAN_TO_MEAN_ERROR, Scalar, median_error, regression
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import STRETCHES
 from toolkit.measurements import NS_PER_S
@@ -227,8 +227,8 @@ def _around(t_s: Array, value: Array) -> Array:
     return medians[np.searchsorted(knots_s, np.floor(t_s))]
 
 
-# Level of significance of a step, over all places where it can be, and its least share (sound drives have 0.057).
-LEVEL, SYSTEMATIC = 1e-3, 0.06
+# Least share of a step, beside its significance over all places where it can be (sound drives have 0.057).
+SYSTEMATIC = 0.06
 # Where only a step larger than this would be found, the finding is undecided and says so.
 LARGEST_HIDDEN_STEP = 0.08
 # Below this speed the camera is taken to stand, and its speed is noise.

@@ -289,18 +289,6 @@ LEAST_SPREAD = 0.1
 AGAINST_GIVEN_ORDER, MOST_LEFT = 5.0, 0.7
 
 
-class _Changes(NamedTuple):
-    """Over M strides: the change of velocity (M, 3), and that of each channel in each axis (M, 3, 3, 3), in m/s^2.
-
-    ``along`` is the mean of each channel if it measured each axis: [stride, axis of the IMU, channel, axis of the first
-    frame]. ``window`` (M,) numbers the windows.
-    """
-
-    velocity: Array
-    along: Array
-    window: IntArray
-
-
 def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     """Report the order and signs of the accelerometer's channels that fit the camera's motion, if not the given.
 
@@ -312,10 +300,10 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     if found.residual_px > found.limit_px:
         return None  # gyro and camera differ, which `disagreement` reports
     changes = _changes(evidence)
-    if len(changes.velocity) < LEAST_STRIDES:
+    if len(changes[0]) < LEAST_STRIDES:
         return None
     orders = signed_axes()
-    left = np.stack([_left(changes, order) for order in orders])
+    left = np.stack([_left(*changes, order) for order in orders])
     best, _, behind = ranked(cauchy(left, LEAST_SPREAD))
     given_mps2, best_mps2 = (float(np.median(np.linalg.norm(left[k], axis=1))) for k in (0, best))
     if best == 0 or behind[0] < AGAINST_GIVEN_ORDER or best_mps2 > MOST_LEFT * given_mps2:
@@ -330,7 +318,12 @@ def accelerometer_axes(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _changes(evidence: Evidence) -> _Changes:
+def _changes(evidence: Evidence) -> tuple[Array, Array, IntArray]:
+    """Return over M strides the change of velocity (M, 3) m/s^2, that by channels (M, 3, 3, 3), and the window (M,).
+
+    The second is the mean of each channel if it measured each axis: [stride, axis of the IMU, channel, axis of the
+    first frame].
+    """
     found, known = evidence.force_beside_camera, evidence.camera_motion.known
     t_s = (found.middle_ns - found.middle_ns[0]) / NS_PER_S
     stride = max(OVERLAP, round(STRIDE_S / float(np.median(np.diff(t_s)))))
@@ -341,13 +334,12 @@ def _changes(evidence: Evidence) -> _Changes:
         (one[a + stride] - one[a]) / (t_s[a + stride] - t_s[a]).reshape(-1, *[1] * (one.ndim - 1))
         for one in (found.v_mps, found.along_mps)
     )
-    return _Changes(velocity, along, (t_s[a] // WINDOW_S).astype(np.int64))
+    return velocity, along, (t_s[a] // WINDOW_S).astype(np.int64)
 
 
-def _left(changes: _Changes, order: Array) -> Array:
+def _left(velocity: Array, along: Array, window: IntArray, order: Array) -> Array:
     """Return the changes (M, 3) less the specific force in an order (3, 3) of channels, about the window's median."""
-    left = changes.velocity - np.einsum("kaci,ac->ki", changes.along, order.T)
-    for window in np.unique(changes.window):
-        here = changes.window == window
+    left = velocity - np.einsum("kaci,ac->ki", along, order.T)
+    for here in (window == one for one in np.unique(window)):
         left[here] -= np.median(left[here], axis=0)
     return np.asarray(left)

@@ -93,12 +93,12 @@ def in_motion(moved: Array, stretches: int) -> float:
     return float(gone.sum() ** 2 / max(float(np.sum(gone**2)), 1e-12))
 
 
-def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
-    """Return the number of standard errors exceeded by chance less often than ``level``, by Student's t.
+def chance_sigmas(stretches: float) -> float:
+    """Return the number of standard errors exceeded by chance less often than ``LEVEL``, by Student's t.
 
     The error is that of a jackknife over this many stretches; with two or fewer the result is infinite.
     """
-    return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * level)) if stretches > LEAST_STRETCHES else np.inf
+    return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * LEVEL)) if stretches > LEAST_STRETCHES else np.inf
 
 
 def chance_bound(error: Array, formal: Array, stretches: float) -> Array:

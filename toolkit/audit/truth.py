@@ -21,9 +21,7 @@ from toolkit.sequence import Sequence, Truth
 # Length (s) of a window: long enough for the noise of single frames to be small, and five seconds have ten of them.
 WINDOW_S = 0.5
 LEAST_WINDOWS = 4
-# Level of significance, by Student's t of as many windows, ...
-LEVEL = 1e-3
-# ... and limit of sound recordings at hand, beyond chance; chosen with them in view.
+# Limit of sound recordings at hand, beyond chance; chosen with them in view.
 SYSTEMATIC = 0.06
 # The difference is one of scale if scaling leaves less than this share of it.
 MOST_SCALED_OFF = 0.25
@@ -107,7 +105,7 @@ def compared(each: Array) -> WindowMedian:
     With few windows neither the error of the median nor that of the mean is certain, so the larger one is used.
     """
     error = max(float(median_error(each[:, None])[0]), float(np.std(each)) / np.sqrt(each.size))
-    return WindowMedian(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
+    return WindowMedian(float(np.median(each)), error, chance_sigmas(each.size) * error)
 
 
 def off_by(both: Array) -> WindowMedian:
