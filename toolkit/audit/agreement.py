@@ -285,7 +285,7 @@ def _largest_step(ratio: Array) -> tuple[int, Scalar]:
 # errors and a share of gravity (sound recordings have 0.3 % at most), a larger one if tracks drift (0.8 %).
 CUTS, GRAVITY_SIGMAS, GRAVITY_SYSTEMATIC, BY_TRACK_DRIFT = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
 # Length (s) of the windows in which gravity is read, while the gyro hardly drifts, and their least number of intervals.
-GRAVITY_WINDOW_S, FEWEST_IN_GRAVITY_WINDOW = 4.0, 12
+GRAVITY_WINDOW_S, FEWEST_IN_GRAVITY_WINDOW = 2.0, 12
 # Where only a change larger than this share of gravity would be found, the finding is undecided and says so.
 LARGEST_HIDDEN_GRAVITY = 0.05
 
