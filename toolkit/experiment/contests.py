@@ -19,13 +19,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri
 
 from toolkit.arrays import rows_of
-from toolkit.experiment.statistics import standard_error
+from toolkit.experiment.statistics import Interval, jackknife_interval, mean_interval
 from toolkit.experiment.units import drift_in_body
 from toolkit.geometry import Array
-from toolkit.jackknife import STRETCHES, jackknife_error
+from toolkit.jackknife import STRETCHES
 from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.against_truth import Matched
 from toolkit.metrics.parts.scores import Unavailable
@@ -262,7 +262,8 @@ def _ratio(one: _Drift, other: _Drift) -> Advantage:
     log_ratio, tail = 0.5 * np.log(others / squares), 0.5 * (1.0 - CONFIDENCE)
     narrowed = 0.5 * np.sqrt(1.0 - shared)
     above, below = (narrowed * np.log(fdtri(other.dof, one.dof, p)) for p in (1.0 - tail, tail))
-    return _advantage(log_ratio, log_ratio - above, log_ratio - below, len(one.over_m), "stretches of the path")
+    found = Interval(log_ratio, log_ratio - above, log_ratio - below)
+    return _advantage(found, len(one.over_m), "stretches of the path")
 
 
 def less_median(one: Array, other: Array, parts: str) -> Advantage | None:
@@ -276,8 +277,8 @@ def less_median(one: Array, other: Array, parts: str) -> Advantage | None:
     def log_ratio(mine: Array, others: Array) -> float:
         return float(np.log(np.median(others) / np.median(mine)))
 
-    whole, error = log_ratio(one, other), jackknife_error(log_ratio, one, other)
-    return _interval(whole, error, STRETCHES, parts) if np.isfinite([whole, error]).all() else None
+    found = jackknife_interval(log_ratio, one, other, level=1.0 - CONFIDENCE)
+    return _advantage(found, STRETCHES, parts) if np.isfinite(found).all() else None
 
 
 def less_over_seeds(one: Array, other: Array) -> Advantage | None:
@@ -287,16 +288,10 @@ def less_over_seeds(one: Array, other: Array) -> Advantage | None:
     """
     if one.size < 3 or not (np.minimum(one, other) > 0.0).all():
         return None
-    logs = np.log(other / one)
-    return _interval(float(logs.mean()), float(standard_error(logs)), logs.size, "seeds")
+    return _advantage(mean_interval(np.log(other / one), 1.0 - CONFIDENCE), one.size, "seeds")
 
 
-def _interval(log_ratio: float, error: float, count: int, parts: str) -> Advantage:
-    reach = float(stdtrit(count - 1, 0.5 * (1.0 + CONFIDENCE))) * error
-    return _advantage(log_ratio, log_ratio - reach, log_ratio + reach, count, parts)
-
-
-def _advantage(log_ratio: float, low: float, high: float, count: int, parts: str) -> Advantage:
+def _advantage(log_ratio: Interval, count: int, parts: str) -> Advantage:
     # A ratio of a million stands for any larger one, which a diverged run may have.
-    ratio, least, most = np.exp(np.clip([log_ratio, low, high], -14.0, 14.0)).tolist()
-    return Advantage(ratio, least, most, count, parts)
+    ratio, low, high = np.exp(np.clip(log_ratio, -14.0, 14.0)).tolist()
+    return Advantage(ratio, low, high, count, parts)

@@ -64,7 +64,11 @@ class Paired:
 
     @property
     def interval(self) -> "Interval":
-        reach = float(stdtrit(self.n - 1, 1.0 - LEVEL / 2.0)) * self.error
+        return self.within(LEVEL)
+
+    def within(self, level: float) -> "Interval":
+        """Return the mean with the interval by Student's t that misses the true one at a rate of ``level``."""
+        reach = float(stdtrit(self.n - 1, 1.0 - level / 2.0)) * self.error
         return Interval(self.mean, self.mean - reach, self.mean + reach)
 
     @property
@@ -114,7 +118,7 @@ def standard_error(differences: Array) -> Array:
 
 
 class Interval(NamedTuple):
-    """A value with the 95 % interval it lies in."""
+    """A value with the interval it lies in, of 95 % where nothing else is said."""
 
     value: float
     low: float
@@ -126,17 +130,17 @@ class Interval(NamedTuple):
             return Interval(*(float(np.exp(end)) for end in self))
 
 
-def mean_interval(values: Array) -> Interval:
+def mean_interval(values: Array, level: float = LEVEL) -> Interval:
     """Return the mean of values (n,) with its interval by Student's t; an infinite one of a single value."""
     mean = float(np.mean(values))
     if len(values) < 2:
         return Interval(mean, -math.inf, math.inf)
-    return Paired(len(values), mean, float(standard_error(np.asarray(values)))).interval
+    return Paired(len(values), mean, float(standard_error(np.asarray(values)))).within(level)
 
 
-def jackknife_interval(estimate: Callable[..., float], *rows: Array) -> Interval:
+def jackknife_interval(estimate: Callable[..., float], *rows: Array, level: float = LEVEL) -> Interval:
     """Return an estimate from arrays (M, ...) in order of time, with its interval by :mod:`toolkit.jackknife`."""
-    return Paired(STRETCHES, estimate(*rows), jackknife_error(estimate, *rows)).interval
+    return Paired(STRETCHES, estimate(*rows), jackknife_error(estimate, *rows)).within(level)
 
 
 def ratio_of_means(above: Iterable[float | None], below: Iterable[float | None]) -> Paired | None:
