@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import Reference, body_of, other_axes, range_s
 from toolkit.datasets.trajectories.covariances import CONVENTIONS, CovConvention
-from toolkit.datasets.trajectories.formats import PosesFile, check_order, read_finite_poses, read_rows
+from toolkit.datasets.trajectories.formats import PosesFile, read_finite_poses, read_rows
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import is_regular
@@ -175,8 +175,7 @@ def read_truth(name: str, path: Path, cov_convention: CovConvention | None = Non
     file = _with_times(read_finite_poses(path, cov_convention))
     if len(file) < 2:
         raise DataError(f"{path}: a truth of {len(file)} pose; give at least two")
-    if file.other_order is not None:
-        check_order(path, file.T_world_imu, file.other_order)
+    file.check_order()
     t_ns = np.arange(len(file), dtype=np.int64) * _FRAME_NS if file.t_ns is None else file.t_ns
     cov = None if file.covariances is None else file.covariances.of(file.T_world_imu)
     return TruthFile(path, t_ns, file.T_world_imu, name, file.t_ns is not None, file.not_finite, cov)

@@ -22,13 +22,11 @@ from toolkit.datasets.trajectories.belonging import (
     Steps,
     check_clock,
     check_turns,
-    in_other_order,
     stamps_among,
     turned,
 )
 from toolkit.datasets.trajectories.formats import (
     POSITIONS_ALONE,
-    check_order,
     checked_poses,
     known_poses,
     read_finite_poses,
@@ -89,8 +87,7 @@ def load_truth(path: Path) -> TruthRead:
         raise DataError(f"{path}: has no stamps; {_KIND}")
     truth = Truth(read.t_ns, read.T_world_imu)
     left_out = (f"left out of the truth: {read.not_finite}",) if read.not_finite else ()
-    if read.other_order is not None:
-        check_order(path, read.T_world_imu, read.other_order)
+    read.check_order()
     return TruthRead(truth, (*left_out, OF_POSITIONS) if is_of_positions(truth) else left_out)
 
 
@@ -109,8 +106,7 @@ def with_truth(sequence: Sequence, truth: Truth, facts: tuple[str, ...] = ()) ->
     reference = Reference.of_recording(sequence)
     check_clock("the truth", reference, truth.t_ns)
     # Only the order: the recording is not audited yet, and mixed axes of its own would look like a camera's.
-    readings = (in_other_order(tum.other_order),)
-    check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
+    check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], (tum.other_order,))
     return replace(sequence, truth=truth).with_facts(*facts)
 
 

@@ -11,7 +11,7 @@ as simple, both fit. The fit is Kabsch's, "A solution for the best rotation to r
 without its rotations' handedness where a reflection is allowed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import permutations, product
@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from toolkit.datasets.trajectories.formats import CONJUGATE, INVERT_EACH, OtherOrder, PosesFile, check_order
+from toolkit.datasets.trajectories.formats import CONJUGATE, INVERT_EACH, PosesFile, Reading
 from toolkit.errors import DataError
 from toolkit.geometry import (
     Array,
@@ -115,22 +115,6 @@ class Reference(NamedTuple):
         middle_ns, positions = t_ns[:-1] + np.diff(t_ns) // 2, T_world_imu[:, :3, 3]
         unknown = np.full(middle_ns.size, np.nan)
         return cls(name, "the truth", "the truth does", t_ns, middle_ns, rates, t_ns, positions, unknown)
-
-
-class Reading(NamedTuple):
-    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it.
-
-    ``step`` is that through the positions (N, 3) then.
-    """
-
-    only_if: str
-    remedy: str
-    reread: Callable[[Array], Array]
-    step: int = 1
-
-
-def in_other_order(order: OtherOrder) -> Reading:
-    return Reading(f"read {order.name}", order.remedy, order.reread)
 
 
 def of_the_camera(sequence: Sequence) -> Reading:
@@ -387,8 +371,8 @@ def _body(
 
     That is at best one turn of the body, however large. Where positions do not tell, the rates of rotation do.
     """
-    what, order = str(file.path), file.other_order
-    others = (*(() if order is None else (in_other_order(order),)), _INVERTED, _BACKWARDS, *readings)
+    what = str(file.path)
+    others = (*filter(None, (file.other_order,)), _INVERTED, _BACKWARDS, *readings)
     if fit is not None and fit.turns:
         given, left = fit.body, {one: fit.reread(one).body for one in others}
         most_rad = min(_FITTING_RAD, fit.turned_by_rad / _TIMES)
@@ -410,8 +394,8 @@ def _body(
     turn = _turned_body(reference, t_ns, R_world_body)
     if turn is None and matched is not None:
         turn = _turned_on_a_line(*matched)
-    if order is not None and not confirmed and turn is None:
-        check_order(file.path, file.T_world_imu, order)
+    if not confirmed and turn is None:
+        file.check_order()
     return None if turn is None else BodyTurn(turn, 0.0, 0.0)
 
 

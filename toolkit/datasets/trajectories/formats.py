@@ -10,12 +10,13 @@ to the world. Behind the columns of TUM, EuRoC and OpenVINS' states a covariance
 row, of the pose or of the state; the header says which one it is (:mod:`~toolkit.datasets.trajectories.covariances`).
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -160,21 +161,25 @@ def _between(line: str, separator: str) -> list[str]:
 # The formats ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class OtherOrder:
-    """The order that the quaternions of a format have by mistake.
+class Reading(NamedTuple):
+    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it.
 
-    Rolling what was read as x y z w by ``roll`` gives what the file then means; ``name`` calls the mistake, and
-    ``remedy`` is the instruction to correct it.
+    ``step`` is that through the positions (N, 3) then.
     """
 
-    roll: int
-    name: str
+    only_if: str
     remedy: str
+    reread: Callable[[Array], Array]
+    step: int = 1
 
-    def reread(self, R_world_imu: Array) -> Array:
-        """Return rotations (N, 3, 3) as they are if the quaternions were in this order."""
-        return rotation_from_quaternion(np.roll(quaternion_from_rotation(R_world_imu), self.roll, axis=-1))
+
+def _w_first(remedy: str, roll: int = -1) -> Reading:
+    """Return the reading in which the scalar, read as the last of a quaternion, comes first; or, rolled by 1, last."""
+    return Reading(f"read w {'first' if roll < 0 else 'last'}", remedy, partial(_rolled, roll))
+
+
+def _rolled(roll: int, rotations: Array) -> Array:
+    return rotation_from_quaternion(np.roll(quaternion_from_rotation(rotations), roll, axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +195,7 @@ class PosesFile:
     format: str
     t_ns: IntArray | None
     T_world_imu: Array
-    other_order: OtherOrder | None
+    other_order: Reading | None
     covariances: StatedCovariances | None = None
     v_world: Array | None = None
     bias: Array | None = None
@@ -217,6 +222,31 @@ class PosesFile:
             raise DataError(f"{self.path}: {self.not_finite}")
         return self
 
+    def check_order(self) -> None:
+        """Raise DataError where the trajectory alone shows that its quaternions are in the other order, or inverted.
+
+        A vehicle moves in one direction of its own frame. If that holds in the other order and not as given, the order
+        is wrong; where both readings do as well (no turn, or a hand-held camera), a start at the identity decides:
+        read in the wrong order it is a start upside down.
+        """
+        other, positions, R_world_imu = self.other_order, self.T_world_imu[:, :3, 3], self.T_world_imu[:, :3, :3]
+        if other is None:
+            return
+        reread = other.reread(R_world_imu)
+        as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
+        R_imu_world = transposed(R_world_imu)
+        inverted_positions = -np.einsum("nij,nj->ni", R_imu_world, positions)
+        readings = ((INVERT_EACH, inverted_positions), (CONJUGATE, positions))
+        inverted, remedy = max((_concentration(at, R_imu_world), remedy) for remedy, at in readings)
+        is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
+        # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is
+        # named.
+        if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
+            raise DataError(f"{self.path}: {remedy}")
+        starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
+        if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
+            raise DataError(f"{self.path}: {other.remedy}")
+
 
 # Behind the columns of a format: no covariance, those of orientation and position apart, that of the pose or the state.
 Covariance = Literal["", "apart", "pose", "state"]
@@ -234,7 +264,7 @@ class Stamped:
     columns: str
     header: str
     order: tuple[int, ...]
-    other_order: OtherOrder
+    other_order: Reading
     unit_ns: int = NS_PER_S
     commas: bool = False
     may_go_on: bool = False
@@ -366,20 +396,16 @@ tum = Stamped(
     "t x y z qx qy qz qw",
     "# t_s x_m y_m z_m qx qy qz qw: the IMU in the world; quaternions are Hamilton, scalar last",
     order=(0, 1, 2, 3, 4, 5, 6),
-    other_order=OtherOrder(
-        -1, "w first", f"{_W_FIRST}; TUM order is qx qy qz qw: move the fifth column to the end"
-    ),
-)  # fmt: skip
+    other_order=_w_first(f"{_W_FIRST}; TUM order is qx qy qz qw: move the fifth column to the end"),
+)
 kitti = Kitti()
 euroc = Stamped(
     "EuRoC",
     "t,x,y,z,qw,qx,qy,qz",
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
     order=(0, 1, 2, 6, 3, 4, 5),
-    other_order=OtherOrder(
-        1,
-        "w last",
-        "the quaternions look w last; EuRoC's order is qw,qx,qy,qz: move the eighth column before the fifth",
+    other_order=_w_first(
+        "the quaternions look w last; EuRoC's order is qw,qx,qy,qz: move the eighth column before the fifth", roll=1
     ),
     unit_ns=1,
     commas=True,
@@ -390,9 +416,7 @@ openvins = Stamped(
     "t qx qy qz qw x y z vx vy vz bgx bgy bgz bax bay baz",
     "# timestamp(s) q_GtoI(x y z w, JPL) p_IinG v_IinG bg ba; nan is not known",
     order=(3, 4, 5, 6, 0, 1, 2, *range(7, 16)),
-    other_order=OtherOrder(
-        -1, "w first", f"{_W_FIRST}; OpenVINS' order is qx qy qz qw: move the scalar behind the others"
-    ),
+    other_order=_w_first(f"{_W_FIRST}; OpenVINS' order is qx qy qz qw: move the scalar behind the others"),
     may_go_on=True,
 )
 _OPENVINS_RECORDED = replace(tum, name="OpenVINS", columns=f"{tum.columns} Pr11 ... Pt33", covariance="apart")
@@ -406,7 +430,7 @@ OPENVINS_COV = replace(
 # Of two that have the same width the header decides: more columns of EuRoC and OpenVINS may be anything.
 _SAYS_SO: tuple[Stamped, ...] = (EUROC_COV, OPENVINS_COV)
 POSITIONS_ALONE = "t x y z"
-_MISNAMED = OtherOrder(-1, "w first", f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
+_MISNAMED = _w_first(f"{_W_FIRST}, and their heading says w last: exchange the names in the heading")
 TrajectoryFormat = Stamped | Kitti
 FORMATS: Mapping[str, TrajectoryFormat] = {"tum": tum, "kitti": kitti, "euroc": euroc, "openvins": openvins}
 _KIND = (
@@ -602,31 +626,6 @@ def _rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: 
         separator.join(([first] if first else []) + [f"{value:.15g}" for value in values]) for first, values in rows
     )
     return "\n".join([*([header] if header else []), *lines]) + "\n"
-
-
-def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
-    """Raise DataError where the trajectory alone shows that its quaternions are in the other order.
-
-    A trajectory inverted as a whole, or in its rotations alone, is named as such.
-
-    A vehicle moves in one direction of its own frame. If that holds in the other order and not as given, the order
-    is wrong; where both readings do as well (no turn, or a hand-held camera), a start at the identity decides:
-    read in the wrong order it is a start upside down.
-    """
-    positions, R_world_imu = T_world_imu[:, :3, 3], T_world_imu[:, :3, :3]
-    reread = other.reread(R_world_imu)
-    as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
-    R_imu_world = transposed(R_world_imu)
-    inverted_positions = -np.einsum("nij,nj->ni", R_imu_world, positions)
-    readings = ((INVERT_EACH, inverted_positions), (CONJUGATE, positions))
-    inverted, remedy = max((_concentration(at, R_imu_world), remedy) for remedy, at in readings)
-    is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
-    # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is named.
-    if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
-        raise DataError(f"{path}: {remedy}")
-    starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
-    if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
-        raise DataError(f"{path}: {other.remedy}")
 
 
 def _concentration(positions: Array, R_world_imu: Array) -> float:
