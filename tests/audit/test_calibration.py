@@ -32,7 +32,7 @@ from toolkit.audit.self_calibration import (
     stride_equations,
     twist_strides,
 )
-from toolkit.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from toolkit.geometry import Array, se3, se3_inverse, so3_exp
 from toolkit.measurements import ImuMotion, ImuNoise, MotionKind
 from toolkit.models.imu import predict, preintegrate, preintegration_params
 from toolkit.sequence import Sequence
@@ -56,30 +56,17 @@ def fitted(sequence: Sequence) -> SelfCalibration:
 
 
 @pytest.mark.parametrize("scenario", [FLIGHT, DRIVE_IMU])
-def test_a_stride_is_the_estimators_preintegration_and_changes_with_the_biases_alike(scenario: Scenario) -> None:
+def test_a_stride_is_the_estimators_preintegration(scenario: Scenario) -> None:
     sequence, given = recorded(scenario, 0), np.array([0.0, 0.0, 0.0, 0.01, -0.02, 0.03])
     strides = imu_strides(sequence, sequence.frames_t_ns, given[3:])
     assert isinstance(sequence.noise, ImuNoise)
     params = preintegration_params(sequence.noise, np.zeros(3))
     motions = [packet.motion for packet in sequence.packets() if isinstance(packet.motion, ImuMotion)]
-    found = [preintegrate(motion, given, params) for motion in motions]
-
-    def gtsam_says(bias: Array) -> tuple[Array, Array, Array]:
-        ends = [predict(one, np.eye(4), np.zeros(3), bias) for one in found]
-        T_a_b = np.array([end.T_world_imu for end in ends])
-        turned = so3_log(strides.R_a_b.swapaxes(1, 2) @ T_a_b[:, :3, :3])
-        return turned, np.array([end.v_world for end in ends]), T_a_b[:, :3, 3]
-
-    turned, faster, moved = gtsam_says(given)
-    np.testing.assert_allclose(turned, 0.0, atol=1e-12)
-    np.testing.assert_allclose(strides.faster, faster, atol=1e-12)
-    np.testing.assert_allclose(strides.moved, moved, atol=1e-12)
-    derivatives = strides.d_turn, strides.d_faster, strides.d_moved
-    for k, column in enumerate(np.roll(np.eye(6), 3, axis=1).argmax(axis=1).tolist()):
-        off = gtsam_says(given + 1e-4 * np.eye(6)[k])
-        for mine, there, here in zip(derivatives, off, (turned, faster, moved), strict=True):
-            # A difference quotient over 1e-4 of what is quadratic, for motions of a tenth of a second.
-            np.testing.assert_allclose(mine[..., column], (there - here) / 1e-4, atol=1e-4 * float(np.abs(mine).max()))
+    ends = [predict(preintegrate(motion, given, params), np.eye(4), np.zeros(3), given) for motion in motions]
+    T_a_b = np.array([end.T_world_imu for end in ends])
+    np.testing.assert_allclose(strides.R_a_b, T_a_b[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(strides.faster, [end.v_world for end in ends], atol=1e-12)
+    np.testing.assert_allclose(strides.moved, T_a_b[:, :3, 3], atol=1e-12)
 
 
 @cache

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.audit.conftest import clean_recording, planted, with_pixels
+from tests.audit.conftest import clean_recording, planted, recording, with_pixels
 from toolkit.audit import audit
 from toolkit.audit.alignment import is_excluded, is_there
 from toolkit.audit.robust import Scalar
@@ -17,50 +17,30 @@ from toolkit.simulation import SCENARIOS, faults, simulate
 from toolkit.verify import short
 
 
-def T_imu_cam(sequence: Sequence) -> Array:
-    return sequence.rig.T_imu_cam
-
-
-def baseline_m(sequence: Sequence) -> Array:
-    return np.array([sequence.rig.baseline_m])
-
-
-def twists_of_packets(sequence: Sequence) -> Array:
-    packets = [packet.motion for packet in sequence.packets()]
-    return np.array([one.v_mps for one in packets if isinstance(one, TwistMotion)])
-
-
-def whole_content(sequence: Sequence) -> Array:
-    return np.frombuffer(sequence.content_hash().encode(), dtype=np.uint8)
-
-
-def samples(sequence: Sequence) -> Array:
-    return sequence.motion.values
-
-
 @pytest.mark.parametrize(
-    ("fault", "field", "scenario", "duration_s", "seed"),
+    "fault",
     [
-        ("time-order", whole_content, "drive", 10.0, 0),
-        ("extrinsic-translation", T_imu_cam, "drive", 10.0, 0),
-        ("twist-lag", twists_of_packets, "drive", 30.0, 0),
-        (faults.baseline_unit, baseline_m, "drive", 12.0, 0),
-        (faults.extrinsic_unit, T_imu_cam, "drive", 12.0, 0),
-        (faults.inverted_extrinsic, T_imu_cam, "drive", 12.0, 0),
-        (faults.linear_unit, samples, "drive", 12.0, 0),
-        (faults.angular_unit, samples, "drive", 12.0, 0),
+        "time-order",
+        "extrinsic-translation",
+        faults.baseline_unit,
+        faults.extrinsic_unit,
+        faults.inverted_extrinsic,
+        faults.linear_unit,
+        faults.angular_unit,
     ],
 )
-def test_a_repair_gives_the_clean_recording_again(
-    fault: str | Callable[[Sequence], Sequence],
-    field: Callable[[Sequence], Array],
-    scenario: str,
-    duration_s: float,
-    seed: int,
-) -> None:
-    clean = clean_recording(scenario, seed, duration_s)
+def test_a_repair_gives_the_clean_recording_again(fault: str | Callable[[Sequence], Sequence]) -> None:
+    clean = recording("drive", 0)
     repaired = audit(planted(fault, clean) if isinstance(fault, str) else fault(clean)).sequence
-    np.testing.assert_allclose(field(repaired), field(clean), rtol=1e-9, atol=1e-9)  # rounding of a conversion
+    assert repaired.content_hash(9) == clean.content_hash(9)  # but for the rounding of a conversion
+
+
+def test_twists_that_were_late_are_paired_with_their_intervals() -> None:
+    clean = recording("drive", 0, 30.0)
+    packets = (audit(planted("twist-lag", clean)).sequence.packets(), clean.packets())
+    for late, sound in zip(*packets, strict=True):
+        if isinstance(late.motion, TwistMotion) and isinstance(sound.motion, TwistMotion):
+            np.testing.assert_array_equal(late.motion.v_mps, sound.motion.v_mps)
 
 
 def test_a_frame_with_the_stamp_of_another_goes_with_its_sightings() -> None:
