@@ -513,18 +513,13 @@ def recorded(bag: Bag, chosen: Chosen) -> Recorded:
     for topic in map(chosen.get, ("left_info", "right_info", "left", "right")):
         if topic is not None:
             held[topic.name] = list(islice(bag.messages({topic.name}), 1))
-    static = [one for topic in fixed for message in held.get(topic.name, ()) for one in _joints(message)]
+    static = [one for topic in fixed for message in held.get(topic.name, ()) for one in message.value.transforms]
     found = Recorded(bag.path, bag.topics, chosen, held, Tree(static))
     if not changing or found.T_imu_left is not None:
         return found
-    moving = (one for message in bag.messages({topic.name for topic in changing}) for one in _joints(message))
+    moving = (one for message in bag.messages({topic.name for topic in changing}) for one in message.value.transforms)
     by_tf = replace(found, tree=Tree([*ros.fixed(moving), *static]), in_tf=True)
     return found if by_tf.T_imu_left is None else by_tf
-
-
-def _joints(message: Message) -> Sequence[Any]:
-    transforms: Sequence[Any] = message.value.transforms
-    return transforms
 
 
 def mounted(source: Recorded, motion: MotionSamples) -> Mounted:

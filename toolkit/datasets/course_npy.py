@@ -69,9 +69,11 @@ def load(path: Path) -> Sequence:
     features = parts.stored.get(_FEATURES)
     K = parts.K[0]
     rig = StereoRig(K[0, 0], K[1, 1], K[0, 2], K[1, 2], parts.baseline_m, parts.T_imu_left, pixel_covariance(2))
-    if isinstance(features, np.ndarray):
-        return _sequence(parts, rig, *_sightings(parts, features))
-    return _sequence(parts, rig, NO_SIGHTINGS, (NO_FEATURES,))
+    if not isinstance(features, np.ndarray):
+        return _sequence(parts, rig, NO_SIGHTINGS, (NO_FEATURES,))
+    frame, track, corners_px, facts = corners_of(path, _FEATURES, features, parts.t_ns.size)
+    seen = rectified_observations(path, frame, track, _as_one_camera(parts, corners_px))
+    return _sequence(parts, rig, seen, facts)
 
 
 def uses_images(path: Path, tracks: Tracks) -> bool:
@@ -157,11 +159,6 @@ def _sequence(parts: _Parts, rig: StereoRig, seen: Observations, facts: tuple[st
         motion=TwistSamples(parts.t_ns, parts.v_mps, parts.w_radps),
         provenance=Provenance("course-npy", str(parts.path), (*facts, *parts.facts, EXTRINSIC_UNCERTAIN)),
     )
-
-
-def _sightings(parts: _Parts, features: np.ndarray) -> tuple[Observations, tuple[str, ...]]:
-    frame, track, corners_px, facts = corners_of(parts.path, _FEATURES, features, parts.t_ns.size)
-    return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px)), facts
 
 
 def _as_one_camera(parts: _Parts, corners_px: Array) -> Array:

@@ -36,7 +36,7 @@ from toolkit.datasets.io.image_pairs import (
     seen_in,
 )
 from toolkit.datasets.io.tables import columns_of_file, headings_of, read_stamps
-from toolkit.datasets.io.truth import choose_truth, find_truth, stamps_within, truth_at, truth_near
+from toolkit.datasets.io.truth import find_truth, stamps_within, truth_at, truth_near
 from toolkit.datasets.trajectories.headings import imu_columns
 from toolkit.errors import DataError, printable
 from toolkit.files.reading import is_regular
@@ -159,7 +159,11 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     layout = _whole(path)
     imu = _imu(layout)
     calibration = published() if layout.mav0 is None else read_calibration(layout.root, layout.mav0)
-    choice = choose_truth(layout.root, layout.mav0, imu, "; ".join(_few_images(layout)))
+    choice, few_images = find_truth(layout.root, layout.mav0, imu), tuple(_few_images(layout))
+    if choice is None:
+        where = "mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it"
+        why = "and the stereo tracks are simulated along it where there are no images; add one of them"
+        raise DataError(": ".join((f"{layout.root}: no ground truth in {where}, {why}", *few_images)))
     stamps = read_stamps(layout.stamps)
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
@@ -178,7 +182,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
             f"{path}: {ALL_SIMULATED if is_simulated(layout.root) else SIMULATED}, seed {seed}",
             (
                 *(_how_simulated(layout), *choice.facts, calibration.source, calibration.noise_source),
-                *(*calibration.unused, *_few_images(layout)),
+                *(*calibration.unused, *few_images),
             ),
         ),
         truth=truth,

@@ -31,7 +31,10 @@ def open_input(path: Path) -> BinaryIO:
     Raises DataError, with the path, the reason and the remedy, where it is none or cannot be read.
     """
     try:
-        check_regular(path)
+        mode = path.stat().st_mode
+        what = next((kind_text for is_of_kind, kind_text in _KINDS if is_of_kind(mode)), None)
+        if what is not None:
+            raise DataError(f"{path}: cannot be read: {what}")
         return path.open("rb")
     except OSError as error:
         raise DataError(unreadable(path, error)) from error
@@ -67,14 +70,6 @@ def read_text_input(path: Path, kind: str) -> str:
         return read_unzipped(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not a text file; {kind}") from error
-
-
-def check_regular(path: Path) -> None:
-    """Raise DataError for a directory, a pipe, a socket or a device; OSError where the path cannot be looked at."""
-    mode = path.stat().st_mode
-    what = next((kind_text for is_of_kind, kind_text in _KINDS if is_of_kind(mode)), None)
-    if what is not None:
-        raise DataError(f"{path}: cannot be read: {what}")
 
 
 def is_regular(path: Path) -> bool:

@@ -138,24 +138,11 @@ def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | No
 # Of EuRoC recordings -----------------------------------------------------------------------------------------------
 
 
-def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> TruthRead:
-    """Return the truth of a recording and why; of several, the one whose rates of rotation agree best with the gyro.
-
-    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged;
-    ``images`` says why tracks are not made of images, nothing where there are none.
-    """
-    choice = find_truth(root, mav0, imu)
-    if choice is None:
-        raise DataError(
-            f"{root}: no ground truth in mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it, "
-            "and the stereo tracks are simulated along it where there are no images; add one of them"
-            f"{f': {images}' if images else ''}"
-        )
-    return choice
-
-
 def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | None:
-    """Return the truth of a recording as :func:`choose_truth`, or None where there is none."""
+    """Return the truth of a recording and why, None where there is none; of several, that which fits the gyro's rates.
+
+    Raises DataError where one is damaged, or the best has no time in common with the IMU.
+    """
     read = {path: _read(path, mav0) for path in _tables(root, mav0)}
     if not read:
         return None
