@@ -264,8 +264,6 @@ ROLES: dict[str, tuple[str, ...]] = {
 }
 # Of a sensor that publishes both by themselves, as RealSense's cameras do.
 _GYRO, _ACCEL = "gyro", "accel"
-# In the name of a topic whose poses are a truth, and not another system's estimate.
-_OF_TRUTH = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "vrpn", "leica")
 _STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
 # Of a message that lists the topics of a bag, which may be hundreds.
 _LONGEST = 900
@@ -285,7 +283,7 @@ def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> tuple[
     left, right = _stereo(path, topics, given)
     imus = _usable(topics, (ros.IMU,))
     imu = given.get("imu") or (None if "twist" in given else _imu(imus))
-    truth = given.get("truth", _truth_topic(topics))
+    truth = given.get("truth", _most(one for one in _usable(topics, _TRUTHS) if _OF_TRUTH.search(one.name)))
     odometry = [topic for topic in _usable(topics, (ros.ODOMETRY,)) if topic != truth]
     found = {
         "left": left,
@@ -342,7 +340,8 @@ def _stereo(path: Path, topics: Sequence[Topic], given: Given) -> tuple[Topic, T
     if left is not None and right is not None:
         return left, right
     images = [topic for topic in _usable(topics, _IMAGES) if topic.count >= _LEAST_IMAGES]
-    pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
+    both = ((one, two) for one in images for two in images)
+    pairs = [(one, two) for one, two in both if any(_differ_by(one.name, two.name, *side) for side in _SIDES)]
     pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
     if not pairs:
         raise DataError(_no_pair(path, topics, images))
@@ -373,6 +372,9 @@ def _alone(word: str) -> str:
     return rf"(?<!{same_kind}){word}(?!{same_kind})"
 
 
+# In the name of a topic whose poses are a truth, and not another system's estimate.
+_TRACKERS = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "vrpn", "leica")
+_OF_TRUTH = re.compile("|".join(map(_alone, _TRACKERS)), re.IGNORECASE)
 # What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
 _SIDES = ((_alone("0"), "1"), (_alone("1"), "2"), (_alone("l"), "r"), ("left", "right"), ("Left", "Right"))
 
@@ -380,11 +382,6 @@ _SIDES = ((_alone("0"), "1"), (_alone("1"), "2"), (_alone("l"), "r"), ("left", "
 def _differ_by(one: str, two: str, pattern: str, other: str) -> bool:
     """Say whether a name becomes another where one place that a pattern fits is exchanged."""
     return two in (one[: at.start()] + other + one[at.end() :] for at in re.finditer(pattern, one))
-
-
-def _are_sides(one: str, two: str) -> bool:
-    """Say whether two names differ in nothing but the side of a pair, the left one first."""
-    return any(_differ_by(one, two, left, right) for left, right in _SIDES)
 
 
 def _imu(imus: Sequence[Topic]) -> Topic | None:
@@ -411,11 +408,6 @@ def _info(topics: Sequence[Topic], image: Topic) -> Topic | None:
             if name in infos:
                 return infos[name]
     return None
-
-
-def _truth_topic(topics: Sequence[Topic]) -> Topic | None:
-    words = re.compile("|".join(map(_alone, _OF_TRUTH)), re.IGNORECASE)
-    return _most(topic for topic in _usable(topics, _TRUTHS) if words.search(topic.name))
 
 
 def _usable(topics: Iterable[Topic], types: tuple[str, ...]) -> list[Topic]:

@@ -78,7 +78,11 @@ def load(path: Path) -> Sequence:
     suspicious (NaN, reversed time) are left for the audit.
     """
     file = _text_file(path)
-    text, arrays = documents.read(file, _Text, remedy=_REMEDY), _read_arrays(file.parent / _ARRAYS)
+    text = documents.read(file, _Text, remedy=_REMEDY)
+    with opened(file.parent / _ARRAYS) as archive:
+        arrays = archive.fields().arrays
+    for key, array in arrays.items():
+        check_numeric(file.parent / _ARRAYS, key, array.dtype)
     try:
         sequence = _sequence(text, arrays)
     except KeyError as error:
@@ -172,14 +176,6 @@ def _to_arrays(sequence: Sequence) -> dict[str, Any]:
 
 
 # Reading ------------------------------------------------------------------------------------------------------
-
-
-def _read_arrays(file: Path) -> Arrays:
-    with opened(file) as archive:
-        arrays = archive.fields().arrays
-    for key, array in arrays.items():
-        check_numeric(file, key, array.dtype)
-    return arrays
 
 
 def _sequence(text: _Text, arrays: Arrays) -> Sequence:

@@ -16,7 +16,7 @@ from toolkit.datasets.io.fields import check_frame_count, observations, probable
 from toolkit.datasets.io.tables import read_stamps
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, read_text_input
-from toolkit.frontend import ImageRecording, ImageTracks, Pinhole, RectifiedPair, StampedPair, size_of
+from toolkit.frontend import ImageRecording, ImageTracks, Pinhole, StampedPair, size_of
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import NS_PER_S, StereoRig
 from toolkit.models.noise import pixel_covariance
@@ -199,7 +199,11 @@ def seen_in(root: Path, filmed: ImageRecording, T_imu_left: Array, frontend: Fro
     tracks = filmed.tracks(frontend, progress)
     check_frame_count(root, tracks.t_ns.size)
     sightings = observations(tracks.frame, tracks.track_id, tracks.corners_px)
-    return Seen(tracks.t_ns, sightings, _rig_of(filmed.rig, T_imu_left), _facts_of(tracks, len(filmed.pairs)))
+    pair, T_imu_rect = filmed.rig, T_imu_left.copy()
+    T_imu_rect[:3, :3] = T_imu_left[:3, :3] @ pair.R_rect_cam.T
+    pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
+    rig = StereoRig(*pinhole_px, pair.baseline_m, T_imu_rect, pixel_covariance(2))
+    return Seen(tracks.t_ns, sightings, rig, _facts_of(tracks, len(filmed.pairs)))
 
 
 def image_size(left: Path, right: Path) -> tuple[int, int]:
@@ -214,13 +218,6 @@ def image_size(left: Path, right: Path) -> tuple[int, int]:
 def pinhole_of(P: Array) -> Pinhole:
     """Return fx, fy, cx, cy (px) of a projection (3, 4) or a camera matrix (3, 3)."""
     return float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2])
-
-
-def _rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
-    T_imu_rect = T_imu_left.copy()
-    T_imu_rect[:3, :3] = T_imu_left[:3, :3] @ pair.R_rect_cam.T
-    pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
-    return StereoRig(*pinhole_px, pair.baseline_m, T_imu_rect, pixel_covariance(2))
 
 
 def _facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
