@@ -36,8 +36,7 @@ from toolkit.experiment.workers import how_it_ended
 from toolkit.geometry import Array, IntArray
 from toolkit.measurements import Packet
 from toolkit.metrics import Evaluation, Unavailable
-from toolkit.metrics.parts.consistency import POSE_DOF, nees_over_time
-from toolkit.models.gating import chi2_bound
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time
 from toolkit.progress import SILENT, Progress
 from toolkit.registry import EstimatorEntry, cannot_import, discover, find
 from toolkit.sequence import Sequence
@@ -319,8 +318,7 @@ def inconsistency(nees_means: list[float]) -> str:
 
     The band is for poses of a run that share one error, the worst case, and holds 99.9 % of consistent estimators.
     """
-    dof = POSE_DOF * len(nees_means)
-    low, high = (float(chi2_bound(dof, p)) / dof for p in (0.5 * _FALSE_ALARM, 1.0 - 0.5 * _FALSE_ALARM))
+    low, high = nees_band(POSE_DOF, len(nees_means), 1.0 - _FALSE_ALARM)
     mean = float(np.mean(nees_means))
     if low <= mean <= high:
         return ""

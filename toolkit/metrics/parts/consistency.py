@@ -147,12 +147,12 @@ class Nis:
         return chi2_bound(dof, tail) / dof, chi2_bound(dof, 1.0 - tail) / dof
 
 
-def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:
-    """Return the two-sided 95 % band of the mean over ``runs`` of a NEES over its degrees of freedom.
+def nees_band(dof: float, runs: int = 1, probability: float = BAND_PROBABILITY) -> tuple[float, float]:
+    """Return the two-sided band of a probability of the mean over ``runs`` of a NEES over its degrees of freedom.
 
     The sum of N independent NEES is chi-square with N times their degrees of freedom.
     """
-    tail = (1.0 - BAND_PROBABILITY) / 2.0
+    tail = (1.0 - probability) / 2.0
     low, high = (float(chi2_bound(dof * runs, p)) / (dof * runs) for p in (tail, 1.0 - tail))
     return low, high
 
