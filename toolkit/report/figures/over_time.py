@@ -31,15 +31,12 @@ from toolkit.report.figures import style
 from toolkit.report.figures.style import Entry, NamedFigure
 from toolkit.report.text import number
 
-# A heading larger than this many times that of the middle row leaves its panel, which has no logarithmic axis.
-_FAR_FROM_MIDDLE = 10.0
-# Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
-_LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _SIGMAS = 3.0
 # An axis shows all of the error, and of the band at most this many times the largest error.
 _BAND_REACH = 6.0
 _BAND_ALPHA = 0.16
-_LEAST = 1e-3  # m, deg
+# Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
+_LEAST = 1e-3
 
 
 def draw_errors(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -53,19 +50,17 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     figure, kind = style.new_figure(4.4), curves.kind
     position, heading = figure.subplots(2, 1, sharex=True)
     position_m = {row: _known(errors.position_m) for row, errors in curves.of_rows.items()}
-    heading_deg = {row: _known(errors.heading_deg) for row, errors in curves.of_rows.items()}
-    for row, errors in curves.of_rows.items():
-        width = style.width_of(comparison, row.estimator)
-        stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
-        position.plot(errors.t_s, position_m[row], linewidth=width, **stroke)
-        heading.plot(errors.t_s, _without_wraps(heading_deg[row]), linewidth=width, **stroke)
+    heading_deg = {row: np.abs(_known(errors.heading_deg)) for row, errors in curves.of_rows.items()}
+    for axes, unit, of_rows in ((position, "m", position_m), (heading, "deg", heading_deg)):
+        for row, sizes in of_rows.items():
+            stroke = style.stroke_of(comparison.estimators, row.estimator, shown_as(row))
+            width = style.width_of(comparison, row.estimator)
+            axes.plot(curves.of_rows[row].t_s, sizes, linewidth=width, **stroke)
+        _scale(axes, of_rows, unit)
     style.label_axes(position, f"{comparison.name}: position {kind.what}, {kind.placing}", "", "position [m]")
     style.label_axes(heading, f"heading {kind.what}", "time [s]", "heading [deg]")
-    rms_m = {row: rmse(values) for row, values in position_m.items()}
-    _limit_position(position, position_m, rms_m)
-    _limit_heading(heading, heading_deg)
     figure.align_ylabels()
-    told = {row.estimator: f"{number(value)} m" for row, value in rms_m.items()}
+    told = {row.estimator: f"{number(rmse(sizes))} m" for row, sizes in position_m.items()}
     entries = style.entries_of(comparison, [(row.estimator, shown_as(row)) for row in curves.of_rows])
     style.legend_below(figure, [entry._replace(label=f"{entry.label}: {told[entry.label]}") for entry in entries])
     caption = f"Position and heading {kind.what} over time, in the legend the RMS of the position, of the final output"
@@ -76,37 +71,16 @@ def _known(values: Numbers) -> Array:
     return np.array(values, dtype=float)
 
 
-def _limit_position(axes: Axes, position_m: dict[Row, Array], rms_m: dict[Row, float]) -> None:
-    """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them."""
-    largest = {row: float(np.nanmax(values)) for row, values in position_m.items()}
+def _scale(axes: Axes, of_rows: dict[Row, Array], unit: str) -> None:
+    """Keep an axis to what the runs that are ok need, so that a diverged one does not flatten them."""
+    largest = {row: float(np.nanmax(sizes)) for row, sizes in of_rows.items()}
     good = [size for row, size in largest.items() if row.status == "ok"] or largest.values()
-    reach = 1.05 * max(*good, _LEAST_POSITION_M)
-    style.scale_errors(axes, [size for row, size in rms_m.items() if row.status == "ok"], reach)
-    _say_who_leaves(axes, largest, reach, "m")
-
-
-def _limit_heading(axes: Axes, heading_deg: dict[Row, Array]) -> None:
-    largest = {row: float(np.nanmax(np.abs(values))) for row, values in heading_deg.items()}
-    sizes = sorted(size for row, size in largest.items() if row.status == "ok") or sorted(largest.values())
-    middle = max(sizes[(len(sizes) - 1) // 2], _LEAST_HEADING_DEG)
-    reach = 1.05 * max(size for size in (*sizes, middle) if size <= _FAR_FROM_MIDDLE * middle)
-    low, high = axes.get_ylim()
-    axes.set_ylim(max(min(low, -_LEAST_HEADING_DEG), -reach), min(max(high, _LEAST_HEADING_DEG), reach))
-    _say_who_leaves(axes, largest, reach, "deg")
-
-
-def _say_who_leaves(axes: Axes, largest: dict[Row, float], reach: float, unit: str) -> None:
+    reach = 1.05 * max(*good, _LEAST)
+    style.scale_errors(axes, [rmse(sizes) for row, sizes in of_rows.items() if row.status == "ok"], reach)
     beyond = {row.estimator: size for row, size in largest.items() if size > 1.01 * reach}
     if beyond:
         listed = ", ".join(f"{name} (to {size:.3g} {unit})" for name, size in beyond.items())
         style.annotate(axes, f"beyond it: {listed}")
-
-
-def _without_wraps(heading_deg: Array) -> Array:
-    """Break the line where the angle steps over +-180 degrees, so that no vertical stroke is drawn."""
-    broken = heading_deg.copy()
-    broken[1:][np.abs(np.diff(heading_deg)) > 180.0] = np.nan
-    return broken
 
 
 def draw_telling_components(comparison: Comparison) -> Iterator[NamedFigure]:

@@ -175,17 +175,13 @@ def say(axes: Axes, text: str) -> None:
 
 
 def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entries: Sequence[Entry]) -> None:
-    """Give the figure its title, its vertical axis and its legend, which stands in a spare panel where there is one."""
+    """Give the figure its title, its vertical axis and its legend, and say which panel has nothing to show."""
     for axes in panels.values():
         if not axes.has_data():
             say(axes, "nothing to show")
     add_title(figure, title)
     figure.supylabel(what, fontsize=LABEL_PT)
-    spare = figure.axes[len(panels) :]
-    if spare:
-        legend(spare[0], entries, columns=1, loc="center left").set_in_layout(False)
-    else:
-        legend_below(figure, entries)
+    legend_below(figure, entries)
 
 
 def scale_by_decades(axes: Axes, low: float, high: float, which: Literal["x", "y"] = "y") -> None:
