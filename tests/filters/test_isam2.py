@@ -30,27 +30,20 @@ MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 ROUNDING = 1e-12
 
 
-def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` are behind it."""
+def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named_and_the_tree_goes_on():
+    """Two of the four that are seen from a pose that is held are behind it."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    values.insert(X(0), gtsam.Pose3())
-    values.insert(V(0), np.zeros(3))
-    values.insert(B(0), gtsam.imuBias.ConstantBias())
+    MOTION.insert(values, Estimate(0, np.eye(4), v_world=np.zeros(3), bias=np.zeros(6)), 0)
     graph.addPriorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1))
     graph.addPriorVector(V(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))
     graph.addPriorConstantBias(B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1))
     calibration = gtsam.Cal3_S2Stereo(400.0, 400.0, 0.0, 300.0, 200.0, 0.1)
-    for i in range(landmarks):
-        depth_m = 4.0 if i < landmarks - unseen else -4.0
+    for i, depth_m in enumerate((4.0, 4.0, -4.0, -4.0)):
         values.insert(L(i), np.array([0.1 * i, 0.0, depth_m]))
         measured = gtsam.StereoPoint2(300.0 + 10.0 * i, 290.0 + 10.0 * i, 200.0)
         graph.add(gtsam.GenericStereoFactor3D(measured, gtsam.noiseModel.Unit.Create(3), X(0), L(i), calibration))
-    return graph, values
-
-
-def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named_and_the_tree_goes_on():
     tree = Isam2Tree(MOTION, baseline_m=0.1)
-    log, dropped = tree.add(*pose_and_landmarks(landmarks=4, unseen=2), [X(0), V(0), B(0)])
+    log, dropped = tree.add(graph, values, [X(0), V(0), B(0)])
     assert len(log) == 2
     assert dropped == {2, 3}
     assert all("indeterminate and was dropped" in line for line in log)

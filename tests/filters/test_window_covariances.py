@@ -103,10 +103,9 @@ def test_states_that_leave_together_leave_as_one_by_one(monkeypatch):
     np.testing.assert_array_equal(together.sightings.point, one_by_one.sightings.point)
 
 
-@pytest.fixture
-def refusing_once(monkeypatch):
-    """Have the smoother refuse a window of eight states, once; return the list of what was refused."""
-    solved, refused = smart.solve_window, []
+def test_a_window_started_afresh_leaves_no_state_without_a_covariance(monkeypatch):
+    """After a window of eight states was refused, once."""
+    sequence, solved, refused = simulate(SCENARIOS[2], 3), smart.solve_window, []
 
     def solve_window(window, camera, ending):
         if len(window.keys) == 8 and not refused:
@@ -115,11 +114,6 @@ def refusing_once(monkeypatch):
         return solved(window, camera, ending)
 
     monkeypatch.setattr(smart, "solve_window", solve_window)
-    return refused
-
-
-def test_a_window_started_afresh_leaves_no_state_without_a_covariance(refusing_once):
-    sequence = simulate(SCENARIOS[2], 3)
     final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
-    assert refusing_once
+    assert refused
     assert np.linalg.eigvalsh(final.cov).min() > 0.0

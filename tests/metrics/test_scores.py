@@ -114,24 +114,13 @@ def score(evaluation):
 """
 
 
-@pytest.fixture
-def found_anew():
-    """Forget which metric files were found, before and after the test."""
-    metrics._found.cache_clear()
-    yield
-    metrics._found.cache_clear()
-
-
-def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case, found_anew):
-    (tmp_path / "dropped_in.py").write_text(DROPPED_IN)
+def test_a_dropped_in_file_is_a_metric_whose_key_no_other_file_may_declare(tmp_path, monkeypatch, case):
+    monkeypatch.setattr(metrics, "_found", metrics._found.__wrapped__)
     monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
+    (tmp_path / "dropped_in.py").write_text(DROPPED_IN)
     assert list(metrics.describe())[-1] == "answer"
     assert case().values["answer"] == 42.0
-
-
-def test_two_files_cannot_declare_the_same_key(tmp_path, monkeypatch, found_anew):
     (tmp_path / "again.py").write_text(DROPPED_IN.replace('"answer"', '"pairs"'))
-    monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
     with pytest.raises(
         ExtensionError, match=r"(and \S+again\.py|again\.py and \S+): both declare pairs; rename it in one"
     ):

@@ -11,7 +11,7 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.errors import OutputError
-from toolkit.frontend.cameras import Camera, Distortion
+from toolkit.frontend.cameras import Distortion
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
@@ -44,18 +44,13 @@ def first_hit(panels: tuple[Panel, ...], origin: Array, towards: Array) -> Array
     return hit
 
 
-def pixel_of(point_cam: Array, camera: Camera) -> Array:
-    """Return where a camera shows a point (3,), by OpenCV's own projection."""
-    project = cv2.fisheye.projectPoints if camera.distortion == "equidistant" else cv2.projectPoints
-    return np.ravel(project(point_cam.reshape(1, 1, 3), np.zeros(3), np.zeros(3), camera.K, camera.coefficients)[0])
-
-
 @pytest.mark.parametrize("model", ["none", "radtan", "equidistant"])
 def test_what_two_cameras_see_at_two_times_are_the_same_points(model: Distortion) -> None:
     """A point seen in one image has its grey value where the other shows it, unless something stands before it."""
     pair, panels = filming._Pair.of(FLIGHT, model), furnished_hall().at(0.0)
     poses = pose_at(2.0), pose_at(2.1) @ se3_inverse(FLIGHT.rig.T_imu_cam) @ pair.T_imu_cams[1]
-    eye = Eye.of(pair.camera)
+    eye, camera = Eye.of(pair.camera), pair.camera
+    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
     images = [light(panels, eye, pose) for pose in poses]
     rng, differences, hidden = np.random.default_rng(1), [], 0
     for column, row in zip(rng.integers(100, 650, 160), rng.integers(60, 420, 160), strict=True):
@@ -65,7 +60,8 @@ def test_what_two_cameras_see_at_two_times_are_the_same_points(model: Distortion
         if np.linalg.norm(first_hit(panels, poses[1][:3, 3], towards) - point) > 0.01:
             hidden += 1
             continue
-        u, v = pixel_of(poses[1][:3, :3].T @ towards, pair.camera)
+        place = (poses[1][:3, :3].T @ towards).reshape(1, 1, 3), np.zeros(3), np.zeros(3)
+        u, v = np.ravel(project(*place, camera.K, camera.coefficients)[0])
         if 1.0 < u < 750.0 and 1.0 < v < 478.0:
             shown = cv2.remap(images[1], np.float32([[u]]), np.float32([[v]]), cv2.INTER_LINEAR)
             differences.append(float(shown[0, 0]) - float(images[0][row, column]))
