@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from filters.kalman.joint import JointBelief
-from tests.filters.conftest import gauge
+from tests.filters.conftest import assert_covariances_agree, gauge
 from tests.models.conftest import numerical_jacobian
+from toolkit.datasets import load_sequence
 from toolkit.geometry import se3_exp
+from toolkit.initialization import start_from_measurements
 from toolkit.measurements import Packet, TwistChangeNoise
-from toolkit.models.factors import joint_cov
+from toolkit.models.factors import joint_cov, ordering_of
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief, predicted
 from toolkit.motion_samples import NoSamples
@@ -99,6 +101,40 @@ def test_a_prediction_is_what_the_graph_of_the_same_increment_says(kind):
     sigma = np.sqrt(np.diag(after.cov))
     # GTSAM's factor works about the end's residual: the two covariances agree to the condition of Q.
     assert np.abs((cov - after.cov) / np.outer(sigma, sigma)).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["twist", "imu"])
+def test_filter_and_factors_agree_on_every_interval(kind):
+    """Of kitti00 by GTSAM's CombinedImuFactor, and of the drive by its twists.
+
+    An implicit function links the two: whitened residuals vanish at the prediction, so that of their Jacobians (A, B)
+    by start and end -B^-1 A is the transition and B^-1 B^-T its noise.
+    """
+    sequence = load_sequence("kitti00") if kind == "imu" else simulate(DRIVE, 0)
+    prior = sequence.prior or start_from_measurements(sequence)
+    model, compared = motion_model(sequence.noise, sequence.gravity_world), 0
+    start = model.initial_belief(prior)
+    for k, motion in ((packet.index, packet.motion) for packet in sequence.packets() if packet.motion is not None):
+        increment, values = model.integrate(motion, prior.bias), gtsam.Values()
+        step = increment.predict(start)
+        end = start.predicted(step)
+        by_state = []
+        for at, state in ((k - 1, start), (k, end)):
+            model.insert(values, state.estimate(0), at)
+            by_state.append(np.eye(model.layout.size))
+            if model.layout.velocity is not None:  # in the world for GTSAM
+                by_state[-1][6:9, 6:9] = state.T_world_imu[:3, :3]
+        keys = ordering_of([*model.keys(k - 1), *model.keys(k)])
+        whole, residual = increment.factors(k).linearize(values).jacobian(keys)
+        by_start, by_end = (part @ turned for part, turned in zip(np.hsplit(whole, 2), by_state, strict=True))
+        root = np.linalg.inv(by_end)
+        # 1e-9 is the promise of docs; positions up to the drive's extent of 300 m leave twelve digits.
+        np.testing.assert_allclose(root @ residual, 0.0, atol=1e-9)
+        np.testing.assert_allclose(-root @ by_start, step.transition, rtol=0.0, atol=1e-9)
+        # Variances of rotation, velocity and bias differ by many orders: compare correlations.
+        assert_covariances_agree(root @ root.T, step.noise, 1e-9)
+        start, compared = end, compared + 1
+    assert compared == sequence.frame_count - 1
 
 
 def turning(sequence: Sequence) -> Belief:
