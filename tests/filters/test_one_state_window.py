@@ -1,6 +1,7 @@
 """The window at its one end: the newest state alone is a joint Kalman filter, and of `sliding-window` `iekf` (4 s).
 
-At its other end, with all states in it, it is the batch: test_infinite_lag.py.
+Where the problem is linear it is the batch: test_joint_ekf_equals_batch.py. At its other end, with all states in it, it
+is the batch everywhere: test_infinite_lag.py.
 """
 
 from dataclasses import replace
@@ -9,43 +10,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from filters import fixed_lag, iekf, sliding_window
-from tests.filters.conftest import BatchAtTruth, assert_covariances_agree, linear, recorded, short
+from filters import iekf, sliding_window
+from tests.filters.conftest import short
 from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.settings import POLICIES, Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-SCENARIOS = [linear(DRIVE, 2.0, tracks=20), linear(FLIGHT, 0.8, tracks=20)]
 ONE_STATE = Window(most_states=1)
-
-
-def last_answer(recording, build, options):
-    """Return the causal answer of a window of one state at the last frame of a recording."""
-    setup = replace(recording.setup, settings=Settings(window=ONE_STATE), options=options)
-    estimator = build(setup)
-    return [estimator.step(packet) for packet in recording.sequence.packets()][-1]
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
-@pytest.mark.parametrize(
-    ("build", "options"),
-    [
-        (fixed_lag.build, {}),
-        *((sliding_window.build, {"marginals": kind}) for kind in sliding_window.OPTIONS["marginals"]),
-    ],
-    ids=["first", *sliding_window.OPTIONS["marginals"]],
-)
-def test_on_a_linear_problem_one_state_is_enough_to_answer_as_the_batch(scenario, build, options):
-    """As a joint Kalman filter: wherever it linearises, forgetting loses nothing. Errors and bounds are as there."""
-    recording = recorded(scenario, 1e-4)
-    last = recording.sequence.frame_count - 1
-    mean, _ = BatchAtTruth(recording, recording.track_ids).state(last)
-    assert np.abs(recording.error_of(last_answer(recording, build, options), last) - mean).max() < 1e-8
-    assert np.abs(mean).max() > 1e-6, "there was something to agree on"
-    exact = recorded(scenario, 1e-7)
-    _, cov = BatchAtTruth(exact, exact.track_ids).state(last)
-    assert_covariances_agree(last_answer(exact, build, options).cov, cov, 1e-5)
 
 
 @pytest.fixture(scope="module")
