@@ -159,14 +159,13 @@ def short(scenario: Scenario, duration_s: float, tracks: int | None = None, seed
     return simulate(replace(scenario, duration_s=duration_s, camera=camera), seed)
 
 
-def linear(scenario: Scenario, duration_s: float, tracks: int = 30) -> Scenario:
+def linear(scenario: Scenario, duration_s: float) -> Scenario:
     """Return a scenario that is linear in effect where its errors are drawn small: short, of few tracks.
 
     Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
     """
     motion = replace(scenario.motion, rate_hz=1000.0) if isinstance(scenario.motion, Imu) else scenario.motion
-    camera = replace(scenario.camera, max_tracks=tracks)
-    return replace(scenario, duration_s=duration_s, motion=motion, camera=camera)
+    return replace(scenario, duration_s=duration_s, motion=motion, camera=replace(scenario.camera, max_tracks=30))
 
 
 def setup_of(sequence: Sequence, settings: Settings = DEFAULTS) -> Setup:
