@@ -96,6 +96,11 @@ def so3_log(rotation: Array) -> Array:
     return factor[..., None] * vector
 
 
+def so3_angle(rotation: Array) -> Array:
+    """Return the angles (...,) rad, 0 to pi, of rotations (..., 3, 3)."""
+    return np.asarray(np.linalg.norm(so3_log(rotation), axis=-1))
+
+
 def so3_left_jacobian(phi: Array) -> Array:
     """Return J_l (..., 3, 3) with exp(phi + d) = exp(J_l d) exp(phi) (Barfoot, eq. 7.37)."""
     phi = np.asarray(phi, dtype=float)

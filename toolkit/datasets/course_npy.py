@@ -37,7 +37,7 @@ from toolkit.frontend import (
     rectified,
 )
 from toolkit.frontend.cache import ImageSpool
-from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_angle
 from toolkit.measurements import StereoRig
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.motion_samples import TwistSamples
@@ -129,7 +129,7 @@ def _parts(path: Path) -> _Parts:
     v_mps, w_radps = (fields.array(key, t_ns.size, 3) for key in ("v_t", "w_t"))
     matrices = (camera_matrix(path, key, fields.constant(key, 3, 3)) for key in ("K_l", "K_r"))
     left, right = (fields.rigid(key) for key in ("extL_T_imu", "extR_T_imu"))
-    turned_rad = float(np.linalg.norm(so3_log(left[:3, :3].T @ right[:3, :3])))
+    turned_rad = float(so3_angle(left[:3, :3].T @ right[:3, :3]))
     turned = f"{np.rad2deg(turned_rad):.2f} deg"
     if turned_rad > _MOST_TURNED_RAD:
         raise DataError(f"{path}: extL_T_imu and extR_T_imu are turned by {turned}: no pair; rectify the recording")

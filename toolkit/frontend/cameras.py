@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, so3_angle
 from toolkit.measurements import StereoRig
 
 Image = npt.NDArray[np.uint8]
@@ -123,7 +123,7 @@ def _check_pair(left: Camera, right: Camera, T_right_left: Array, where: str) ->
     if left.size_px != right.size_px:
         sizes = " and ".join(f"{width}x{height}" for width, height in (left.size_px, right.size_px))
         raise DataError(f"{where}: the cameras have images of {sizes} px, and a pair needs one size; record both alike")
-    turned = float(np.arccos(np.clip(0.5 * (np.trace(T_right_left[:3, :3]) - 1.0), -1.0, 1.0)))
+    turned = float(so3_angle(T_right_left[:3, :3]))
     if turned > _MOST_TURNED_RAD:
         raise DataError(
             f"{where}: the cameras look {np.rad2deg(turned):.0f} deg apart, and a stereo pair looks the same way; "

@@ -29,6 +29,7 @@ from toolkit.geometry import (
     quaternion_from_rotation,
     se3,
     se3_inverse,
+    so3_angle,
     so3_exp,
     so3_log,
     transposed,
@@ -311,7 +312,7 @@ def _turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> A
     turn, _ = nearest_rotation(measured.T @ rates)
     as_given, otherwise = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
     is_other = otherwise > _TURNED_CORRELATION and 1.0 - otherwise < _UNEXPLAINED_SHARE * (1.0 - as_given)
-    return turn if is_other and _angle_rad(turn) > _OTHER_AXES_RAD else None
+    return turn if is_other and so3_angle(turn) > _OTHER_AXES_RAD else None
 
 
 def stamps_among(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
@@ -347,7 +348,7 @@ class BodyTurn(NamedTuple):
 
     @property
     def angle_rad(self) -> float:
-        return float(_angle_rad(self.R_truth_body))
+        return float(so3_angle(self.R_truth_body))
 
     @property
     def is_told(self) -> bool:
@@ -446,7 +447,7 @@ def other_axes(R_reference_body: Array) -> str:
         signed = [f"{sign}{_NAMES[row]}" for sign, row in zip(signs, largest, strict=True)]
         along = f"its x, y and z point along the truth's {signed[0]}, {signed[1]} and {signed[2]}"
     else:
-        along = f"turned by {float(np.degrees(_angle_rad(R_reference_body))):.0f} deg"
+        along = f"turned by {float(np.degrees(so3_angle(R_reference_body))):.0f} deg"
     x, y, z, w = quaternion_from_rotation(R_reference_body).tolist()
     quaternion = f"x y z w {x:.3f} {y:.3f} {z:.3f} {w:.3f}"
     return f"{along}; multiply each pose by the inverse of the extrinsic (about {quaternion}) from the right"
@@ -595,14 +596,10 @@ class _Fit:
     def turned_rad(self, exchange: Exchange) -> float:
         """Return the median angle between the truth's orientations and those under an exchange."""
         aligned = nearest_rotation(self._covariance @ exchange.matrix.T)[0] @ exchange.reread(self.estimate)[:, :3, :3]
-        return float(np.median(_angle_rad(aligned @ transposed(self.truth[:, :3, :3]))))
+        return float(np.median(so3_angle(aligned @ transposed(self.truth[:, :3, :3]))))
 
 
 def _scatter_rad(rotations: Array) -> tuple[Array, float]:
     """Return the rotation (3, 3) nearest to the mean of rotations (n, 3, 3), and their median angle from it."""
     mean, _ = nearest_rotation(rotations.mean(axis=0))
-    return mean, float(np.median(_angle_rad(mean.T @ rotations)))
-
-
-def _angle_rad(rotations: Array) -> Array:
-    return np.asarray(np.linalg.norm(so3_log(rotations), axis=-1))
+    return mean, float(np.median(so3_angle(mean.T @ rotations)))

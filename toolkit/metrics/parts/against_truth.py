@@ -26,7 +26,7 @@ from toolkit.geometry import (
     nearest_rotation,
     se3,
     se3_inverse,
-    so3_log,
+    so3_angle,
 )
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.sequence import Truth
@@ -286,7 +286,7 @@ def lengths(vectors: Array) -> Array:
 
 def angles_deg(rotations: Array) -> Array:
     """Return the rotation angle (...,) in degrees, 0 to 180, of rotations (..., 3, 3)."""
-    return np.degrees(lengths(so3_log(rotations)))
+    return np.degrees(so3_angle(rotations))
 
 
 def rmse(errors: Array) -> float:
