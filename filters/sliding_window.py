@@ -435,8 +435,6 @@ class SlidingWindow:
         """Take Gauss-Newton steps, halved until the error falls, until one would gain little; say whether one did."""
         tied = self._tied()
         tried = Tried.of(self._window, self._camera, self._left, tied)
-        if not np.isfinite(tried.error):
-            raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
         for _ in range(_MOST_STEPS):
             equations, window = Equations.of(tried, self._left, tied), self._window
             states, points, gain = equations.solved()

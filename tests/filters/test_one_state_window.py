@@ -62,3 +62,14 @@ def test_only_a_window_that_was_not_solved_to_its_minimum_is_told_once(most_step
 def test_a_gaussian_that_is_not_determined_cannot_lose_its_cross_covariances_and_says_so():
     with pytest.raises(EstimatorError, match=r"does not determine .* set cross_covariances to true"):
         sliding_window.without_cross_covariances(np.diag([1.0, 1.0, 0.0]), np.zeros(3), size=1)
+
+
+def test_a_window_that_does_not_determine_its_states_says_so(monkeypatch):
+    def refusing(matrix):
+        raise np.linalg.LinAlgError("5-th leading minor")
+
+    monkeypatch.setattr(sliding_window, "lower_factor", refusing)
+    sequence = short(FLIGHT, 0.2, 20, 3)
+    done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
+    assert done.status == "failed"
+    assert any("the window does not determine its states (5-th leading minor)" in line for line in done.log)
