@@ -291,8 +291,3 @@ def test_every_exit_status_is_in_the_docs() -> None:
         kinds |= {one for kind in kinds for one in kind.__subclasses__()}
     of_a_command = {cli._DEFECT, cli._SYSTEM, cli._INTERRUPTED, cli._READER_GONE}
     assert [*listed] == sorted({0, 1} | {kind.exit_status for kind in kinds} | of_a_command)
-
-
-def test_pictures_are_small() -> None:
-    for picture in (PROJECT / "docs/images").iterdir():
-        assert picture.stat().st_size <= 150_000, picture.name

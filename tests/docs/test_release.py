@@ -56,9 +56,10 @@ def test_every_page_and_notebook_has_its_place_in_the_sites_menu() -> None:
     assert not [name for name in named if not (PROJECT / name).exists()]
 
 
-def test_every_picture_is_shown_and_can_be_made_again() -> None:
+def test_every_picture_is_small_and_shown_and_can_be_made_again() -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in [*DOCS.glob("*.md"), PROJECT / "README.md"])
     made = runpy.run_path(str(DOCS / "site/pictures.py"))["FIGURES"]
-    pictures = {picture.name for picture in (DOCS / "images").iterdir()}
+    pictures = {picture.name: picture.stat().st_size for picture in (DOCS / "images").iterdir()}
+    assert max(pictures.values()) <= 150_000
     assert {name for name in pictures if f"images/{name})" not in pages} == set()
     assert {name for name in pictures if name.endswith(".png")} == set(made)

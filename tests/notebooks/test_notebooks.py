@@ -50,7 +50,9 @@ def test_what_it_imports_of_the_toolkit_is_there(source: Path) -> None:
 
 
 @each
-def test_what_is_kept_was_executed_without_an_error_and_is_small(source: Path) -> None:
+def test_what_is_kept_was_executed_without_an_error_and_is_small_and_of_no_machine(
+    source: Path, machine_paths: Callable[[str], list[str]]
+) -> None:
     kept = source.with_suffix(".ipynb")
     notebook = nbformat.read(kept, 4)
     nbformat.validate(notebook)
@@ -58,11 +60,7 @@ def test_what_is_kept_was_executed_without_an_error_and_is_small(source: Path) -
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     assert not [o for cell in code for o in cell.outputs if o.output_type == "error" or o.get("name") == "stderr"]
     assert kept.stat().st_size <= MOST_BYTES
-
-
-@each
-def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[str], list[str]]) -> None:
-    text = source.with_suffix(".ipynb").read_text(encoding="utf-8")
+    text = kept.read_text(encoding="utf-8")
     assert machine_paths(text) == []
     places = {Path.home(), Path(tempfile.gettempdir()), ROOT} - {Path("/")}  # the home of a user who has none
     assert not [place for place in places if f"{place}{os.sep}" in text]

@@ -69,9 +69,8 @@ def test_the_command_prints_the_card_and_writes_it(tmp_path: Path, capsys: pytes
     assert all(line in printed for line in record.words)
 
 
-def compared(sequence: Sequence, card: bool = True) -> Comparison:
-    settings = Settings(card=card)
-    return run(Plan((sequence,), ("dead-reckoning",), settings=settings, workers=1))[0]
+def compared(sequence: Sequence) -> Comparison:
+    return run(Plan((sequence,), ("dead-reckoning",), settings=Settings(card=True), workers=1))[0]
 
 
 def test_a_report_and_its_page_have_the_card_on_request(walking: Sequence, tmp_path: Path) -> None:

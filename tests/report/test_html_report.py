@@ -113,17 +113,6 @@ def test_the_running_median_ignores_a_single_spike_and_what_is_missing() -> None
     assert running_median([None, None]) == [None, None]
 
 
-def _contest(winner: str | None, leaders: tuple[str, ...]) -> ContestRecord:
-    rivals = (
-        Rival(estimator="one", output="causal", value=3.0, ratio=None, interval=None),
-        Rival(estimator="other", output="causal", value=4.0, ratio=1.3, interval=(0.9, 1.8)),
-    )
-    by = "stretches of the path"
-    return ContestRecord(
-        question="accuracy in the end", metric="ate_yaw_m", by=by, rivals=rivals, leaders=leaders, winner=winner
-    )
-
-
 @pytest.mark.parametrize(
     ("winner", "leaders", "mark", "answer", "row"),
     [
@@ -135,8 +124,12 @@ def _contest(winner: str | None, leaders: tuple[str, ...]) -> ContestRecord:
 def test_a_card_names_whom_the_contest_does_and_a_marked_row_wins_nothing(
     winner: str | None, leaders: tuple[str, ...], mark: str, answer: str, row: str | None
 ) -> None:
+    first = Rival(estimator="one", output="causal", value=3.0, ratio=None, interval=None)
+    other = Rival(estimator="other", output="causal", value=4.0, ratio=1.3, interval=(0.9, 1.8))
+    ranked = {"metric": "ate_yaw_m", "by": "stretches of the path", "rivals": (first, other)}
+    contest = ContestRecord(question="accuracy in the end", leaders=leaders, winner=winner, **ranked)
     rows = [{"id": name, "estimator": name, "output": "both", "mark": mark} for name in ("one", "other")]
-    card = highlights([_contest(winner, leaders)], rows, "one run")[0]
+    card = highlights([contest], rows, "one run")[0]
     assert (card["answer"], card["row"]) == (answer, row)
     assert "ATE yaw 3.00" in card["detail"]
 

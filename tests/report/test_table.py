@@ -8,7 +8,6 @@ import pytest
 
 from tests.report.conftest import rescored
 from toolkit.audit import Finding
-from toolkit.errors import VislamError
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.pipeline import Plan, run
 from toolkit.measurements import NS_PER_S
@@ -81,11 +80,6 @@ def test_a_real_drive_leads_with_drift_and_the_error_that_keeps_the_vertical(com
     assert "kitti_t_percent" not in usual
     assert set(usual) - set(of_real) <= {"rpe_100m_percent"}
     assert "kitti_t_percent" in {metric.key for metric in explained_metrics(real)}
-
-
-def test_an_unknown_column_is_answered_with_the_nearest(comparison: Comparison) -> None:
-    with pytest.raises(VislamError, match=r"no metric is called ate_se3; did you mean ate_se3_m\?"):
-        comparison_table(comparison, ("ate_se3",))
 
 
 @pytest.mark.parametrize(
