@@ -5,16 +5,17 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 
+from tests.datasets.test_course_npy import course_dict
 from tests.datasets.test_own_tables import written
 from toolkit.datasets import vislam_recording
 from toolkit.datasets.trajectories import FORMATS
 from toolkit.estimate import Trajectory
-from toolkit.geometry import se3
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -34,15 +35,15 @@ def valid_files(workshop: Path) -> dict[str, Files]:
     few = {"max_tracks": 12}
     drive = simulate(replace(DRIVE, duration_s=1.5, camera=replace(DRIVE.camera, **few)), 0)
     flight = simulate(replace(FLIGHT, duration_s=0.5, camera=replace(FLIGHT.camera, **few)), 0)
-    saved = {}
+    saved, now = {}, course_dict(drive, "inverted, camera axes optical", mismatched=0.0)
     for sequence in (drive, flight):
         vislam_recording.save(sequence, workshop / sequence.name)
         saved[f"vislam {sequence.name}"] = _contents(workshop / sequence.name)
     return {
         **saved,
-        **_course(drive),
+        **_course(drive, now),
         "own tables": _contents(written(flight, workshop / "own")),
-        "utias": _utias(drive),
+        "utias": _utias(drive, now),
         "openvins": openvins_files(flight),
         "lean euroc": _lean(flight),
     }
@@ -52,41 +53,27 @@ def _contents(folder: Path) -> Files:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def _course(sequence: Sequence) -> dict[str, Files]:
+def _course(sequence: Sequence, now: dict[str, Any]) -> dict[str, Files]:
     """Return a recording as the course writes it now and before."""
-    rig, stamps, count = sequence.rig, sequence.frames_t_ns / 1e9, sequence.frame_count
-    v, w = np.split(sequence.motion.values[:count], 2, axis=1)
-    T_imu_right = rig.T_imu_cam @ se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
-    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
-    features, b, T_imu_cam = _corners(sequence), np.array(rig.baseline_m), rig.T_imu_cam
-    before = {"time_stamps": stamps, "features": features, "linear_velocity": v.T, "angular_velocity": w.T}
-    now = {"v_t": v, "w_t": w, "timestamps": stamps, "features": features, "K_l": K, "K_r": K}
+    before = {"time_stamps": now["timestamps"], "features": now["features"], "K": now["K_l"]}
+    before |= {"linear_velocity": now["v_t"].T, "angular_velocity": now["w_t"].T}
     npz, npy = io.BytesIO(), io.BytesIO()
-    np.savez(npz, **before, K=K, b=b, imu_T_cam=T_imu_cam)
-    np.save(npy, np.array({**now, "extL_T_imu": T_imu_cam, "extR_T_imu": T_imu_right}, dtype=object), allow_pickle=True)
+    np.savez(npz, **before, b=np.array(sequence.rig.baseline_m), imu_T_cam=now["extL_T_imu"])
+    np.save(npy, np.array(now, dtype=object), allow_pickle=True)
     return {"course": {"": npz.getvalue()}, "course npy": {"": npy.getvalue()}}
 
 
-def _corners(sequence: Sequence) -> np.ndarray:
-    """Return features (4, M, K) of uL, vL, uR, vR, -1 where a track is not seen."""
-    seen = sequence.observations
-    track = np.unique(seen.track_id, return_inverse=True)[1]
-    features = np.full((4, track.max() + 1, sequence.frame_count), -1.0)
-    features[:, track, seen.frame] = seen.uv_px[:, [0, 2, 1, 2]].T
-    return features
-
-
-def _utias(sequence: Sequence) -> Files:
-    rig, count, truth = sequence.rig, sequence.frame_count, sequence.truth
+def _utias(sequence: Sequence, now: dict[str, Any]) -> Files:
+    rig, truth = sequence.rig, sequence.truth
     T_cam_imu = np.linalg.inv(rig.T_imu_cam)
     out = io.BytesIO()
     variables = {
-        "y_k_j": np.moveaxis(_corners(sequence), 1, 2),
-        "t": sequence.frames_t_ns[None] / 1e9,
-        "v_vk_vk_i": sequence.motion.values[:count, :3].T,
-        "w_vk_vk_i": sequence.motion.values[:count, 3:].T,
+        "y_k_j": np.moveaxis(now["features"], 1, 2),
+        "t": now["timestamps"][None],
+        "v_vk_vk_i": now["v_t"].T,
+        "w_vk_vk_i": now["w_t"].T,
         "r_i_vk_i": truth.T_world_imu[:, :3, 3].T,
-        "theta_vk_i": np.zeros((3, count)),
+        "theta_vk_i": np.zeros((3, sequence.frame_count)),
         "C_c_v": T_cam_imu[:3, :3],
         "rho_v_c_v": rig.T_imu_cam[:3, 3:],
         **{"fu": rig.fx_px, "fv": rig.fy_px, "cu": rig.cx_px, "cv": rig.cy_px, "b": rig.baseline_m},
