@@ -138,10 +138,8 @@ def _layout(path: Path) -> _Layout | None:
 def _whole(path: Path) -> _Layout:
     layout = _layout(path)
     if layout is None:
-        raise DataError(
-            f"{path}: no image_0 and image_1, image_2 and image_3, image_l and image_r, or image_00/data and "
-            f"image_01/data, or image_02 and image_03, with images; {UNPACK_IMAGES}"
-        )
+        folders = ", ".join(" and ".join(pair) for pair in _FOLDERS)
+        raise DataError(f"{path}: no pair of folders, {folders}, with images; {UNPACK_IMAGES}")
     check_both_cameras(layout.root, layout.left, layout.right)
     return layout
 
@@ -231,10 +229,8 @@ def _listed_by_number(layout: _Layout) -> Listed:
         if not numbers:
             name = images_in(layout.left)[0].name
             raise DataError(f"{layout.left}: {name} has no number; name the images of an instant alike, as 000000.png")
-        raise DataError(
-            f"{layout.root}: no image has a stamp: they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has "
-            f"{stamps.size}, from number 0 on; cut both or neither"
-        )
+        held = f"they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has {stamps.size}, from number 0 on"
+        raise DataError(f"{layout.root}: no image has a stamp: {held}; cut both or neither")
     check_several_stamps(layout.root / "times.txt", listed)
     return listed
 
@@ -268,10 +264,9 @@ def _poses(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
         return None
     poses = read_poses(file)
     if poses.t_ns is not None:
-        raise DataError(
-            f"{file}: is a trajectory with stamps ({poses.format}), and KITTI's poses have twelve numbers a line and "
-            "none; move it away, and give poses of the body (forward, left, up) in TUM format with --truth"
-        )
+        why = f"is a trajectory with stamps ({poses.format}), and KITTI's poses have twelve numbers a line and none"
+        remedy = "move it away, and give poses of the body (forward, left, up) in TUM format with --truth"
+        raise DataError(f"{file}: {why}; {remedy}")
     T_world_cam = poses.T_world_imu
     if len(T_world_cam) not in (stamps.size, _count(layout)):
         raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; cut both alike, or take its own")

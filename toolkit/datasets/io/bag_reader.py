@@ -2,9 +2,8 @@
 
 Messages are read with the library's own definitions of ROS's types and never with those in a bag, because code is
 generated from definitions. Any error that a damaged bag makes the library raise becomes a DataError. Formats:
-http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2.
-Values: the definitions of sensor_msgs, geometry_msgs and nav_msgs, whose stamps, grey images, poses and tree of fixed
-transforms (REP 105) are read.
+http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2; sensor_msgs,
+geometry_msgs and nav_msgs; frames are REP 105's.
 """
 
 import heapq

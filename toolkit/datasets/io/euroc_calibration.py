@@ -1,7 +1,5 @@
 """Calibration of an ASL folder: its sensor.yaml files, Kalibr's camchain, or as published for all EuRoC recordings.
 
-Cameras are stated by Kalibr's names or EuRoC's.
-
 Where tracks are simulated camera 1 serves for the baseline only: that pair is rectified, with the left camera as it is
 mounted. Real images are rectified with both cameras.
 

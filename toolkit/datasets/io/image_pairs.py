@@ -283,10 +283,9 @@ def check_both_cameras(root: Path, left: Path, right: Path) -> None:
 def check_one_trigger(mav0: Path, listed: Listed) -> None:
     """Raise DataError where no image of cam0 has one of cam1 of the same instant."""
     if listed.apart_ms is not None:
-        raise DataError(
-            f"{mav0}: no image of cam0 has one of cam1 within 1 ms, the nearest is {listed.apart_ms:.4g} ms away "
-            "(median): a stereo pair has one trigger; where only the cameras' clocks differ, correct the stamps of cam1"
-        )
+        apart = f"no image of cam0 has one of cam1 within 1 ms, the nearest is {listed.apart_ms:.4g} ms away (median)"
+        remedy = "where only the cameras' clocks differ, correct the stamps of cam1"
+        raise DataError(f"{mav0}: {apart}: a stereo pair has one trigger; {remedy}")
 
 
 def check_several_stamps(path: Path, listed: Listed) -> None:
@@ -304,7 +303,5 @@ def check_one_clock(root: Path, images_t_ns: IntArray, motion_t_ns: IntArray, mo
     if not ((images_t_ns >= first) & (images_t_ns <= last)).any():
         unit = probable_unit_of_ns(images_t_ns)
         why = "they are of two clocks or two recordings" if unit is None else f"the images' look like {unit}"
-        raise DataError(
-            f"{root}: none of the {images_t_ns.size} image pairs, {images_t_ns.min()} to {images_t_ns.max()} ns, lies "
-            f"in the time of {motion}, {first} to {last} ns; {why}"
-        )
+        pairs = f"{images_t_ns.size} image pairs, {images_t_ns.min()} to {images_t_ns.max()} ns"
+        raise DataError(f"{root}: none of the {pairs}, lies in the time of {motion}, {first} to {last} ns; {why}")

@@ -3,8 +3,7 @@
 A TUM file is given by the user; columns are never reordered silently: where the order looks wrong an error is raised.
 Of EuRoC recordings a truth lies beside the sensors, and of several the gyro chooses: of V1_01_easy two are in use, the
 original, whose orientation is off by degrees, and one computed again from the motion capture and the IMU (Geneva &
-Huang, "vicon2gt", 2020). Their names are alike; the rates of rotation of the second agree with the gyro, those of the
-first do not.
+Huang, "vicon2gt", 2020), whose rates of rotation agree with the gyro.
 """
 
 from dataclasses import replace
