@@ -350,15 +350,6 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     return digests
 
 
-def differing_answers(estimator: str) -> str:
-    """Say on which scenario an estimator's answers differ between one thread and two; empty where they do not."""
-    one, two = (digests_at(threads, (estimator,)) for threads in (1, 2))
-    differing = [key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest]
-    if not differing:
-        return ""
-    return f"with two threads its answers differ in bits from those with one, on {', '.join(differing)}"
-
-
 def _digests(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     if hasattr(os, "sched_setaffinity"):  # read by GTSAM's thread pool
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
@@ -590,8 +581,13 @@ def _consistent(name: str, build: Build, scenario: Scenario) -> CheckRecord:
 
 
 def _threads(word: str) -> CheckRecord:
+    def differing() -> str:
+        one, two = (digests_at(threads, (word,)) for threads in (1, 2))
+        where = ", ".join(key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest)
+        return f"with two threads its answers differ in bits from those with one, on {where}" if where else ""
+
     try:
-        return _check(_THREADS, lambda: differing_answers(word))
+        return _check(_THREADS, differing)
     except SystemLimitError as error:
         return _checked(_THREADS, "not applicable", f"not checked: {error}")
 

@@ -88,7 +88,10 @@ def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
             raise DataError(
                 f"{path}: a folder of one system's runs needs its name, NAME={path}; or give a folder of truths"
             )
-        files = _trajectory_files(path) if path.is_dir() else (_existing(path),)
+        place = place_in_bag(path)
+        if not (path if place is None else place[0]).exists():
+            raise DataError(f"{path}: there is no such file; check the path")
+        files = _trajectory_files(path) if path.is_dir() else (path,)
         if not files:
             raise DataError(f"{path}: it holds no trajectory")
         runs = found.setdefault(name or _name(path), {})
@@ -143,13 +146,6 @@ def _named(word: str) -> tuple[str | None, Path]:
     if not equals or not name.strip() or not path or Path(word).exists():
         return None, Path(word)
     return printable(name.strip()), Path(path)
-
-
-def _existing(path: Path) -> Path:
-    place = place_in_bag(path)
-    if not (path if place is None else place[0]).exists():
-        raise DataError(f"{path}: there is no such file; check the path")
-    return path
 
 
 def _name(path: Path) -> str:
