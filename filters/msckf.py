@@ -66,8 +66,9 @@ class Msckf:
         landmarks: int = 0,
         belief: Callable[[Belief], JointBelief] = JointBelief,
     ) -> None:
-        self._motion, self.log = load_kernels(setup.progress, setup.motion)
+        self.log = load_kernels(setup.progress)
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers
+        self._motion = setup.motion
         window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: list[int] = []

@@ -9,15 +9,14 @@ Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter fo
 eqs. 17-26 and appendix; Triggs, McLauchlan, Hartley & Fitzgibbon 2000, "Bundle adjustment - a modern synthesis",
 section 6.1; Golub & Van Loan, "Matrix Computations" (4th ed.), 4.1-4.2 (roots), 5.1 (reflections).
 
-Only this module and :mod:`filters.kalman.compiled_imu` import numba, which takes half a second, so they are imported
-when an MSCKF is built. All kernels of tracks are in one file because numba's cache looks at a function's own file
-alone; what is defined elsewhere is an argument for the same reason. Loops over scalars compile several times as fast as
-expressions of arrays.
+Only this module imports numba, which takes half a second, so it is imported when an MSCKF is built. All kernels are in
+one file because numba's cache looks at a function's own file alone; what is defined elsewhere is an argument for the
+same reason. Loops over scalars compile several times as fast as expressions of arrays.
 """
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -797,15 +796,15 @@ def test_landmarks(
     return nis, dof, accepted, HP[:end], S, residuals
 
 
-def what_was_compiled(what: str, kernels: Sequence[Any], began_cpu_s: float) -> tuple[str, ...]:
-    """Return a line about the compilation of some kernels, if it was not done before."""
-    stats = [each.stats for each in kernels]
+def _what_was_compiled() -> tuple[str, ...]:
+    """Return a line about the compilation, if it was not done before."""
+    stats = [each.stats for each in (eliminate_tracks, normals_in_view, add_newest, test_landmarks)]
     if all(each.cache_hits for each in stats):
         return ()
     kept = all(each.cache_path for each in stats)
     how_often = "once for this version" if kept else "and there is no place to keep that: NUMBA_CACHE_DIR names one"
-    spent_s = time.process_time() - began_cpu_s
-    return (f"{what} was compiled, {how_often} ({spent_s:.0f} s of CPU, in none of the times)",)
+    spent_s = time.process_time() - _BEGAN_CPU_S
+    return (f"the MSCKF was compiled, {how_often} ({spent_s:.0f} s of CPU, in none of the times)",)
 
 
-COMPILED = what_was_compiled("the MSCKF", (eliminate_tracks, normals_in_view, add_newest, test_landmarks), _BEGAN_CPU_S)
+COMPILED = _what_was_compiled()

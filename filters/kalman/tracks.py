@@ -44,35 +44,25 @@ from toolkit.models.gating import (
     MISMATCHED_TRACK_FACTOR,
     FrameGate,
 )
-from toolkit.models.imu import ImuModel
-from toolkit.models.state import POSE, Belief, Predictor
+from toolkit.models.state import POSE, Belief
 from toolkit.progress import Progress
 
 
-def load_kernels(progress: Progress, motion: Predictor) -> tuple[Predictor, tuple[str, ...]]:
-    """Import the kernels; return the motion model, where it can be by one that uses them, and what was compiled.
+def load_kernels(progress: Progress) -> tuple[str, ...]:
+    """Import the kernels, and compile them where that has not been done for this version; say so in one line.
 
-    They are compiled where that has not been done for this version, and it is reported while it goes on, because it
-    takes many seconds. Processes do it one after another: the second finds what the first has compiled.
+    It is reported while it goes on, because compiling takes many seconds. Processes do it one after another: the second
+    finds what the first has compiled.
     """
-    compiled, by_imu = tuple[str, ...](), isinstance(motion, ImuModel)
-    if f"filters.kalman.{'compiled_imu' if by_imu else 'kernels'}" not in sys.modules:
-        progress.advance(0, 1, "loading compiled code, which is compiled the first time")
-        with Path(__file__).open("rb") as own:
-            with suppress(OSError):  # a file system without locks: they compile side by side
-                fcntl.flock(own, fcntl.LOCK_EX)
-            from filters.kalman import kernels
-
-            compiled = kernels.COMPILED
-            if by_imu:
-                from filters.kalman import compiled_imu
-
-                compiled += compiled_imu.COMPILED
-    if not isinstance(motion, ImuModel):
-        return motion, compiled
-    from filters.kalman.compiled_imu import CompiledImu
-
-    return CompiledImu(motion), compiled
+    if "filters.kalman.kernels" in sys.modules:
+        return ()
+    progress.advance(0, 1, "loading compiled code, which is compiled the first time")
+    with Path(__file__).open("rb") as own:
+        with suppress(OSError):  # a file system without locks: they compile side by side
+            fcntl.flock(own, fcntl.LOCK_EX)
+        from filters.kalman import kernels
+    compiled: tuple[str, ...] = kernels.COMPILED
+    return compiled
 
 
 class TrackSightings(NamedTuple):

@@ -73,27 +73,6 @@ def predict(preintegration: Preintegration, T_world_imu: Array, v_world: Array, 
     return Prediction(predicted.pose().matrix(), predicted.velocity(), transition, noise)
 
 
-def transition_over(dt_s: float, gravity_world: Array, start: Belief, end: Prediction) -> Array:
-    """Return the transition (15, 15) of an interval from the mean of ``start`` to that of ``end``.
-
-    The blocks of the biases stay as predicted; those of pose and velocity are the exact derivatives at both means
-    (Li & Mourikis 2013, section 4).
-    """
-    to_start = start.T_world_imu[:3, :3].T
-    turned_back = end.T_world_imu[:3, :3].T @ start.T_world_imu[:3, :3]
-    fallen = start.v_world * dt_s + 0.5 * gravity_world * dt_s**2
-    moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
-    accelerated = to_start @ (end.v_world - start.v_world - gravity_world * dt_s)
-    transition = end.transition.copy()
-    for block in (ROTATION, POSITION, _VELOCITY):
-        transition[block, block] = turned_back
-    transition[POSITION, ROTATION], transition[_VELOCITY, ROTATION] = -(
-        turned_back @ skew(np.array([moved, accelerated]))
-    )
-    transition[POSITION, _VELOCITY], transition[_VELOCITY, POSITION] = dt_s * turned_back, 0.0
-    return transition
-
-
 @dataclass(frozen=True, eq=False)
 class ImuIncrement:
     """The preintegrated samples between two frames, their duration, and gravity (3,) m/s^2 in the world."""
@@ -106,7 +85,24 @@ class ImuIncrement:
         return predict(self.preintegration, start.T_world_imu, start.v_world, start.bias)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        return transition_over(self.dt_s, self.gravity_world, start, end)
+        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``.
+
+        The blocks of the biases stay as predicted; those of pose and velocity are the exact derivatives at both means
+        (Li & Mourikis 2013, section 4).
+        """
+        dt_s, to_start = self.dt_s, start.T_world_imu[:3, :3].T
+        turned_back = end.T_world_imu[:3, :3].T @ start.T_world_imu[:3, :3]
+        fallen = start.v_world * dt_s + 0.5 * self.gravity_world * dt_s**2
+        moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
+        accelerated = to_start @ (end.v_world - start.v_world - self.gravity_world * dt_s)
+        transition = end.transition.copy()
+        for block in (ROTATION, POSITION, _VELOCITY):
+            transition[block, block] = turned_back
+        transition[POSITION, ROTATION], transition[_VELOCITY, ROTATION] = -(
+            turned_back @ skew(np.array([moved, accelerated]))
+        )
+        transition[POSITION, _VELOCITY], transition[_VELOCITY, POSITION] = dt_s * turned_back, 0.0
+        return transition
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
@@ -121,13 +117,13 @@ class ImuModel(MotionModel):
     layout = IMU_LAYOUT
 
     def __init__(self, noise: ImuNoise, gravity_world: Array) -> None:
-        self._noise, self.gravity_world = noise, gravity_world
+        self._noise, self._gravity_world = noise, gravity_world
         self._params = preintegration_params(noise, gravity_world)
 
     def integrate(self, motion: Motion, bias: Array) -> ImuIncrement:
         assert isinstance(motion, ImuMotion)
         preintegration = preintegrate(motion, bias, self._params_over(motion))
-        return ImuIncrement(preintegration, float(motion.dt_s.sum()), self.gravity_world)
+        return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
 
     def predict_each(self, motions: list[Motion], starts: Belief) -> Prediction:
         """Predict S stacked states over an interval each, with the samples of all turned to their starts at once."""
@@ -144,17 +140,13 @@ class ImuModel(MotionModel):
         return Prediction(*(np.stack(part) for part in zip(*each, strict=True)))
 
     def _params_over(self, motion: ImuMotion) -> gtsam.PreintegrationCombinedParams:
+        """Return the parameters over an interval; a preintegration has one noise, the mean over a bridged piece."""
         if motion.noise_scale is None:
             return self._params
-        return preintegration_params(self.noise_over(motion), self.gravity_world)
-
-    def noise_over(self, motion: ImuMotion) -> ImuNoise:
-        """Return the noise over an interval; a preintegration has one, the mean over a bridged piece."""
-        if motion.noise_scale is None:
-            return self._noise
         accel, gyro = np.sqrt(motion.dt_s @ motion.noise_scale**2 / motion.dt_s.sum()).tolist()
-        return replace(
+        scaled = replace(
             self._noise,
             accel_noise_density=accel * self._noise.accel_noise_density,
             gyro_noise_density=gyro * self._noise.gyro_noise_density,
         )
+        return preintegration_params(scaled, self._gravity_world)
