@@ -14,8 +14,7 @@ from tests.filters.conftest import off_at_the_end_m, recording_with_a_fleck, set
 from toolkit.geometry import Array
 from toolkit.measurements import NS_PER_S
 from toolkit.models.factors import L, X
-from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, POLICIES, Outliers, Settings
+from toolkit.settings import Outliers, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 from toolkit.simulation.faults import moving_vehicles
 
@@ -169,34 +168,6 @@ def test_a_landmark_without_sightings_does_not_come_into_a_tree_built_anew():
     assert not window.values().exists(L(5))
     for k in range(1, 4):
         assert window.add(chain_link(k), k * NS_PER_S).log == []
-
-
-def with_a_first_sighting_too_far(sequence: Sequence, track_id: int, disparity_px: float) -> Sequence:
-    seen, uv_px = sequence.observations, sequence.observations.uv_px.copy()
-    first = np.flatnonzero(seen.track_id == track_id)[0]
-    uv_px[first, 1] = uv_px[first, 0] - disparity_px
-    return replace(sequence, observations=replace(seen, uv_px=uv_px))
-
-
-def test_a_landmark_first_seen_far_too_far_begins_anew_before_it_is_linearised_behind_the_camera():
-    """The step from a small disparity to the right one passes the camera; the next sighting is as good a start."""
-    clean = simulate(replace(FLIGHT, duration_s=1.0), 0)
-    log, point = log_and_point(with_a_first_sighting_too_far(clean, 8, disparity_px=1.5), 8)
-    assert log == ("frame 1: landmark 8 fell behind the camera and was dropped",)
-    seen = clean.observations
-    later = replace(clean, observations=seen.select((seen.track_id != 8) | (seen.frame > 1)))
-    # The poses of the first two frames still differ by what the dropped sightings did to them before.
-    np.testing.assert_allclose(point, log_and_point(later, 8)[1], atol=1e-3)
-
-
-def log_and_point(sequence: Sequence, track_id: int) -> tuple[tuple[str, ...], Array]:
-    """Return the log of fixed-lag and one of its landmarks (3,) m, where nothing keeps a wrong sighting out."""
-    setup = replace(setup_of(sequence), settings=Settings(outliers=POLICIES["none"]))
-    estimator = FixedLag(setup, DEFAULTS.window.seconds(sequence.motion_kind))
-    for packet in sequence.packets():
-        estimator.step(packet)
-    finished = estimator.finish()
-    return finished.log, finished.landmarks.points_world[finished.landmarks.track_ids == track_id][0]
 
 
 def test_an_imu_so_good_that_a_covariance_is_refused_does_not_end_it(run_estimator):
