@@ -17,7 +17,7 @@ from toolkit import runner
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, skew
-from toolkit.measurements import Prior, StereoFrame, StereoRig
+from toolkit.measurements import Prior, StereoRig
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.graph_state import GraphIncrement
 from toolkit.models.motion import motion_model
@@ -82,14 +82,18 @@ class BatchAtTruth:
             if track_id in seen:
                 values.insert(L(track_id), point)
         linear = graph.linearize(values)
-        linear.push_back(_seen(frames, values, recording.sequence.rig))
+        camera, sightings = StereoFactors(recording.sequence.rig), gtsam.NonlinearFactorGraph()
+        for k, frame in enumerate(frames):
+            for factor in camera.of(frame, k):
+                sightings.add(factor)
+        linear.push_back(sightings.linearize(values))
         self._delta = linear.optimize()
         self._marginals = gtsam.Marginals(linear, self._delta)
 
     def _motion(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         recording, values = self._recording, gtsam.Values()
         maker = motion_model(recording.setup.noise, recording.setup.gravity_world)
-        graph = maker.hold(first_belief(recording), 0)
+        graph = maker.hold(maker.initial_belief(recording.setup.prior), 0)
         for packet in recording.sequence.packets():
             maker.insert(values, recording.truth_at(packet.index), packet.index)
             if packet.motion is not None:
@@ -107,18 +111,6 @@ class BatchAtTruth:
         if len(keys) == 3:
             to_body[6:9, 6:9] = self._recording.truth_at(k).T_world_imu[:3, :3].T
         return to_body @ error, to_body @ cov @ to_body.T
-
-
-def _seen(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> gtsam.GaussianFactorGraph:
-    graph, camera = gtsam.NonlinearFactorGraph(), StereoFactors(rig)
-    for k, frame in enumerate(frames):
-        for factor in camera.of(frame, k):
-            graph.add(factor)
-    return graph.linearize(values)
-
-
-def first_belief(recording: Recording) -> Belief:
-    return motion_model(recording.setup.noise, recording.setup.gravity_world).initial_belief(recording.setup.prior)
 
 
 def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
@@ -219,12 +211,9 @@ class Problem:
     def __init__(self, sequence: Sequence) -> None:
         self.rig, self.packets = sequence.rig, list(sequence.packets())
         self.frames = [packet.frame for packet in self.packets]
-        motion, maker = motion_model(sequence.noise, sequence.gravity_world), StereoFactors(sequence.rig)
-        self.motion, self.graph, self.start = (
-            motion,
-            motion.hold(motion.initial_belief(sequence.prior), 0),
-            gtsam.Values(),
-        )
+        self.motion = motion = motion_model(sequence.noise, sequence.gravity_world)
+        maker = StereoFactors(sequence.rig)
+        self.graph, self.start = motion.hold(motion.initial_belief(sequence.prior), 0), gtsam.Values()
         self.increments: dict[int, GraphIncrement] = {}
         truth, rng = sequence.truth, np.random.default_rng(5)
         for k, packet in enumerate(self.packets):
