@@ -1,4 +1,7 @@
-"""Whatever is asked for that is not there: an exit status and one line that names it, before anything runs."""
+"""Whatever is asked for that is not there: an exit status and one line that names it, before anything runs.
+
+That who does what such a line says is not refused again is in test_advice.py.
+"""
 
 import sys
 from collections.abc import Callable
@@ -10,12 +13,6 @@ from toolkit import runner
 
 Vislam = Callable[..., int]
 ENDLESS = "n" * 300
-# Seven poses on a bend, so that they can be fitted to others.
-POSES = "".join(f"{k}.0 {k} {k * k} 0 0 0 {k / 20} {(1 - k * k / 400) ** 0.5}\n" for k in range(7))
-OURS, CHECK = (
-    "baseline --trajectories results/ours --truth truths",
-    "check --baseline b.json --trajectories results/ours",
-)
 
 # Words, exit status, and what the line has to say. The files named here are those of ``files`` below.
 WRONG: list[tuple[str, int, str]] = [
@@ -106,32 +103,8 @@ WRONG: list[tuple[str, int, str]] = [
     # Sweeps; what else cannot be swept is in tests/experiment/test_sweep.py.
     ("sweep drive --out d", 2, "there is nothing to sweep over"),
     ("sweep drive --over fault:blackout", 2, "expected KEY=V1,V2,... or fault:NAME=D1,D2,..., not 'fault:blackout'"),
-    # What does not go together, or is given twice.
-    ("check-data no --topics imu=/a,imu=/b", 2, "imu is named twice; leave one out"),
-    ("compare no --config sound.toml --config sound.toml", 2, "it takes one file"),
-    ("compare no --estimators ekf batch", 2, "give names with commas: --estimators ekf,batch"),
-    ("compare no --estimtors ekf", 2, "did you mean --estimators?"),
-    ("compare no --config run/manifest.json", 2, "name the manifest.json of a comparison, or a TOML file"),
-    ("simulate flight --out d --duration 0.1 --lens radtan", 2, "add --images"),
-    ("sweep --over window.lag_s=1,2", 2, "name the sequence to sweep, a path or a built-in name as drive"),
-    ("sweep no --over window.lag_s=1 --over window.lag_s=2", 2, "give all its values at once"),
-    ("export run --format tum", 2, "give --format and --out for a trajectory"),
     ("export run --bundle a.zip --format tum", 2, "--bundle goes without any other option"),
-    # Trajectories of other systems, and their baseline.
-    ("evaluate truths/A.tum nowhere.tum", 3, "no such file; check the path"),
-    ("evaluate nowhere results/ours/A/1.tum", 3, "give a file, or a folder that has SEQUENCE.tum"),
-    ("evaluate truths/A.tum results/ours/A", 3, "or give a folder of truths"),
-    ("evaluate truths results/ours/A/1.tum", 3, "where the truth is a folder, give systems as NAME=FOLDER"),
-    ("evaluate two results", 3, "it has 2 truths for A; leave one, A.tum"),
-    ("evaluate both results", 3, "A is given twice, as 1.tum and A.tum; keep one"),
-    ("evaluate truths results ours=results/ours", 3, "ours is given twice; give each system another name"),
-    ("baseline --out new.json", 2, "name a SEQUENCE, or --trajectories DIR"),
-    ("baseline --trajectories results/ours --out new.json", 3, "name it with --truth A=FILE.tum or --truth DIR"),
-    (f"{OURS} --out new.json --truth two", 2, "--truth names two folders, truths and two; give one"),
-    ("baseline --plan --trajectories truths --truth truths", 3, "give the files of repeated runs, SEQUENCE/RUN.tum"),
-    ("check --baseline b.json", 3, "check it with --trajectories DIR"),
-    (f"{CHECK} --json c.json --markdown c.json", 2, "are files of their own; give each its name"),
-    (f"{CHECK} --speed-against HEAD", 2, "with --trajectories nothing runs"),
+    ("check --baseline b.json --trajectories t --speed-against HEAD", 2, "with --trajectories nothing runs"),
     # Outputs that cannot be written.
     ("compare drive --estimators dead-reckoning --out taken", 4, "taken exists and is not a directory"),
     (f"compare drive --estimators dead-reckoning --out {ENDLESS}", 4, "File name too long"),
@@ -142,8 +115,8 @@ WRONG: list[tuple[str, int, str]] = [
 
 
 @pytest.fixture
-def files(vislam: Vislam, request: pytest.FixtureRequest) -> None:
-    """Write the files that are named, in the directory of ``vislam``."""
+def files(vislam: Vislam) -> None:
+    del vislam  # in whose directory they stand
     Path("wrong.toml").write_text("[outliers]\ngate = 0.9\n")
     Path("asked.toml").write_text('[compare]\nestimator = ["ekf"]\n')
     Path("typed.toml").write_text("[compare]\nmax_frames = 1\n")
@@ -157,15 +130,6 @@ def files(vislam: Vislam, request: pytest.FixtureRequest) -> None:
         Path(name).mkdir()
     for name in ("manifest.json", "metrics.json"):
         Path("run", name).write_text("{}")
-    for name in ("truths/A.tum", "two/A/1.tum", "two/A/2.tum", "both/A.tum", "both/A/1.tum"):
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_text(POSES)
-    Path("results/ours/A").mkdir(parents=True)
-    for run in (1, 2, 3):
-        Path(f"results/ours/A/{run}.tum").write_text(POSES.replace("5.0 5", f"5.0 5.{run}"))
-    if "b.json" in request.node.callspec.params["words"]:
-        assert vislam(*f"{OURS} --out b.json".split()) == 0
-        request.getfixturevalue("capsys").readouterr()
 
 
 @pytest.mark.usefixtures("files")
