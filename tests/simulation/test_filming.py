@@ -19,8 +19,8 @@ from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
 from toolkit.simulation.filming import Filming, errors_px, film
 from toolkit.simulation.renderer import Eye, Panel, furnished_hall, light
 
-SHORT = replace(FLIGHT, duration_s=0.35)
-FRAMES = 8
+SHORT = replace(FLIGHT, duration_s=0.2)
+FRAMES = 5
 
 
 def pose_at(t_s: float) -> Array:

@@ -42,8 +42,8 @@ OF_POSITIONS = "the truth is of positions alone: its orientations are all one"
 _KIND = "a truth file is TUM text, one pose a line"
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
 _LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
-# The rotation of a step is unknown where poses are farther apart than this: some truths have gaps of minutes.
-_LONGEST_STEP_S = 0.5
+# Rotations are compared over steps of such lengths: shorter ones are noise, and some truths have gaps of minutes.
+_SHORTEST_STEP_NS, _LONGEST_STEP_S = NS_PER_S // 10, 0.5
 # Rates of two unrelated motions differ by at least the gyro's rates; those of a noisy motion capture by half of that.
 # Differences below the first number are the noise of a good motion capture at a standstill.
 _MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
@@ -151,7 +151,7 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | No
     best, (least, turning) = ranked[0]
     if not np.isfinite(least):
         raise DataError(
-            f"{best}: it and the IMU have less than 0.3 s in common; check that both are of one recording and clock"
+            f"{best}: it and the IMU have less than 0.2 s in common; check that both are of one recording and clock"
         )
     scatters = "; ".join(f"{path.relative_to(root)} by {off:.4f} rad/s" for path, (off, _) in ranked)
     among = "" if len(ranked) == 1 else ", the better of those in the folder"
@@ -211,7 +211,7 @@ def _rates_apart_radps(truth: Truth, imu: ImuSamples) -> tuple[float, float]:
     """
     sample_t_ns, gyro_radps = _usable(imu)
     within = stamps_among(truth.t_ns, sample_t_ns)
-    steps = Steps.of(truth.t_ns[within])
+    steps = Steps.of(truth.t_ns[within], _SHORTEST_STEP_NS)
     known = steps.duration_s < _LONGEST_STEP_S
     if known.sum() < 2:
         return float("inf"), 0.0

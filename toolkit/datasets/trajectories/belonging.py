@@ -247,9 +247,9 @@ class Steps(NamedTuple):
     duration_s: Array
 
     @classmethod
-    def of(cls, t_ns: IntArray) -> "Steps":
-        """Return the steps that end within the stamps."""
-        end = np.searchsorted(t_ns, t_ns + _STEP_NS)
+    def of(cls, t_ns: IntArray, shortest_ns: int = _STEP_NS) -> "Steps":
+        """Return the steps of at least ``shortest_ns`` that end within the stamps."""
+        end = np.searchsorted(t_ns, t_ns + shortest_ns)
         start = np.flatnonzero(end < t_ns.size)
         return cls(t_ns, start, end[start], (t_ns[end[start]] - t_ns[start]) / NS_PER_S)
 
