@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from toolkit.cli import main
+from toolkit.errors import DataError
+from toolkit.report import export
 from toolkit.report.export import installed_packages, unpack_bundle
 
 COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "8", "--workers", "1", "--seed", "3")
@@ -110,3 +112,12 @@ def test_a_damaged_bundle_is_reported_in_one_line(bundle: Path, reproduce, tmp_p
     assert status == 3
     assert expected in reported
     assert reported.count("\n") == 1
+
+
+def test_a_bundle_that_would_unpack_to_more_than_its_limit_is_not_unpacked(
+    bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "_MOST_BYTES", 1000)
+    with pytest.raises(DataError, match="would unpack to more than"):
+        unpack_bundle(bundle, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -30,6 +30,7 @@ BUNDLE, LOCK = "bundle.json", "requirements.txt"
 _NEVER_IN = ("figures/",)
 # The oldest stamp that a zip archive can hold, for every entry, so that the same files give the same bytes.
 _STAMP = (1980, 1, 1, 0, 0, 0)
+_MOST_BYTES = 4 * 2**30
 _REMEDY = "make it again with vislam export --bundle"
 _DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
 
@@ -166,9 +167,11 @@ def unpack_bundle(path: Path, directory: Path) -> BundleRecord:
 
 
 def _read_bundle(archive: zipfile.ZipFile) -> tuple[BundleRecord, dict[str, bytes]]:
-    entries = set(archive.namelist())
+    entries = {entry.filename: entry.file_size for entry in archive.infolist()}
     if BUNDLE not in entries:
         raise DataError(f"it is a zip archive without {BUNDLE}")
+    if sum(entries.values()) > _MOST_BYTES:
+        raise DataError("it would unpack to more than 4 GB, which no bundle does")
     try:
         record = documents.parse(archive.read(BUNDLE), BundleRecord)
     except DataError as error:
