@@ -26,6 +26,7 @@ from toolkit.measurements import ImuNoise, StereoRig
 from toolkit.models.noise import pixel_covariance
 from toolkit.motion_samples import ImuSamples
 from toolkit.sequence import Observations, Provenance, Sequence, Truth
+from toolkit.simulation import FLIGHT, simulate
 
 COUNT, STEP_S, START_S = 200, 0.1, 1.4e9
 FORWARD_MPS, LEFT_TURN_RADPS = 10.0, 0.3
@@ -91,6 +92,15 @@ def test_a_vehicle_is_accepted_whatever_its_heading_and_upside_down(
 ) -> None:
     rolled = T_world_start @ drive() @ se3(so3_exp(np.array([roll_rad, 0.0, 0.0])), np.zeros(3))
     load_truth(written(tmp_path, table(rolled)))
+
+
+@pytest.mark.parametrize("duration_s", [2.0, 3.0, 4.0])
+def test_a_short_flight_that_looks_nearly_like_a_vehicle_in_the_other_order_is_accepted(
+    tmp_path: Path, duration_s: float
+) -> None:
+    flown = simulate(replace(FLIGHT, duration_s=duration_s), 0).truth
+    assert flown is not None
+    load_truth(written(tmp_path, table(flown.T_world_imu)))
 
 
 @pytest.mark.parametrize("seed", range(3))
