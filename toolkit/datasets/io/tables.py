@@ -119,7 +119,10 @@ class Columns:
     def whole(self, name: str) -> IntArray:
         """Return a column of whole numbers (N,); raises DataError naming the row of anything else."""
         self.require(name)
-        return np.array([self._whole(name, i, cell) for i, cell in enumerate(self._cells(name))], dtype=np.int64)
+        cells = self._cells(name)
+        if self.given is not None and self.given[name].dtype.kind == "i":
+            return self.given[name].astype(np.int64)
+        return np.array([self._whole(name, i, cell) for i, cell in enumerate(cells)], dtype=np.int64)
 
     def stamps(self) -> IntArray:
         """Return the stamps (N,) of a column t, in seconds, or t_ns, as int64 nanoseconds, rounded only there.
@@ -166,6 +169,8 @@ class Columns:
 
     def _numbers(self, name: str, empty: str) -> Array:
         cells = self._cells(name)
+        if self.given is not None and self.given[name].dtype.kind in "fiu":
+            return self.given[name].astype(np.float64)
         cells = [cell.strip() or empty if isinstance(cell, str) else cell for cell in cells]
         bad = next((row for row, cell in enumerate(cells) if not is_number(cell)), None)
         if bad is not None:
