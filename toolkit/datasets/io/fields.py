@@ -321,14 +321,14 @@ def read_fields(path: Path) -> Fields:
         document = yaml.load(plain, _Loader)
     except yaml.MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
-        raise DataError(f"{path}: {line}{error.problem or error}; it is no YAML, or truncated") from error
+        raise DataError(f"{path}: {line}{error.problem or error}; correct this line, or copy the file again") from error
     except RecursionError as error:
         raise DataError(f"{path}: is nested too deeply for a calibration; name another file") from error
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         why = str(error).partition("\n")[0].partition(";")[0]
         raise DataError(f"{path}: is no YAML of a calibration ({why}); copy it again, or name another file") from error
     if not isinstance(document, dict):
-        raise DataError(f"{path}: holds no 'key: value'; a calibration is made of them")
+        raise DataError(f"{path}: holds no 'key: value', of which a calibration is made; copy it again")
     return Fields(path, dict(flattened(document)))
 
 
