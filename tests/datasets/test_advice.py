@@ -580,7 +580,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (gone("calib.json", "imu.csv"), "missing calib.json, imu.csv"),
         (document("calib.json", lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
         (document("calib.json", lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds text"),
-        (text("calib.json", '{"cam0": '), "it is no YAML, or truncated"),
+        (text("calib.json", '{"cam0": '), "correct this line, or copy the file again"),
         (text("calib.json", '["cam0"]'), "holds no 'key: value'"),
         (edit("features.csv", "uL,vL", "u,v"), "missing column uL (rename u?), vL"),
         (edit("features.csv", "300", "many"), "features.csv: line 2: uL is many, expected a number"),
@@ -876,7 +876,11 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "two clocks; stamp both by one, or name another topic with --topics imu=TOPIC",
             TOPICS("imu=/imu0"),
         ),
-        (without("imu0"), "record one with the images, or convert what measures it to sensor_msgs/Imu"),
+        (without("imu0"), "convert the topic that measures the motion to sensor_msgs/Imu (m/s^2, rad/s; "),
+        (
+            both(without("imu0"), more(ROS.item(START_NS, "/sensor_combined", "sensor_msgs/msg/FluidPressure", "px4"))),
+            "record one with the images; there are /sensor_combined (sensor_msgs/FluidPressure), /cam0",
+        ),
         (
             both(without("imu0"), more(*wheels("/wheels", 0.5, "geometry_msgs/msg/TwistStamped"))),
             "name one with --topics twist=TOPIC (/wheels)",
@@ -897,7 +901,10 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
             "synchronise the cameras, or correct the stamps",
         ),
         (compressed(lambda one: (one.t_ns, b"RIFF....WEBP")), "republish them as one of these, or as raw images"),
-        (without("cam"), "images that can be read, and the tracks are made of them; write them as sensor_msgs/Image"),
+        (
+            without("cam"),
+            "no images that can be read; write them as sensor_msgs/Image, as image_transport republish does",
+        ),
         (
             lambda case: [write_bag(case.at.with_stem("other"), case.content), say("check-data", "@/..")(case)],
             "name one of them, or if they are parts of one recording, let their names end in _0, _1",

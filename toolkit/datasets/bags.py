@@ -52,7 +52,10 @@ from toolkit.settings import DEFAULTS, Frontend
 HAS_TOPICS = True
 # Images are rectified already where this many times as many corners meet their row as once the calibration is applied.
 _CLEARLY = 2
-_RECORD_ONE = "record one with the images, or convert what measures it to sensor_msgs/Imu (m/s^2, rad/s)"
+_RECORD_ONE = (
+    "convert the topic that measures the motion to sensor_msgs/Imu (m/s^2, rad/s; PX4's axes are x forward, y right, "
+    "z down), or record one with the images"
+)
 _NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 
 uses_images = images_only
@@ -207,7 +210,7 @@ def _twists(source: Recorded) -> TwistSamples:
         others = ", ".join(one.name for one in _usable(source.topics, ROLES["twist"]))
         remedy = f"{_RECORD_ONE}; {_there_are(source.topics)}"
         remedy = f"name one with --topics twist=TOPIC ({others})" if others else remedy
-        why = "no sensor_msgs/Imu and no nav_msgs/Odometry that can be read, so nothing measures the motion"
+        why = "no sensor_msgs/Imu and no nav_msgs/Odometry that can be read"
         raise DataError(f"{path}: {why}; {remedy}"[:_LONGEST])
     messages = _messages_of(source, topic)
     values = [message.value for message in messages]
@@ -354,7 +357,7 @@ def _stereo(path: Path, topics: Sequence[Topic], given: Given) -> tuple[Topic, T
 
 def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
     if not images:
-        why = "holds no images that can be read, and the tracks are made of them; write them as sensor_msgs/Image"
+        why = "holds no images that can be read; write them as sensor_msgs/Image, as image_transport republish does"
     elif len(images) == 1:
         why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
     else:
@@ -363,7 +366,9 @@ def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> st
 
 
 def _there_are(topics: Sequence[Topic]) -> str:
-    return f"there are {', '.join(map(str, topics)) or 'no topics'}"
+    """Return a list of topics, first those that are not read, which may hold what lacks."""
+    in_order = sorted(topics, key=lambda topic: topic.type in ros.KNOWN_TYPES and not topic.unreadable)
+    return f"there are {', '.join(map(str, in_order)) or 'no topics'}"
 
 
 def _alone(word: str) -> str:
