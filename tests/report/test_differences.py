@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from toolkit.cli import main
 from toolkit.files.documents import read, schema
 from toolkit.report.differences import ChangeRecord, DiffRecord, diff_text
+from toolkit.report.run_directory import read_run, repeated
 
 DOCUMENTS = Path(__file__).parent / "documents"
 
@@ -48,6 +49,22 @@ def other_recordings(seeds: dict, manifest: dict) -> None:
         run["status"][0], run["counts"] = "failed", {"ok": 2, "diverged": 0, "failed": 1}
         for metric in run["metrics"].values():
             metric["n"] = min(metric["n"], 2)
+
+
+def without_errors(seeds: dict, manifest: dict) -> None:
+    """No truth and no withheld tracks: there is nothing by which final and causal answers could be told apart."""
+    for run in seeds["runs"]:
+        for key, metric in run["metrics"].items():
+            metric.update(dict.fromkeys(metric.keys() - {"quantiles_all"}) | {"n": 0, "values": [None] * 3})
+            metric.pop("quantiles_all", None)
+            run["notes"][key] = "no truth"
+
+
+def test_a_final_answer_repeats_the_causal_one_over_seeds_only_where_errors_say_so(tmp_path: Path) -> None:
+    write_run(tmp_path / "known")
+    write_run(tmp_path / "unknown", without_errors)
+    assert repeated(read_run(tmp_path / "known")) == {"dead-reckoning", "ekf"}
+    assert repeated(read_run(tmp_path / "unknown")) == set()
 
 
 @pytest.fixture(scope="module")

@@ -236,13 +236,13 @@ class SeedsFiles:
 
 
 def repeated(files: RunFiles | SeedsFiles) -> frozenset[str]:
-    """Return the estimators whose final answer is the causal one; over seeds, where all errors of all seeds are."""
+    """Return the estimators whose final answer is the causal one; over seeds, where all known errors say so."""
     if isinstance(files, RunFiles):
         return frozenset(run.estimator for run in files.report.runs if run.repeats_causal)
     of = {(run.estimator, run.output): [run.metrics[key].values for key in _ERRORS] for run in files.scores.runs}
-    return frozenset(
-        name for (name, output), values in of.items() if output == "final" and values == of.get((name, "causal"))
-    )
+    finals = [(name, values) for (name, output), values in of.items() if output == "final"]
+    known = [(name, values) for name, values in finals if any(value is not None for one in values for value in one)]
+    return frozenset(name for name, values in known if values == of.get((name, "causal")))
 
 
 def runs_in(directory: Path) -> tuple[Path, ...]:
