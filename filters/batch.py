@@ -4,8 +4,10 @@ What it minimises, with states x_k, landmarks l_j and sightings z_kj, is
 
     1/2 |x_0 - prior|^2 + sum_k 1/2 |x_k - motion(x_k-1)|^2 + sum_kj rho(z_kj - stereo(x_k, l_j))
 
-in the Mahalanobis norms of the prior, of the measured motion and of the sightings, these by the weight of tracks. The
-loss rho changes from solve to solve, each of which starts where the one before it ended:
+in the Mahalanobis norms of the prior, of the measured motion (with the walk of an IMU's biases) and of the sightings,
+these by the weight of tracks; thresholds of the losses are in stated standard deviations. A track takes part if it was
+seen twice and once with a pixel of disparity. The loss rho changes from solve to solve, each of which starts where the
+one before it ended:
 
     solve   loss rho      sightings                   until a step lowers the error by less than
     first   Huber's       all                         1 %; it only brings landmarks near, mismatched or not

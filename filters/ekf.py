@@ -59,7 +59,8 @@ class DecoupledEkf(Filter):
         gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
             self._belief, accepted = correct_pose(self._belief, self._known(seen), uvs_px, self._rig, gate)
-            # By the corrected pose, as uncertain as it is then and as if it were independent of the landmarks.
+            # By the corrected pose, as uncertain as it is then and as if it were independent of the landmarks; a gate
+            # of their own decides.
             pose_cov = self._belief.cov[POSE, POSE]
             bound = np.where(accepted, gate.bound(stereo.degrees_of_freedom(uvs_px)), 0.0)
             seen = correct_landmarks_below(seen, uvs_px, self._belief.T_world_imu, pose_cov, self._rig, bound)
@@ -97,7 +98,7 @@ def correct_pose(
     accepted = gate.accepts(mahalanobis_squared(residual_px, S), dof, depth_m > 0.0)
     weights = gate.weights(mahalanobis_squared(residual_px, landmark_px2 + noise_px2), dof, accepted)
 
-    # The gain K = P H^T S^-1 of all sightings in information form: sums of 3x3 blocks (see landmark_map).
+    # The gain of all sightings at once in information form: sums of 3x3 blocks (see landmark_map).
     weighted = weights[:, None, None] * np.linalg.solve(landmark_px2 + noise_px2 / rig.track_weight, H_pose)
     rows = weighted.reshape(-1, 6)
     return informed(belief, rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)), accepted

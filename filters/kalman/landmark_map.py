@@ -1,8 +1,9 @@
 """What the decoupled filters share: a map of landmarks, each with a small Gaussian of its own, and its correction.
 
 Source: Kang, eqs. 3-14. The report leaves one problem open: the gain of its pose inverts a matrix of the size of all
-measurements (eq. 12). Because the measurement noise is block diagonal, the same update in information form,
-``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``, needs only 3x3 blocks and is identical; no landmark is left out.
+measurements (eq. 12). Its noise is block diagonal: with R_k the covariance of a sighting's noise and of its landmark,
+the same update in information form, ``P+ = (P^-1 + sum_k H_k^T R_k^-1 H_k)^-1``, needs only 3x3 blocks and is
+identical; no landmark is left out.
 """
 
 from dataclasses import dataclass, replace

@@ -103,7 +103,8 @@ def test_what_is_not_shown_not_measured_or_did_not_end_well_is_said() -> None:
     given = {"salt": effect(A, BETWEEN, 1.0), "pepper": lost, "tea": None, "oil": perhaps, "flour": wide}
     found = explanation(*(part(name, one) for name, one in given.items()))
     words = in_words(found)
-    assert "With 8 seeds the error shows no effect of salt (0.952 to 1.05) and pepper (too few runs" in words
+    assert "Over 8 seeds no effect on the error is found of salt (0.952 to 1.05)." in words
+    assert "Too few runs ended well to tell of pepper." in words
     assert "Too few data to tell of flour (0.367 to 3.30): a factor of two is not excluded." in words
     assert "What tea brings cannot be measured: no two estimators differ in that alone." in words
     assert "Perhaps the error is smaller with oil (1.14 to 1.26 near a); among 4 tests that may be chance" in words

@@ -64,8 +64,8 @@ _SCHEDULER = arg("--scheduler ADDRESS", "run on a Dask cluster, as in tcp://host
 _TRUTH = arg("--truth FILE.tum", "ground truth of the one SEQUENCE")
 _OUT = arg(
     "--out DIR",
-    "run directory (default: runs/<date and time>); runs are kept there as they end (of compare with --seeds), and the "
-    "same command continues where it stopped",
+    "run directory (default: runs/<date and time>); runs of several seeds or variants are kept there as they end, and "
+    "the same command continues where it stopped",
     Path,
 )
 
@@ -171,9 +171,17 @@ def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) 
     "explain",
     "say what makes one estimator more accurate than another, ingredient by ingredient",
     arg("sequence SEQUENCE", "a recording's path, or a built-in name"),
-    arg("--from NAME", "the first estimator (default: the lowest rung of those compared by default)", dest="start_at"),
-    arg("--to NAME", "the second estimator (default: the highest rung of those)", dest="goal"),
-    arg("--estimators NAME,...", "those whose variants may lie between the two, or files (default: all)", names),
+    arg(
+        "--from NAME",
+        "the first estimator (default: the lowest with INGREDIENTS of those compared by default)",
+        dest="start_at",
+    ),
+    arg("--to NAME", "the second estimator (default: the highest of those)", dest="goal"),
+    arg(
+        "--estimators NAME,...",
+        "those that may be run between the two, with and without ingredients, or files (default: all)",
+        names,
+    ),
     _TRUTH,
     _OUT,
     arg("--since TIME", "leave out frames before it, as in 10s", seconds_from_start, dest="from_s"),
@@ -189,8 +197,8 @@ def _shown(comparison: Comparison, columns: Columns, form: str, *, first: bool) 
 )
 def explain(options: argparse.Namespace) -> int:
     """Run what lies between two estimators on one recording, and say what each ingredient in which they differ brings:
-    added to the first alone, and lost where the second lacks it; with 95 % intervals over seeds, or over stretches of
-    a recording. docs/explain.md tells how.
+    added as near to the first as can be, and taken away as near to the second; with 95 % intervals over 3 seeds or
+    more, or over stretches of a recording. docs/explain.md tells how.
     """
     from toolkit.cli.progress_display import of_this_process
     from toolkit.experiment.configuration import plan_of

@@ -46,7 +46,7 @@ EXCESS = "excess_pose"
 # What differences are taken of: the error, the variance beyond the Cramér-Rao bound, and the NEES.
 ERROR, VARIANCE = "error", "variance"
 # With fewer seeds, or values of one recording, nothing is tested.
-_FEWEST_SEEDS, _FEWEST_VALUES = 3, 2 * STRETCHES
+FEWEST_SEEDS, _FEWEST_VALUES = 3, 2 * STRETCHES
 GATE, NOISE, FUTURE = "gate and loss", "measured noise", "the future"
 OUTPUT, _REPAIR = "output", "repair of "
 _STATED: Mapping[str, Scalar] = {"noise.track_weight": 1.0, "noise.motion_scale": 1.0}
@@ -364,7 +364,7 @@ def _over_seeds(metric: str) -> dict[str, Measure]:
             return np.asarray(np.log(beyond + values))
 
     keys = {ERROR: (metric, 0.0), VARIANCE: (EXCESS, 1.0), NEES: (NEES, 0.0)}
-    return {name: Measure(partial(logs, *key), np.mean, _FEWEST_SEEDS) for name, key in keys.items()}
+    return {name: Measure(partial(logs, *key), np.mean, FEWEST_SEEDS) for name, key in keys.items()}
 
 
 def _over_stretches(metric: str) -> dict[str, Measure]:

@@ -12,7 +12,15 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
-from toolkit.experiment.explanation import ERROR, VARIANCE, Contribution, Explanation, Variant, called
+from toolkit.experiment.explanation import (
+    ERROR,
+    FEWEST_SEEDS,
+    VARIANCE,
+    Contribution,
+    Explanation,
+    Variant,
+    called,
+)
 from toolkit.experiment.statistics import Paired
 from toolkit.files.documents import Count, reader, rounded
 from toolkit.metrics import metrics_called
@@ -187,7 +195,8 @@ def _gap(found: ExplanationRecord) -> str:
     on = f"On {found.sequence.name}"
     if gap is None:
         ended = f"both ended well in {found.gap.ok} of {found.gap.runs} runs"
-        return f"{on} {start} and {goal} cannot be compared: {ended}, which is too few, or there are too few data."
+        takes = f"it takes {FEWEST_SEEDS} seeds" if found.intervals == "seeds" else "it takes a longer stretch of path"
+        return f"{on} {start} and {goal} cannot be compared: {ended}, and {takes}."
     if not gap.is_off:
         return f"{on} {over(found)} show no difference of {error_of(found)} between {start} and {goal} ({gap.range()})."
     better, worse, by = (goal, start, gap) if gap.factor > 1.0 else (start, goal, gap.inverse())
@@ -281,7 +290,10 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
         by_size = {"smaller": list(filter(_helps, likely)), "larger": [part for part in likely if not _helps(part)]}
         said = " and ".join(f"{size} with {_where_likely(found, some)}" for size, some in by_size.items() if some)
         yield f"Perhaps the error is {said}; among {_tests(found)} tests that may be chance: more data would tell."
-    rest = [part for part in silent if part not in likely]
+    unknown = [part for part in silent if not any(one.error for one in part.effects)]
+    if unknown and found.gap.error is not None:
+        yield f"Too few runs ended well to tell of {_joined([part.ingredient for part in unknown])}."
+    rest = [part for part in silent if part not in (*likely, *unknown)]
     if still_open := [
         part
         for part in rest
@@ -289,7 +301,7 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
     ]:
         yield f"Too few data to tell of {_listed(still_open)}: a factor of two is not excluded."
     if rest := [part for part in rest if part not in still_open]:
-        yield f"With {over(found)} the error shows no effect of {_listed(rest)}."
+        yield f"Over {over(found)} no effect on the error is found of {_listed(rest)}."
     if lacking := [part.ingredient for part in found.parts if not part.effects]:
         yield f"What {' and '.join(lacking)} brings cannot be measured: no two estimators differ in that alone."
 
@@ -297,8 +309,8 @@ def _not_shown(found: ExplanationRecord) -> Iterator[str]:
 def _beside(found: ExplanationRecord) -> Iterator[str]:
     if found.gap.error is not None and _tests(found) > 1:
         yield (
-            "A range alone is of the error without an ingredient over that with it; each effect holds beside what else "
-            "the estimators there have, so they need not multiply to the whole."
+            "A range in brackets that follows an ingredient's name is of the error without it over that with it. Each "
+            "effect holds beside what else the estimators there have, so they need not multiply to the whole."
         )
 
 
@@ -321,8 +333,8 @@ def _listed(parts: Sequence[IngredientRecord]) -> str:
     texts = []
     for part in parts:
         known = [one.error for one in part.effects if one.error]
-        whole = known and FactorRecord(factor=1.0, low=min(e.low for e in known), high=max(e.high for e in known))
-        texts.append(f"{part.ingredient} ({whole.range() if whole else 'too few runs ended well'})")
+        whole = FactorRecord(factor=1.0, low=min(e.low for e in known), high=max(e.high for e in known))
+        texts.append(f"{part.ingredient} ({whole.range()})")
     return _joined(texts)
 
 

@@ -134,9 +134,11 @@ def sweep_table(sweep: SweepRecord) -> Table:
             rows.append((*_named(at), told, *(in_words(effect.over_clean) for effect in effects)))
         else:
             rows.append(("clean", "", "", *_clean_cells(metric_of(sweep), list(effects))))
+    unknown = {(e.estimator, *one) for e in sweep.effects if e.over_clean is None for one in e.at.items()}
     for (name, _), sides in groupby(sweep.breaking, key=lambda one: (one.axis, one.tried)):
         axis = next(axis for axis in sweep.axes if axis.name == name)
-        rows.append((name, "breaks at", "", *(_breaking(one, axis) for one in sides)))
+        cells = (MISSING if (one.estimator, name, one.tried) in unknown else _breaking(one, axis) for one in sides)
+        rows.append((name, "breaks at", "", *cells))
     heads = ("over", "value", "audit says", *sweep.estimators)
     return Table(tuple((head, "", "") for head in heads), tuple(rows), labels=3, under=tuple(_under(sweep)))
 
