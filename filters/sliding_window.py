@@ -36,6 +36,7 @@ from toolkit.models.stereo_adjustment import (
     RobustCamera,
     Sightings,
     StereoWindow,
+    check_error,
     lower_factor,
     without,
 )
@@ -435,6 +436,7 @@ class SlidingWindow:
         """Take Gauss-Newton steps, halved until the error falls, until one would gain little; say whether one did."""
         tied = self._tied()
         tried = Tried.of(self._window, self._camera, self._left, tied)
+        check_error(tried.error)
         for _ in range(_MOST_STEPS):
             equations, window = Equations.of(tried, self._left, tied), self._window
             states, points, gain = equations.solved()

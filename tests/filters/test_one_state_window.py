@@ -14,6 +14,7 @@ from filters import iekf, sliding_window
 from tests.filters.conftest import short
 from toolkit import runner
 from toolkit.errors import EstimatorError
+from toolkit.models.stereo_adjustment import lower_factor
 from toolkit.settings import POLICIES, Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -73,3 +74,25 @@ def test_a_window_that_does_not_determine_its_states_says_so(monkeypatch):
     done = runner.run("sliding-window", sliding_window.build, sequence, sequence.prior)
     assert done.status == "failed"
     assert any("the window does not determine its states (5-th leading minor)" in line for line in done.log)
+
+
+@pytest.mark.parametrize("damaged", ["information", "vector"])
+def test_a_gaussian_with_nan_ends_the_run(damaged, monkeypatch):
+    """LAPACK raises for neither: one is without a root, the other without a step that lowers the error."""
+    keep = sliding_window.whole
+
+    def with_nan(information, vector, size):
+        parts = {"information": information.copy(), "vector": vector.copy()}
+        parts[damaged].flat[0] = np.nan
+        return keep(**parts, size=size)
+
+    monkeypatch.setattr(sliding_window, "whole", with_nan)
+    sequence = short(FLIGHT, 0.3, 20, 3)
+    done = runner.run("one", sliding_window.build, sequence, sequence.prior, settings=Settings(window=ONE_STATE))
+    assert done.status == "failed"
+    assert "not a number" in done.log[0]
+
+
+def test_a_factor_of_nan_is_none():
+    with pytest.raises(np.linalg.LinAlgError, match="not finite"):
+        lower_factor(np.array([[1.0, np.nan], [np.nan, 1.0]]))

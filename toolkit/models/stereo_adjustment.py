@@ -410,7 +410,11 @@ def _off_prior(window: StereoWindow) -> Array:
 def lower_factor(matrix: Array) -> Array:
     """Return the lower Cholesky factor of a symmetric matrix; raises LinAlgError where there is none."""
     # LAPACK is column-major and NumPy row-major: a symmetric matrix is its own transpose and need not be copied.
-    return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))
+    root = np.asarray(cholesky(matrix.T, lower=True, check_finite=False))
+    # OpenBLAS takes NaN for positive. A row of the factor that has any has it on the diagonal.
+    if not np.isfinite(np.diagonal(root)).all():
+        raise np.linalg.LinAlgError("the information matrix has entries that are not finite")
+    return root
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,8 +451,7 @@ class Ending:
 def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt; raise EstimatorError where it has none."""
     here, damping = Evaluated.of(window, camera), 0.0
-    if not np.isfinite(here.error):
-        raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
+    check_error(here.error)
     for _ in range(ending.iterations):
         system = here.linearised()
         step = _descent(here, system, damping, camera)
@@ -460,6 +463,12 @@ def solve_window(window: StereoWindow, camera: RobustCamera, ending: Ending) -> 
         return SolvedWindow(here.window, system.root)
     except np.linalg.LinAlgError as refusal:
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
+
+
+def check_error(error: float) -> None:
+    """Raise EstimatorError where a window's error is not finite: no step would be found to lower it."""
+    if not np.isfinite(error):
+        raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
 
 
 class Eliminated(NamedTuple):
