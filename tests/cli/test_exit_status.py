@@ -124,6 +124,14 @@ def test_an_interrupt_that_comes_out_as_another_error_is_130(vislam, one_line, m
     assert "interrupted" in one_line()
 
 
+def test_a_directory_that_is_gone_is_reported(vislam, one_line):
+    Path("gone").mkdir()
+    os.chdir("gone")
+    Path("../gone").rmdir()
+    assert vislam(*QUICK) == 71
+    assert "the current directory is no longer there; change to another one" in one_line()
+
+
 def test_a_full_shared_memory_is_not_taken_for_a_full_output(vislam, one_line, monkeypatch):
     monkeypatch.setattr(workers, "_executor", raiser(OSError(28, "No space left on device")))
     assert vislam(*QUICK, "--workers", "2") == 71

@@ -89,6 +89,7 @@ def _run(given: list[str]) -> int:
     try:
         options = parser().parse_args(given)
         options.command_line = ["vislam", *given]
+        _check_current_directory()
         _check_memory()
         status: int = options.command(options)
     except SystemExit:  # argparse leaves this way, after a help text too
@@ -97,6 +98,14 @@ def _run(given: list[str]) -> int:
     # Here and not at the interpreter's end, where a closed pipe or a full disk looks like a defect.
     sys.stdout.flush()
     return status
+
+
+def _check_current_directory() -> None:
+    """Raise SystemLimitError where the current directory was removed: relative paths and new processes need it."""
+    try:
+        os.getcwd()  # noqa: PTH109
+    except FileNotFoundError as error:
+        raise SystemLimitError("the current directory is no longer there; change to another one") from error
 
 
 def _check_memory() -> None:
