@@ -10,7 +10,8 @@ from tests.audit.conftest import LONGER_S, details, recording
 from toolkit.audit import audit
 from toolkit.audit.clocks import camera_offset, change_of_offset
 from toolkit.audit.fault import Evidence, Symptom, Undecided
-from toolkit.audit.timing import clock_change, clock_jump, uneven_stamps
+from toolkit.audit.self_calibration import LATE
+from toolkit.audit.timing import LEAST_OFFSET_S, clock_change, clock_jump, time_offset, uneven_stamps
 from toolkit.sequence import Sequence
 from toolkit.simulation import faults
 
@@ -176,3 +177,17 @@ def test_frames_are_not_shifted_where_the_gyro_alone_is_late(samples: int) -> No
     assert offset.warning and "the gyro alone is shifted" in offset.detail
     np.testing.assert_array_equal(found.sequence.frames_t_ns, late.frames_t_ns)
     assert "the frames are shifted by it" in details(audit(faults.camera_clock(clean, -0.1 * samples)))["time-offset"]
+
+
+def test_where_repeated_shifts_leave_as_much_the_offset_is_that_of_the_rotations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late = faults.camera_clock(recording("flight"), 0.02)
+    intervals, fitted = Evidence(late).intervals, Evidence(late).self_calibration
+    assert intervals is not None and fitted is not None
+    rotations = camera_offset(late, intervals)
+    assert rotations is not None and abs(fitted.value[LATE]) > LEAST_OFFSET_S
+    monkeypatch.setattr("toolkit.audit.fault.self_calibration", lambda *_: fitted)  # whatever the frames' stamps are
+    offset = time_offset(Evidence(late))
+    assert isinstance(offset, Symptom)
+    assert f"shifted by {1e3 * rotations.value:.1f} +- {1e3 * rotations.error:.1f} ms" in offset.detail

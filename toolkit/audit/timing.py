@@ -599,7 +599,8 @@ def _velocities_against(evidence: Evidence, shifted: Sequence, offset_s: float) 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
     """Return the self-calibration's offset, of frames that are shifted by a large one until little is left.
 
-    Its model is linear in the delay: 20 ms of a shaken camera are off by a quarter.
+    Its model is linear in the delay: 20 ms of a shaken camera are off by a quarter. Where that does not converge, the
+    offset of the rotations is returned.
     """
     if found is None or (fitted := evidence.self_calibration) is None:
         return found
@@ -608,10 +609,12 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
         shift_s, fitted = found.value, shifted
     for _ in range(SHIFTS):
         shift_s += float(fitted.value[LATE])
-        if abs(fitted.value[LATE]) < LEAST_OFFSET_S or (shifted := _fitted_after(evidence, shift_s)) is None:
+        if abs(fitted.value[LATE]) < LEAST_OFFSET_S:
+            return Scalar(shift_s, float(fitted.error[LATE]))
+        if (shifted := _fitted_after(evidence, shift_s)) is None:
             break
         fitted = shifted
-    return Scalar(shift_s, float(fitted.error[LATE]))
+    return found
 
 
 def _fitted_after(evidence: Evidence, shift_s: float) -> SelfCalibration | None:
