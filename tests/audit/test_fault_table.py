@@ -174,6 +174,7 @@ CASES = [
     Case(faults.disturbed_motion, 2.0, "conflict", "warned", "m/s^2 of specific force", IMU),
     Case(faults.moving_objects, 0.8, "conflict", "warned"),
     Case(faults.turned_camera, 0.035, "miscalibration", "warned", "about its own x, y, z", IMU),
+    Case(faults.turned_camera, 0.5, "miscalibration", "warned", "rad against T_imu_cam", IMU),
     Case(faults.wrong_focal_length, 1.1, "miscalibration", "warned", "tracks and odometry fit fx_px = 7", TWIST),
     Case(faults.wrong_aspect, 0.85, "miscalibration", "warned", "tracks and odometry fit fx_px = 7", TWIST),
     Case(faults.shifted_centre, 25.0, "miscalibration", "warned", "tracks and odometry fit cx_px = 6", TWIST),

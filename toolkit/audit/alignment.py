@@ -35,7 +35,7 @@ MOST_SIGMAS = 4.0
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
 # The same of sound recordings with an IMU (m), which have 0.06 at most.
 BESIDE_IMU_M = 0.05
-# Limit of a rotation (rad) beyond chance: slip and pitch of cars bias it.
+# Limit of a rotation (rad) by velocities beyond chance: slip and pitch of cars bias it.
 SYSTEMATIC_RAD = 0.018
 # Axes known worse than the best one by this factor are not judged, as that of the direction of travel by velocities.
 MOST_ERROR_RATIO = 4.0
@@ -105,6 +105,16 @@ def velocity_fit(intervals: Intervals, step_s: float) -> VelocityFit:
     by_chance = (1.0 + scale) ** 2 * float(bound[0])
     turn = _tested(found[_TURN], formal[_TURN, _TURN], lasting[_TURN, _TURN], moving)
     return VelocityFit(Scalar(scale, error), by_chance, Position(found[_LEVER], cov[_LEVER, _LEVER]), turn)
+
+
+def turn_by_rotations(intervals: Intervals) -> Turn:
+    """Return the rotation that aligns the camera's rates of rotation with the gyro's, less its bias."""
+    seen = intervals.w_seen_radps
+    bias = np.tile(np.eye(3), (len(seen), 1, 1))
+    response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
+    found, formal = regression(response, jacobian)
+    cov = jackknife_cov(_robust_solution, response, jacobian)
+    return _tested(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES))
 
 
 def _tested(rad: Array, formal: Array, cov: Array, stretches: float) -> Turn:

@@ -10,6 +10,7 @@ from toolkit.audit.alignment import (
     Turn,
     VelocityFit,
     metres,
+    turn_by_rotations,
 )
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
@@ -404,6 +405,10 @@ def lever_arm(evidence: Evidence, intervals: Intervals) -> Symptom | Undecided |
 RATIO_SIGMAS, SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 5.0, 0.05, 0.025
 # Where only a rotation (rad) larger than this would be found, the finding is undecided and says so.
 LARGEST_RAD = 0.05
+# With an IMU the self-calibration finds rotations (rad) up to about this one. Larger ones, for which it finds no
+# calibration, are seen in the rates of rotation; what other faults look like there is smaller (0.115 at most).
+FAR_RAD = 0.2
+SLIP = "wheel slip that lasts for seconds is as large"
 
 
 @beside_camera
@@ -411,7 +416,7 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     """Report small errors of the calibration that bend a trajectory: rotation, K, the accelerometer's scale.
 
     Points followed over a second show most of them (`self_calibration`). With odometry, whose slip lasts as long, the
-    rotation by its velocities is judged as well.
+    rotation by its velocities is judged as well; with an IMU and no calibration that fits, a large one by the rates.
     """
     sequence, rig, kind, found = (
         evidence.sequence,
@@ -424,7 +429,7 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     wrongs = [] if found is None else wrong(found, rig, kind)
     unseen = [f"the intrinsics: {_unfitted(kind)}" if found is None else hidden(found, kind)]
     if evidence.velocity_fit is not None:
-        turned, unturned = _by_turn(evidence.velocity_fit.turn, rig)
+        turned, unturned = _by_turn(evidence.velocity_fit.turn, rig, SYSTEMATIC_RAD, SLIP)
         wrongs, unseen = wrongs or turned, [unturned, *unseen]
         rate = rotation_ratio(intervals)
         if 1.0 + RATIO_SIGMAS * rate.error + SYSTEMATIC_RATE < rate.value < MOST_RATIO:
@@ -432,6 +437,9 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
             wrongs.append((summary, "the scale of the gyro and the focal length"))
     elif found is not None:
         unseen = [doubtful(found, rig, kind), *unseen]
+    else:
+        wrongs, unturned = _by_turn(turn_by_rotations(intervals), rig, FAR_RAD, "rates of rotation alone tell of it")
+        unseen = [unturned, *unseen]
     force = force_ratio(sequence)
     near = force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO  # else a `disagreement`
     if force is not None and near and abs(force.value - 1.0) > RATIO_SIGMAS * force.error + SYSTEMATIC_FORCE:
@@ -446,8 +454,8 @@ def miscalibration(evidence: Evidence, intervals: Intervals) -> Symptom | Undeci
     )
 
 
-def _by_turn(turn: Turn, rig: StereoRig) -> tuple[list[Wrong], str]:
-    least_rad = SYSTEMATIC_RAD + turn.by_chance_rad
+def _by_turn(turn: Turn, rig: StereoRig, systematic_rad: float, why: str) -> tuple[list[Wrong], str]:
+    least_rad = systematic_rad + turn.by_chance_rad
     least = float(least_rad.min())
     if (np.abs(turn.rad) > least_rad).any():
         angle, error = turn.angle
@@ -459,7 +467,7 @@ def _by_turn(turn: Turn, rig: StereoRig) -> tuple[list[Wrong], str]:
     if least < LARGEST_RAD:
         return [], ""
     unseen = f"a rotation of it by less than {least:.2f} rad" if np.isfinite(least) else "any rotation of it"
-    return [], f"the camera's orientation: {unseen} would not show, for wheel slip that lasts for seconds is as large"
+    return [], f"the camera's orientation: {unseen} would not show, for {why}"
 
 
 # Limit of the scale beyond chance (0.044 +- 0.007 in cars), and the largest standard error with which it is judged.
