@@ -498,7 +498,9 @@ def _scale_beside_odometry(found: VelocityFit) -> Symptom | Undecided | None:
         return Symptom.warning(_steps(found.scale, "odometry"), cause) if is_scale else None
     hidden = found.scale_by_chance + abs(scale)
     off = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
-    unseen = f"{off}: less than {100.0 * hidden:.1f} % would not show beside what slip causes"
+    if error > LARGEST_SCALE_ERROR:
+        return Undecided(f"{off}: too little change of velocity to judge that")
+    unseen = f"{off}: a fault of less than {100.0 * hidden:.1f} % would not show beside what slip causes"
     return None if hidden < LARGEST_HIDDEN_SCALE["twist"] else Undecided(unseen)
 
 
