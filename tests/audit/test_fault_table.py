@@ -278,6 +278,7 @@ MEASURED = [
     # The noise of the camera's rotation lowers the ratio by up to 1.5 %.
     Measured(miscalibration, faults.angular_unit, 1.1, ("drive", 61, 12.0, True), TURNS, 1.1, 0.015),
     Measured(gyro_scale, faults.angular_unit, 1.1, ("flight", 61, 6.0, True), TURNS, 1.1, 0.01),
+    Measured(miscalibration, faults.angular_unit, 1.03, ("flight-realistic", 0, 8.0), TURNS, 1.03, 0.005),
     Measured(clock_change, faults.camera_clock_step, 0.08, ("drive-imu", 102, 12.0), PARTS, -80.0, 2.5),
     Measured(clock_change, faults.camera_clock_step, 0.08, ("flight", 102, 6.0), PARTS, -80.0, 2.5),
     Measured(clock_change, faults.camera_clock_step, 0.025, ("flight-realistic", 102, 5.0), PARTS, -25.0, 2.5),
