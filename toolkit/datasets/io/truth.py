@@ -140,7 +140,7 @@ def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | No
 def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | None:
     """Return the truth of a recording and why, None where there is none; of several, that which fits the gyro's rates.
 
-    Raises DataError where one is damaged, or the best has no time in common with the IMU.
+    Raises DataError where one is damaged, or too few poses of the best are close to one another in the IMU's time.
     """
     read = {path: _read(path, mav0) for path in _tables(root, mav0)}
     if not read:
@@ -150,9 +150,9 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> TruthRead | No
     ranked = sorted(apart.items(), key=lambda item: item[1][0])
     best, (least, turning) = ranked[0]
     if not np.isfinite(least):
-        raise DataError(
-            f"{best}: it and the IMU have less than 0.2 s in common; check that both are of one recording and clock"
-        )
+        few = f"in the IMU's time it has less than 0.2 s of poses that are within {_LONGEST_STEP_S:g} s of one another"
+        remedy = "check that both are of one recording and clock, and give a truth of 10 Hz or more"
+        raise DataError(f"{best}: {few}; {remedy}")
     scatters = "; ".join(f"{path.relative_to(root)} by {off:.4f} rad/s" for path, (off, _) in ranked)
     among = "" if len(ranked) == 1 else ", the better of those in the folder"
     stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * turning) else ""
