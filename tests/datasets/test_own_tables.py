@@ -151,9 +151,10 @@ def test_a_folder_named_by_a_dot_has_its_own_name(tmp_path: Path, monkeypatch: p
         (("vR",), np.nan),
         *((("uR", "vR"), filler) for filler in (-1.0, 0.0, -999.0)),
         (("uR",), None),
+        (("uR",), "masked"),
         (("uR", "vR"), " "),
     ],
-    ids=["no uR", "no vR", "-1", "0", "-999", "masked", "empty"],
+    ids=["no uR", "no vR", "-1", "0", "-999", "None", "masked", "empty"],
 )
 def test_a_right_image_that_is_missing_leaves_the_sighting_of_the_left_one(
     tmp_path: Path, columns: tuple[str, ...], missing: float | str | None
@@ -164,7 +165,7 @@ def test_a_right_image_that_is_missing_leaves_the_sighting_of_the_left_one(
     for name in columns:
         masked = np.ma.masked_array(np.where(lacking, 1.0, given["tracks"][name]), lacking)
         filled = np.where(lacking, np.array(missing, dtype=object), given["tracks"][name])
-        given["tracks"][name] = masked if missing is None else filled
+        given["tracks"][name] = masked if missing == "masked" else filled
     uv_px = own_tables.read("own", **given, rig=rig_of(sequence)).sequence.observations.uv_px
     np.testing.assert_array_equal(is_left_only(uv_px), lacking)
     np.testing.assert_allclose(uv_px[:, [0, 2]], seen.uv_px[:, [0, 2]], rtol=0.0, atol=1e-12)  # v is a mean of two

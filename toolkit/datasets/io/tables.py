@@ -164,14 +164,15 @@ class Columns:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
         if values.dtype.kind == "c":
             raise DataError(f"{self.what}: column {name} holds complex numbers; give their real parts")
-        cells: list[Any] = values.tolist()
+        # NumPy gives dates of nanoseconds as whole numbers, which are no column's.
+        cells: list[Any] = list(map(str, values)) if values.dtype.kind in "mM" else values.tolist()
         return cells
 
     def _numbers(self, name: str, empty: str) -> Array:
         cells = self._cells(name)
         if self.given is not None and self.given[name].dtype.kind in "fiu":
             return self.given[name].astype(np.float64)
-        cells = [cell.strip() or empty if isinstance(cell, str) else cell for cell in cells]
+        cells = [np.nan if cell is None else cell.strip() or empty if isinstance(cell, str) else cell for cell in cells]
         bad = next((row for row, cell in enumerate(cells) if not is_number(cell)), None)
         if bad is not None:
             shown = printable(str(cells[bad]))[:50] or "empty"
