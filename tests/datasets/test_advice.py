@@ -523,7 +523,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (put(time_stamps=np.array([[0, 1, np.nan, 3, 4]])), "(1 such stamps); remove these samples"),
         (
             put(time_stamps=np.array([[0, 1, 1e300, 3, 4]])),
-            "which no unit makes a time of (1 such stamps)",
+            "beyond the year 2262 (1 such stamps)",
         ),
         (put(time_stamps=FEW_S + 1e300), "(5 such stamps); correct them"),
         (put(time_stamps=1.3e18 + 1e9 * FEW_S), "divide by 1e9", put(time_stamps=(1.3e18 + 1e9 * FEW_S) / 1e9)),
@@ -680,6 +680,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (say(*IMPORT, "."), "and cannot be replaced; name one inside it", INTO),
         (say(*IMPORT, "n" * 201), "too long for a recording; shorten it", INTO),
         (kept(tracks=3), "give a dict of arrays", kept()),
+        (kept(tracks=OWN["tracks"] | {"uL": OWN["tracks"]["uL"].astype("M8[ns]")}), "uL is 1970-01-01T00:00", kept()),
         (kept(tracks=OWN["tracks"] | {"uL": OWN["tracks"]["uL"] * 1j}), "give their real parts", kept()),
         (
             call(lambda at: load_sequence(str(at)).truncated(-1)),
@@ -734,7 +735,10 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
     "odometry": [
         (edit("calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
         (text("calib.txt", f"7,2 0 3\n{P}\n{P}\n"), "P0 holds text, expected real numbers"),
-        (text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 5 images; cut both alike, or take its own"),
+        (
+            text("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
+            "1 poses for 5 images; cut both alike, or take the poses of this sequence",
+        ),
         (text("times.txt", "0\n0.1\nx\n"), "times.txt: line 3 is not numeric"),
         (text("times.txt", "".join(f"{k}00000000\n" for k in range(FRAMES))), "look like nanoseconds: divide by 1e9"),
         (text("times.txt", ""), "times.txt has one number a line, in seconds"),

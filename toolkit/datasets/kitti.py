@@ -269,7 +269,8 @@ def _poses(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
         raise DataError(f"{file}: {why}; {remedy}")
     T_world_cam = poses.T_world_imu
     if len(T_world_cam) not in (stamps.size, _count(layout)):
-        raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; cut both alike, or take its own")
+        counts = f"{len(T_world_cam)} poses for {stamps.size} images"
+        raise DataError(f"{file}: {counts}; cut both alike, or take the poses of this sequence")
     T_cam_flu = np.linalg.inv(T_FLU_CAM)
     posed = stamps[: len(T_world_cam)]
     used = np.flatnonzero(np.isin(posed, t_ns))

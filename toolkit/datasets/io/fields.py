@@ -157,7 +157,7 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
         far = np.abs(stamps_s) > NS_PER_S * _LATEST_NS_S
     if far.any():
         shown = f"{key}[{far.argmax()}] is {stamps_s[far.argmax()]:g} s"
-        raise DataError(f"{path}: {shown}, which no unit makes a time of ({far.sum()} such stamps); correct them")
+        raise DataError(f"{path}: {shown}, beyond the year 2262 ({far.sum()} such stamps); correct them")
     unit = _unit_of(stamps_s)
     coarse_s = (1.0 if unit is None else unit[0]) * float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
     if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s):
