@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_inverse, se3_log
-from toolkit.models.corrections import predicted_steps
+from toolkit.measurements import ImuMotion
+from toolkit.models.corrections import _averaged, predicted_steps
 from toolkit.motion_samples import Bridges
 from toolkit.simulation import FLIGHT, simulate
 
@@ -26,3 +28,16 @@ def test_averaged_samples_predict_the_same_poses_and_noise():
     assert np.abs(off[:, 3:]).max() < 1e-4
     noise = [np.diagonal(each.predictions.noise, axis1=1, axis2=2) for each in (exact, averaged)]
     np.testing.assert_allclose(noise[1], noise[0], rtol=0.2)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 200])
+def test_no_average_is_longer_than_said_where_durations_divide_it(rate_hz):
+    """Over many frames, whose durations add up with rounding; the integrals over each stay."""
+    rng, count = np.random.default_rng(1), rate_hz // 10
+    dt_s = np.full(count, 1.0 / rate_hz)
+    samples = [rng.normal(size=(2, count, 3)) for _ in range(300)]
+    averaged = _averaged([ImuMotion(dt_s, accel, gyro) for accel, gyro in samples], 0.02)
+    assert {motion.dt_s.size for motion in averaged} == {5}
+    for motion, (accel, gyro) in zip(averaged, samples, strict=True):
+        np.testing.assert_allclose(motion.dt_s @ motion.accel_mps2, dt_s @ accel, atol=1e-12)
+        np.testing.assert_allclose(motion.dt_s @ motion.gyro_radps, dt_s @ gyro, atol=1e-12)

@@ -109,14 +109,18 @@ def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int
 
 
 def _averaged(motions: list[Motion], longest_s: float) -> list[Motion]:
-    """Return motions with the samples of an IMU averaged over up to ``longest_s``; all others as they are."""
+    """Return motions with averages of IMU samples, whose middles are within ``longest_s``; all others as they are.
+
+    An average keeps the integral of its samples over time, and the covariance of that.
+    """
     measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
     if not longest_s or len(measured) < len(motions):
         return motions
     counts = np.array([motion.dt_s.size for motion in measured])
     begins, dt_s = np.cumsum(counts) - counts, np.concatenate([motion.dt_s for motion in measured])
     middles_s = np.cumsum(dt_s) - 0.5 * dt_s
-    parts = np.floor((middles_s - np.repeat(middles_s[begins], counts)) / longest_s)
+    # What sums of durations are rounded by is far below the share that is added: samples of 50 Hz stay single ones.
+    parts = np.floor((middles_s - np.repeat(middles_s[begins], counts)) / longest_s + 1e-6)
     is_first = np.append(True, parts[1:] != parts[:-1])
     is_first[begins] = True
     first = np.flatnonzero(is_first)
