@@ -39,11 +39,9 @@ class Spread:
 
 
 class QuantilesAll(Struct, frozen=True, kw_only=True):
-    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it.
+    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it."""
 
-    Its score until then does not show how it would have gone on.
-    """
-
+    # A run's score until it failed or diverged does not show how it would have gone on.
     lower_quartile: float | None
     median: float | None
     upper_quartile: float | None
