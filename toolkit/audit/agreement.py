@@ -33,7 +33,7 @@ def disagreement(evidence: Evidence, intervals: Intervals) -> Symptom | Undecide
     residuals = f"the tracks' residuals from frame to frame are {found.residual_px:.2f} px against the measured motion"
     explained = f"(median; noise explains {found.limit_px:.2f} px at most)"
     findings.append(f"{residuals} {explained} and {found.own_px:.2f} px against the camera motion that fits them best")
-    treatment = "T_imu_cam, the intrinsics, the baseline or the samples are wrong: check them"
+    treatment = "T_imu_cam, the intrinsics, the baseline or the samples (their unit or axes) are wrong: check them"
     if found.own_px > found.limit_px:
         treatment = "the intrinsics or the tracks themselves are wrong: check K and the pixels"
     return Symptom(count=1, detail="; ".join(findings), treatment=treatment, remedy=None)
