@@ -319,3 +319,9 @@ def test_a_focal_length_beyond_chance_and_below_what_counts_is_reported() -> Non
     assert match is not None
     assert float(match[1]) == pytest.approx(sound.rig.fx_px, abs=4.0 * float(match[2]))
     assert "more than chance" in reported.undecided["miscalibration"]
+
+
+def test_a_turned_camera_is_no_late_one() -> None:
+    """Rotations alone have it 57 +- 5 ms late."""
+    found = {finding.fault for finding in audit(faults.turned_camera(recorded(FLIGHT, 7, 6.0), 0.1, 7)).findings}
+    assert "miscalibration" in found and "time-offset" not in found
