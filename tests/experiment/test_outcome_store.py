@@ -243,6 +243,18 @@ def test_a_line_that_was_edited_or_is_damaged_is_refused_with_its_number(store, 
         OutcomeStore(tmp_path, Conditions("hash"))
 
 
+def test_a_line_of_an_earlier_version_is_counted_and_never_found(store, tmp_path):
+    """It has no checksum, and is of other code in any case."""
+    store.keep(UNIT, OUTCOME)
+    store.close()
+    path = tmp_path / OUTCOMES
+    path.write_bytes(path.read_bytes().replace(b"vislam.outcome/2", b"vislam.outcome/1"))
+    again = OutcomeStore(tmp_path, Conditions("hash"))
+    assert again.unusable == 1
+    assert again.find(UNIT) is None
+    again.close()
+
+
 @pytest.mark.parametrize("name", ["../notes.txt", "notes.txt", "/etc/hosts", "trajectories/../notes.txt"])
 def test_a_line_makes_no_file_elsewhere_ours(tmp_path, name):
     (tmp_path / OUTCOMES).write_text(f'{{"schema":"vislam.outcome-files/1","files":["{name}"]}}\n')

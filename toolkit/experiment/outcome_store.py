@@ -32,8 +32,8 @@ from toolkit.settings import Settings, as_values
 Number = float | str | None
 Series = Annotated[tuple[Number, ...], Meta(description="one a frame; null where unknown")]
 OUTCOMES, _TRAJECTORIES = "outcomes.jsonl", "trajectories"
-# Every line of such a file begins so.
-_OUR_START = b'{"schema":"vislam.outcome'
+# Every line of such a file begins so. Those of the first version had no checksum, and are of other code.
+_OUR_START, _OF_VERSION_1 = b'{"schema":"vislam.outcome', b'{"schema":"vislam.outcome/1"'
 _FILES_START = b'{"schema":"vislam.outcome-files/1"'
 # Series of an output.
 _SERIES = ("nees_pose", "position_m", "drift_m", "heldout_px")
@@ -192,6 +192,7 @@ class OutcomeStore:
         self._path = directory / OUTCOMES
         self._lines = LineFile(self._path) if self._path.exists() else None
         self._records: dict[bytes, list[OutcomeRecord]] = {}
+        self._of_version_1 = 0
         try:
             for number, line in enumerate(whole_lines(read_input(self._path)) if self._lines else (), start=1):
                 self._read(line, number)
@@ -201,6 +202,9 @@ class OutcomeStore:
 
     def _read(self, line: bytes, number: int) -> None:
         """Take in a line; a last one without its end, cut off by a kill, is none."""
+        if line.startswith(_OF_VERSION_1):
+            self._of_version_1 += 1
+            return
         try:
             record = _DECODER.decode(line)
         except msgspec.DecodeError as error:
@@ -217,7 +221,8 @@ class OutcomeStore:
     @property
     def unusable(self) -> int:
         """Return how many outcomes are of other data, code or repairs, so that no unit of the case can use them."""
-        return sum(not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
+        of_others = (not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
+        return self._of_version_1 + sum(of_others)
 
     def find(self, unit: Unit) -> Outcome | None:
         """Return the outcome of a unit with everything that is requested of it, or None."""
