@@ -48,6 +48,16 @@ def test_lines_of_long_work_are_ever_more_seldom(monkeypatch):
     assert 11 <= last_hour <= 12  # one every five minutes in the end
 
 
+def test_the_time_is_that_since_the_work_began_whatever_becomes_known_of_its_length(monkeypatch):
+    clock_s = itertools.count()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock_s)))
+    stream = io.StringIO()
+    with progress.on_stream(stream)("explain") as watched:
+        for done in range(61):
+            watched.advance(done, 100 + done)
+    assert "explain 37 % [01:00, left 01:41" in stream.getvalue()
+
+
 def test_a_terminal_sees_a_bar_that_is_gone_at_the_end():
     stream = Terminal()
     with progress.on_stream(stream)("8 runs") as watched:

@@ -120,7 +120,9 @@ def test_other_measures_tell_of_what_the_error_does_not_show_and_only_of_that() 
     worse = msgspec.structs.replace(effect(A, BETWEEN, 0.5), shown=False, also_shown=("variance", "nees"))
     clear = effect(A, BETWEEN, 2.3, also_shown=("variance", "nees"))
     silent = msgspec.structs.replace(effect(A, BETWEEN, 1.1), shown=False)
-    found = explanation(part("salt", hidden), part("pepper", worse), part("tea", clear), part("oil", silent))
+    tiny = msgspec.structs.replace(effect(A, BETWEEN, 1.001, 1.0001), shown=False, also_shown=("variance",))
+    given = {"salt": hidden, "pepper": worse, "tea": clear, "oil": silent, "flour": tiny}
+    found = explanation(*(part(name, one) for name, one in given.items()))
     assert (
         "Other figures show more than the error, beyond chance: the variance of the pose over its bound is 2.00 times "
         "larger with pepper (1.90 to 2.10) and 1.20 times smaller with salt (1.14 to 1.26); the NEES is 2.00 times "

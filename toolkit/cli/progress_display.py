@@ -48,8 +48,9 @@ class _Bar:
         self._bar = tqdm(desc=label, total=0, file=stream, leave=False, dynamic_ncols=True, bar_format=_FORMAT)
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        if total != self._bar.total or done < self._bar.n:
-            self._bar.reset(total)
+        if done < self._bar.n:
+            self._bar.reset()
+        self._bar.total = total  # which may become known better on the way
         if stage != self._stage:
             self._stage = stage
             self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label)
@@ -64,15 +65,15 @@ class _Log:
 
     def __init__(self, label: str, stream: TextIO) -> None:
         self._label, self._stream = label, stream
-        self._done, self._total, self._began_s = 0, 0, time.monotonic()
+        self._done, self._began_s = 0, time.monotonic()
         self._first_s = self._shown_s = self._began_s
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Write a line if enough time has passed since the last one."""
         now_s = time.monotonic()
-        if total != self._total or done < self._done:
+        if done < self._done:
             self._began_s = now_s
-        self._done, self._total = done, total
+        self._done = done
         if now_s - self._shown_s < max(LOG_EVERY_S, min(_LOG_SHARE * (now_s - self._first_s), _LOG_AT_MOST_S)):
             return
         from tqdm import tqdm

@@ -41,6 +41,8 @@ _DIGITS = 3
 _KEYS: dict[Other, str] = {"variance": VARIANCE, "nees": NEES}
 # So many ingredients a sentence names; the table has all.
 _MOST_NAMED = 3
+# An effect of less than a hundredth may be certain, and is not worth a sentence.
+_LEAST_TOLD = 0.01
 
 
 class VariantRecord(Struct, frozen=True, kw_only=True):
@@ -267,7 +269,7 @@ def _by_other_measures(found: ExplanationRecord) -> Iterator[str]:
         effects: list[tuple[FactorRecord, str]] = []
         for part in found.parts:
             shown = [getattr(one, measure) for one in part.effects if one.shows(measure)]
-            if shown and not _is_shown(part):
+            if shown and not _is_shown(part) and abs(math.log(shown[0].factor)) > _LEAST_TOLD:
                 effects.append((shown[0], part.ingredient))
         effects.sort(key=lambda pair: -abs(math.log(pair[0].factor)))
         clauses = [_size_told(change, f"with {ingredient} ") for change, ingredient in effects[:_MOST_NAMED]]
