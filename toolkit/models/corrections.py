@@ -124,9 +124,10 @@ def _averaged(motions: list[Motion], longest_s: float) -> list[Motion]:
     is_first = np.append(True, parts[1:] != parts[:-1])
     is_first[begins] = True
     first = np.flatnonzero(is_first)
-    samples = [np.hstack([each.accel_mps2, each.gyro_radps, noise_scale_of(each) ** 2]) for each in measured]
+    samples = [(each.accel_mps2, each.gyro_radps, noise_scale_of(each) ** 2) for each in measured]
+    columns = np.hstack([np.concatenate(part) for part in zip(*samples, strict=True)])
     lengths_s = np.add.reduceat(dt_s, first)
-    means = np.add.reduceat(dt_s[:, None] * np.concatenate(samples), first) / lengths_s[:, None]
+    means = np.add.reduceat(dt_s[:, None] * columns, first) / lengths_s[:, None]
     ends = np.append(np.searchsorted(first, begins[1:]), first.size).tolist()
     return [
         _averaged_motion(motion, lengths_s[begin:end], means[begin:end])
