@@ -33,8 +33,6 @@ _FEWEST_TESTED = 200
 # What a correction may do beyond the noise of the motion where it corrects a velocity and biases as well:
 # rad/s of turn rate and m/s of velocity.
 _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
-# Samples of an IMU are averaged over up to this time, which moves a predicted pose by far less than that.
-_AVERAGED_S = 0.02
 
 # No trajectory goes farther from its first pose than this many times the path that odometry measured (at a quarter
 # more, vision and odometry disagree already). Beside an IMU, which measures no path, the limit is this speed (m/s)
@@ -123,7 +121,7 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
 
 def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
     """Return the squared Mahalanobis distances (S,) of steps between neighbouring frames from the measured motion."""
-    steps = predicted_steps(trajectory, sequence, _AVERAGED_S)
+    steps = predicted_steps(trajectory, sequence)
     if steps is None:
         return np.empty(0)
     transition, noise = steps.predictions.transition[:, POSE], steps.predictions.noise[:, POSE, POSE]

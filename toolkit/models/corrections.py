@@ -15,7 +15,7 @@ import numpy as np
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray
-from toolkit.measurements import ImuMotion, Motion, noise_scale_of
+from toolkit.measurements import Motion
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief, Prediction
@@ -80,13 +80,10 @@ class PredictedSteps(NamedTuple):
     predictions: Prediction
 
 
-def predicted_steps(
-    trajectory: Trajectory, sequence: Sequence, samples_longest_s: float = 0.0
-) -> PredictedSteps | None:
+def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> PredictedSteps | None:
     """Return the steps between neighbouring frames of which the trajectory has both, None where there are none.
 
-    Its stamps must be those of frames. The samples of an IMU may be averaged over up to ``samples_longest_s``, which
-    takes less time.
+    Its stamps must be those of frames.
     """
     intervals = list(_intervals(trajectory, sequence))
     if not intervals:
@@ -95,8 +92,7 @@ def predicted_steps(
     starts, ends, motions = zip(*intervals, strict=True)
     start, beliefs = np.array(starts), belief_at(trajectory, np.array(starts), model)
     dt_s = np.array([np.sum(motion.dt_s) for motion in motions])
-    predictions = model.predict_each(_averaged(list(motions), samples_longest_s), beliefs)
-    return PredictedSteps(start, np.array(ends), dt_s, beliefs, predictions)
+    return PredictedSteps(start, np.array(ends), dt_s, beliefs, model.predict_each(list(motions), beliefs))
 
 
 def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
@@ -106,35 +102,3 @@ def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
         if start is not None and end is not None and packet.motion is not None:
             yield start, end, packet.motion
-
-
-def _averaged(motions: list[Motion], longest_s: float) -> list[Motion]:
-    """Return motions with averages of IMU samples, whose middles are within ``longest_s``; all others as they are.
-
-    An average keeps the integral of its samples over time, and the covariance of that.
-    """
-    measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
-    if not longest_s or len(measured) < len(motions):
-        return motions
-    counts = np.array([motion.dt_s.size for motion in measured])
-    begins, dt_s = np.cumsum(counts) - counts, np.concatenate([motion.dt_s for motion in measured])
-    middles_s = np.cumsum(dt_s) - 0.5 * dt_s
-    # What sums of durations are rounded by is far below the share that is added: samples of 50 Hz stay single ones.
-    parts = np.floor((middles_s - np.repeat(middles_s[begins], counts)) / longest_s + 1e-6)
-    is_first = np.append(True, parts[1:] != parts[:-1])
-    is_first[begins] = True
-    first = np.flatnonzero(is_first)
-    samples = [(each.accel_mps2, each.gyro_radps, noise_scale_of(each) ** 2) for each in measured]
-    columns = np.hstack([np.concatenate(part) for part in zip(*samples, strict=True)])
-    lengths_s = np.add.reduceat(dt_s, first)
-    means = np.add.reduceat(dt_s[:, None] * columns, first) / lengths_s[:, None]
-    ends = np.append(np.searchsorted(first, begins[1:]), first.size).tolist()
-    return [
-        _averaged_motion(motion, lengths_s[begin:end], means[begin:end])
-        for motion, begin, end in zip(measured, [0, *ends], ends, strict=False)
-    ]
-
-
-def _averaged_motion(motion: ImuMotion, lengths_s: Array, means: Array) -> ImuMotion:
-    scale = None if motion.noise_scale is None else np.sqrt(means[:, 6:])
-    return ImuMotion(lengths_s, means[:, :3], means[:, 3:6], scale)
