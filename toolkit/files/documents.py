@@ -129,7 +129,9 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
 
 
 def schema(record: type[msgspec.Struct]) -> Json:
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(record)}
+    # Descriptions are docstrings, which Python indents as their source is, up to 3.12.
+    told = re.sub(r"\\n {4,}", r"\\n", json.dumps(msgspec.json.schema(record)))
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **json.loads(told)}
 
 
 class _NotFinite:
