@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from toolkit.experiment.sweep import CLEAN, Axis, Point, Sweep, run_sweep
 from toolkit.experiment.units import Outcome, Scored
 from toolkit.metrics import Scores
 from toolkit.registry import find
+from toolkit.report.sweep import sweep_document, sweep_table
 from toolkit.settings import SettingsError
 from toolkit.settings.reading import settings_of
 
@@ -69,6 +71,18 @@ def test_ratios_are_paired_by_seed(plan):
     effect = over_doses(plan, axis, [1.3, 2.0]).effects["ekf", axis.points[0]]
     assert effect.over_clean == pytest.approx((1.3, 1.3, 1.3))  # though clean errors scatter fourfold
     assert effect.nees is not None and effect.nees.high > 1.2 * effect.nees.low
+
+
+def test_a_dose_whose_effect_is_unknown_is_not_one_that_an_estimator_survives(plan):
+    axis = Axis.of(FRAMES, [0.2, 0.4], plan)
+    document = sweep_document(over_doses(plan, axis, [1.0, 1.5]))
+    unknown = [
+        msgspec.structs.replace(one, over_clean=one.over_clean if one.at.get(FRAMES) != 0.4 else None)
+        for one in document.effects
+    ]
+    told = [sweep_table(one).rows[-1] for one in (document, msgspec.structs.replace(document, effects=tuple(unknown)))]
+    assert [row[1] for row in told] == ["breaks at"] * 2
+    assert [row[-1] for row in told] == [">0.400", "-"]
 
 
 def test_an_estimator_breaks_where_it_passes_three_times_clean(plan):
