@@ -122,7 +122,7 @@ class Effect(NamedTuple):
 class Breaking(Struct, frozen=True):
     """The dose at which an estimator passes three times its clean error, on a side of the clean one, with its interval.
 
-    None is beyond the largest dose, ``tried``, that was run, or unknown where the effect there is; a ``dose`` is between
+    None is beyond the largest dose, ``tried``, that was run, or unknown as the effect there is; a ``dose`` is between
     two that were.
     """
 
