@@ -60,11 +60,7 @@ class Msckf:
     """
 
     def __init__(
-        self,
-        setup: Setup,
-        at: Linearisation,
-        landmarks: int = 0,
-        belief: Callable[[Belief], JointBelief] = JointBelief,
+        self, setup: Setup, at: Linearisation, landmarks: int = 0, belief: Callable[[Belief], JointBelief] = JointBelief
     ) -> None:
         self.log = load_kernels(setup.progress)
         self._rig, self._at, self._outliers = setup.rig, at, setup.settings.outliers

@@ -244,9 +244,7 @@ def show_change(before: Result, after: Result, metrics: dict[str, str]) -> None:
 
 
 show_change(
-    white,
-    measured,
-    {"kitti_t_percent": "KITTI drift [%]", "ate_yaw_m": "ATE, heading and position fitted [m]"},
+    white, measured, {"kitti_t_percent": "KITTI drift [%]", "ate_yaw_m": "ATE, heading and position fitted [m]"}
 )
 
 # %%

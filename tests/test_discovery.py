@@ -145,8 +145,7 @@ def test_a_module_says_which_common_rules_it_treats_otherwise(write):
 
 
 @pytest.mark.parametrize(
-    "rules",
-    ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '{"window": ("car",)}', '("window",)'],
+    "rules", ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '{"window": ("car",)}', '("window",)']
 )
 def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(write, rules):
     write("odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
@@ -280,10 +279,7 @@ def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp
         ("replace(drawn, name=3)", "a recording: its name is of type int, expected str"),
         ("replace(drawn, observations=None)", "drive: its observations is of type NoneType, expected Observations"),
         ("replace(drawn, provenance='x')", "drive: its provenance is of type str"),
-        (
-            "replace(drawn, rig=replace(drawn.rig, fx_px=None))",
-            "drive: its rig.fx_px is of type NoneType",
-        ),
+        ("replace(drawn, rig=replace(drawn.rig, fx_px=None))", "drive: its rig.fx_px is of type NoneType"),
         ("replace(drawn, motion=replace(drawn.motion, v_mps=drawn.motion.v_mps[1:]))", "motion.v_mps has 10 rows, and"),
         ("replace(drawn, frames_t_ns=drawn.frames_t_ns[:3])", "is of frame 3, there are 3"),
     ],

@@ -21,16 +21,7 @@ import numpy as np
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, BoolArray, IntArray, se3, so3_exp, so3_log
-from toolkit.measurements import (
-    NS_PER_S,
-    ImuMotion,
-    ImuNoise,
-    Motion,
-    Packet,
-    Prior,
-    StereoFrame,
-    TwistNoise,
-)
+from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise, Motion, Packet, Prior, StereoFrame, TwistNoise
 from toolkit.models import stereo
 from toolkit.models.camera_motion import camera_motion
 from toolkit.models.factors import B, X

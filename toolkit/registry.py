@@ -37,10 +37,7 @@ ENTRY_POINT_GROUP = "toolkit.estimators"
 LADDER = "ladder"
 # Settings that are meant for all estimators, and whether an estimator obeys them by default, when its module has no
 # entry for them: the outlier policy and the window.
-RULES = {
-    "outliers": True,
-    "window": True,
-}
+RULES = {"outliers": True, "window": True}
 
 
 @dataclass(frozen=True)

@@ -677,12 +677,7 @@ def innovate(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array, S: Arra
     S[0, 2, 0], S[0, 2, 1], S[0, 2, 2] = S[0, 2, 0] + s20, S[0, 2, 1] + s21, S[0, 2, 2] + s22
 
 
-@kernel(
-    _TRACKS,
-    types.Tuple((_ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW)),
-    types.Tuple((_MATRIX, _MATRIX)),
-    _WEIGHER,
-)
+@kernel(_TRACKS, types.Tuple((_ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW)), types.Tuple((_MATRIX, _MATRIX)), _WEIGHER)
 def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, weigher: Arrays) -> Array:
     """Gate the newest sightings of F tracks, add them, and eliminate the landmarks.
 

@@ -38,12 +38,7 @@ from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
-from toolkit.models.gating import (
-    LEAST_DEPTH_M,
-    LEAST_DISPARITY_PX,
-    MISMATCHED_TRACK_FACTOR,
-    FrameGate,
-)
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, MISMATCHED_TRACK_FACTOR, FrameGate
 from toolkit.models.state import POSE, Belief
 from toolkit.progress import Progress
 

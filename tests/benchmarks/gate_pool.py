@@ -120,11 +120,7 @@ def _plants(run: Run, read: Sequence, prior: Prior, sequence: Sequence) -> Itera
         yield MEAN_ATE, {"status": run.status, "scores": scores(run, sequence, 0.0)}
     rig, name = read.rig, run.estimator
     reads = {
-        plant: replace(
-            read,
-            rig=replace(rig, cov_uv_px2=rig.cov_uv_px2 * pixels**2),
-            noise=_louder(read.noise, motion),
-        )
+        plant: replace(read, rig=replace(rig, cov_uv_px2=rig.cov_uv_px2 * pixels**2), noise=_louder(read.noise, motion))
         for plant, (pixels, motion) in NOISE_PLANTS.items()
     }
     slipped = rig.T_imu_cam.copy()

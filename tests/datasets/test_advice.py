@@ -521,10 +521,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         (both(put(Feature=1.0), gone("features")), "without image features leave Feature out", gone("Feature")),
         (put(features=OBJECTS), "never unpickled; save it as plain numbers"),
         (put(time_stamps=np.array([[0, 1, np.nan, 3, 4]])), "(1 such stamps); remove these samples"),
-        (
-            put(time_stamps=np.array([[0, 1, 1e300, 3, 4]])),
-            "beyond the year 2262 (1 such stamps)",
-        ),
+        (put(time_stamps=np.array([[0, 1, 1e300, 3, 4]])), "beyond the year 2262 (1 such stamps)"),
         (put(time_stamps=FEW_S + 1e300), "(5 such stamps); correct them"),
         (put(time_stamps=1.3e18 + 1e9 * FEW_S), "divide by 1e9", put(time_stamps=(1.3e18 + 1e9 * FEW_S) / 1e9)),
         (put(time_stamps=1.3e15 + 1e6 * FEW_S), "divide by 1e6", put(time_stamps=(1.3e15 + 1e6 * FEW_S) / 1e6)),
@@ -831,10 +828,7 @@ ADVICE: dict[str, list[tuple[Step, str] | tuple[Step, str, Step]]] = {
         ),
         (both(*(lines(name, restamped(lambda t: t // 1000)) for name in TABLES)), "microseconds: multiply by 1e3"),
         (lines(TABLES[0], of_rows(in_seconds)), "write seconds times 1e9"),
-        (
-            lines(TABLES[1], restamped(lambda t: t + 20_000_000)),
-            "clocks differ, correct the stamps of cam1",
-        ),
+        (lines(TABLES[1], restamped(lambda t: t + 20_000_000)), "clocks differ, correct the stamps of cam1"),
         (
             both(gone(YAMLS[1]), text("orb.yaml", "Camera1.fx: 50.0")),
             "orb.yaml of ORB-SLAM3 is not read; write the calibration as docs/images.md describes",

@@ -183,11 +183,7 @@ def test_an_empty_cell_of_the_right_image_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kinds", "stamp"),
-    [
-        (("acc_", "gyro_"), "timestamp [ns]"),
-        (("a", "w"), "t_ns"),
-        (("linear_acceleration.", "omega_"), "#ns"),
-    ],
+    [(("acc_", "gyro_"), "timestamp [ns]"), (("a", "w"), "t_ns"), (("linear_acceleration.", "omega_"), "#ns")],
 )
 def test_columns_of_an_imu_go_by_many_names(tmp_path: Path, kinds: tuple[str, ...], stamp: str) -> None:
     original = recorded("imu")

@@ -56,8 +56,7 @@ def test_a_bayer_pattern_has_its_red_where_it_says(pattern: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "step", "pattern"),
-    [("32FC1", 16, "encoded as 32FC1; there are mono8"), ("mono8", 3, "it is cut off")],
+    ("encoding", "step", "pattern"), [("32FC1", 16, "encoded as 32FC1; there are mono8"), ("mono8", 3, "it is cut off")]
 )
 def test_an_image_that_cannot_be_used_is_named(encoding: str, step: int, pattern: str) -> None:
     with pytest.raises(DataError, match=rf"bag: /left: .*{pattern}"):

@@ -8,14 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from toolkit.gate.baseline import (
-    BaselineError,
-    installed_releases,
-    json_text,
-    load_baseline,
-    other_releases,
-    to_text,
-)
+from toolkit.gate.baseline import BaselineError, installed_releases, json_text, load_baseline, other_releases, to_text
 from toolkit.metrics import describe
 
 

@@ -49,11 +49,7 @@ def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(ba
         for factor in (1.0 + 1e-7, 0.996, 1.004, 1.006)
         for accepted in (False, True)
         for check in [
-            checked(
-                baseline,
-                [edited(simulated, lambda _n, _k, v, f=factor: v * f), recorded],
-                accept_better=accepted,
-            )
+            checked(baseline, [edited(simulated, lambda _n, _k, v, f=factor: v * f), recorded], accept_better=accepted)
         ]
     }
     assert findings == {
@@ -190,9 +186,7 @@ def test_frames_that_got_lost_fail_however_good_the_rest(baseline):
 def test_other_measurements_are_not_compared(baseline):
     simulated, recorded = as_measured(baseline)
     other = replace(
-        simulated,
-        hashes=("other", *simulated.hashes[1:]),
-        fingerprints=("other", *simulated.fingerprints[1:]),
+        simulated, hashes=("other", *simulated.hashes[1:]), fingerprints=("other", *simulated.fingerprints[1:])
     )
     check = checked(baseline, [other, recorded])
     assert findings(check) == [("flight", "", "sequence", "missing")]

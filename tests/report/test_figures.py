@@ -14,12 +14,7 @@ from toolkit.estimate import Landmarks, Trajectory
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.registry import defaults, discover
-from toolkit.report.curves import (
-    COLOURS,
-    components,
-    error_curves,
-    look_numbers,
-)
+from toolkit.report.curves import COLOURS, components, error_curves, look_numbers
 from toolkit.report.figures import FigureFormat, bands, from_above, over_time, save
 from toolkit.report.figures.from_above import NOWHERE, view_of
 from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of

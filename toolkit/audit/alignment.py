@@ -11,13 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.intervals import Intervals, chained, interval_means, subdivided
-from toolkit.audit.robust import (
-    Scalar,
-    chance_bound,
-    in_motion,
-    regression,
-    slip_stretches,
-)
+from toolkit.audit.robust import Scalar, chance_bound, in_motion, regression, slip_stretches
 from toolkit.geometry import Array, IntArray, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measurements import NS_PER_S

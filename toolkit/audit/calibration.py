@@ -5,13 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from toolkit.audit.alignment import (
-    SYSTEMATIC_RAD,
-    Turn,
-    VelocityFit,
-    metres,
-    turn_by_rotations,
-)
+from toolkit.audit.alignment import SYSTEMATIC_RAD, Turn, VelocityFit, metres, turn_by_rotations
 from toolkit.audit.fault import Evidence, Symptom, Undecided, beside_camera
 from toolkit.audit.intervals import (
     LEAST_INTERVALS,

@@ -22,15 +22,7 @@ from toolkit.audit.intervals import Intervals, chained, interval_means, moved_as
 from toolkit.audit.robust import LEVEL
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_exp, se3_inverse, skew, so3_exp, so3_log, transform
-from toolkit.measurements import (
-    NS_PER_S,
-    ImuMotion,
-    ImuNoise,
-    MotionKind,
-    StereoRig,
-    TwistMotion,
-    TwistNoise,
-)
+from toolkit.measurements import NS_PER_S, ImuMotion, ImuNoise, MotionKind, StereoRig, TwistMotion, TwistNoise
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.gating import CHI2_3_MEDIAN
 from toolkit.models.imu import predict, preintegrate, preintegration_params

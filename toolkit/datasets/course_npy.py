@@ -28,14 +28,7 @@ from toolkit.datasets.io.image_pairs import pinhole_of, seen_in
 from toolkit.datasets.io.numpy_files import MAGIC, corners_of, read_dict
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
-from toolkit.frontend import (
-    Camera,
-    ImageRecording,
-    RectifiedPair,
-    StampedPair,
-    already_rectified,
-    rectified,
-)
+from toolkit.frontend import Camera, ImageRecording, RectifiedPair, StampedPair, already_rectified, rectified
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_angle
 from toolkit.measurements import StereoRig

@@ -27,14 +27,7 @@ from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence
 CITES = ("geiger2013kitti",)
 # Two spellings of one quantity differ by the digits they were written with.
 _ALIKE = 1e-4
-_REQUIRED = (
-    "time_stamps",
-    "linear_velocity",
-    "angular_velocity|rotational_velocity",
-    "K",
-    "b",
-    "imu_T_cam|cam_T_imu",
-)
+_REQUIRED = ("time_stamps", "linear_velocity", "angular_velocity|rotational_velocity", "K", "b", "imu_T_cam|cam_T_imu")
 _NAMES = {"features"}.union(*(keys.split("|") for keys in _REQUIRED))
 
 

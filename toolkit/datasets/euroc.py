@@ -18,12 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.euroc_calibration import (
-    PIXEL_SIGMA_PX,
-    AslCalibration,
-    published,
-    read_calibration,
-)
+from toolkit.datasets.io.euroc_calibration import PIXEL_SIGMA_PX, AslCalibration, published, read_calibration
 from toolkit.datasets.io.fields import check_frame_count
 from toolkit.datasets.io.image_pairs import (
     Listed,

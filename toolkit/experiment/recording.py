@@ -27,10 +27,7 @@ from toolkit.simulation.faults import Doses, planted
 from toolkit.threads import on_one_thread
 
 Start = Literal["measurements", "truth"]
-STARTS: dict[Start, Callable[[Sequence], Prior]] = {
-    "measurements": start_from_measurements,
-    "truth": start_from_truth,
-}
+STARTS: dict[Start, Callable[[Sequence], Prior]] = {"measurements": start_from_measurements, "truth": start_from_truth}
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,7 @@ import numpy as np
 from toolkit.answers import Output, Run
 from toolkit.audit.truth import steps_beside_camera
 from toolkit.datasets.trajectories import read_poses
-from toolkit.datasets.trajectories.belonging import (
-    Reference,
-    body_of,
-    of_the_camera,
-    other_axes,
-    range_s,
-)
+from toolkit.datasets.trajectories.belonging import Reference, body_of, of_the_camera, other_axes, range_s
 from toolkit.datasets.trajectories.covariances import CovConvention, StatedCovariances
 from toolkit.datasets.trajectories.formats import PosesFile
 from toolkit.errors import DataError

@@ -141,16 +141,7 @@ def outcome_of(run: Run, sequence: Sequence, seed: int, requested: tuple[str, ..
         outputs: dict[Output, Scored] = {"causal": causal, "final": replace(causal, scores=repeated(causal.scores))}
     else:
         outputs = {output: _scored(run, output, sequence, requested) for output in given}
-    return Outcome(
-        seed,
-        run.estimator,
-        run.status,
-        outputs,
-        run.log,
-        sequence.content_hash(),
-        run.final_is_causal,
-        run,
-    )
+    return Outcome(seed, run.estimator, run.status, outputs, run.log, sequence.content_hash(), run.final_is_causal, run)
 
 
 def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, ...]) -> Scored:

@@ -22,14 +22,7 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.graph_state import MotionModel
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.models.stereo_adjustment import (
-    Ending,
-    Evaluated,
-    RobustCamera,
-    StereoWindow,
-    Vision,
-    solve_window,
-)
+from toolkit.models.stereo_adjustment import Ending, Evaluated, RobustCamera, StereoWindow, Vision, solve_window
 from toolkit.sequence import Sequence
 
 # A stretch has this many frames: most tracks end within it, and a dense matrix holds its states. There are as many

@@ -61,11 +61,7 @@ _USUAL = (
     *("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "time_coverage_percent"),
 )
 # Blocks of a stated covariance: in words, degrees of freedom, and the metric that is its energy score.
-_BLOCKS = {
-    "pose": ("pose", 6, ""),
-    "ori": ("orientation", 3, "energy_ori_deg"),
-    "pos": ("position", 3, "energy_pos_m"),
-}
+_BLOCKS = {"pose": ("pose", 6, ""), "ori": ("orientation", 3, "energy_ori_deg"), "pos": ("position", 3, "energy_pos_m")}
 _UNCERTAINTY = "Stated uncertainty: means over the runs (95 % interval over the runs)"
 # What is told of long lists; evaluation.json has all.
 _MOST_FAILURES, _MOST_REMARKS = 20, 8

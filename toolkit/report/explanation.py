@@ -12,25 +12,13 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from toolkit.answers import Output
 from toolkit.experiment.comparison import NEES
 from toolkit.experiment.contests import HELD_OUT
-from toolkit.experiment.explanation import (
-    ERROR,
-    FEWEST_SEEDS,
-    VARIANCE,
-    Contribution,
-    Explanation,
-    Variant,
-    called,
-)
+from toolkit.experiment.explanation import ERROR, FEWEST_SEEDS, VARIANCE, Contribution, Explanation, Variant, called
 from toolkit.experiment.statistics import Paired
 from toolkit.files.documents import Count, reader, rounded
 from toolkit.metrics import metrics_called
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
 from toolkit.report.results_folder import Results, Shown
-from toolkit.report.text import (
-    MISSING,
-    Table,
-    number,
-)
+from toolkit.report.text import MISSING, Table, number
 from toolkit.settings import changes_of
 
 Kind = Literal["added", "taken"]

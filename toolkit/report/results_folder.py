@@ -17,14 +17,7 @@ from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.files.documents import to_text
 from toolkit.files.writing import check_replaceable, replaced_directory, with_folders
 from toolkit.report.html import card
-from toolkit.report.text import (
-    Table,
-    Width,
-    as_markdown,
-    as_text,
-    filled,
-    in_markdown,
-)
+from toolkit.report.text import Table, Width, as_markdown, as_text, filled, in_markdown
 
 if TYPE_CHECKING:
     from toolkit.report.figures.style import NamedFigure
@@ -103,10 +96,7 @@ class Results(Generic[Record]):
         return card(shown.title, [shown.words], shown.table, figures)
 
     def write(
-        self,
-        target: Path,
-        figures: "Iterable[NamedFigure]",
-        made: Callable[[dict[str, str], tuple[str, ...]], Record],
+        self, target: Path, figures: "Iterable[NamedFigure]", made: Callable[[dict[str, str], tuple[str, ...]], Record]
     ) -> Record:
         """Write the folder anew: figures, PNG and PDF, then the document and its Markdown; return the document.
 

@@ -294,10 +294,7 @@ def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
 
 
 def _check_same_runs(
-    directory: Path,
-    name: str,
-    scored: Sequence[ScoredRun | RunOverSeeds],
-    drawn: Sequence[DrawnRun | DrawnOverSeeds],
+    directory: Path, name: str, scored: Sequence[ScoredRun | RunOverSeeds], drawn: Sequence[DrawnRun | DrawnOverSeeds]
 ) -> list[tuple[str, Output]]:
     runs = [(run.estimator, run.output) for run in drawn]
     if [(run.estimator, run.output) for run in scored] != runs:

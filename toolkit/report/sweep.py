@@ -17,13 +17,7 @@ from toolkit.metrics import Metric, known_metrics
 from toolkit.report.comparison_table import sequence_line
 from toolkit.report.manifest import RecordingRecord, SeedsUsed, made_here, recording_record
 from toolkit.report.results_folder import Results, Shown
-from toolkit.report.text import (
-    MISSING,
-    Table,
-    cell,
-    number,
-    unit_of,
-)
+from toolkit.report.text import MISSING, Table, cell, number, unit_of
 from toolkit.settings import Scalar, changes_of
 
 if TYPE_CHECKING:

@@ -197,12 +197,10 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
     """How stereo tracks are made of images; the same tracks for every estimator."""
 
     tracks: Annotated[
-        Tracks,
-        _about("source of the tracks of a recording with images; auto: the images, if nearly all of them exist"),
+        Tracks, _about("source of the tracks of a recording with images; auto: the images, if nearly all of them exist")
     ] = "auto"
     topics: Annotated[
-        str | None,
-        _about("topics of a bag, as in left=/cam0/image_raw,imu=/imu0; others are guessed from their names"),
+        str | None, _about("topics of a bag, as in left=/cam0/image_raw,imu=/imu0; others are guessed from their names")
     ] = None
     max_tracks: Annotated[int, _about("most stereo tracks a frame", ge=20, le=2000)] = 200
     spacing_px: Annotated[float, _about("least distance of two tracks in the left image", "px", ge=3.0, le=200.0)] = (

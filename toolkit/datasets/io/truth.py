@@ -16,14 +16,7 @@ from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.fields import read_fields
 from toolkit.datasets.io.tables import columns_of_file, headings_of
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.belonging import (
-    Reference,
-    Steps,
-    check_clock,
-    check_turns,
-    stamps_among,
-    turned,
-)
+from toolkit.datasets.trajectories.belonging import Reference, Steps, check_clock, check_turns, stamps_among, turned
 from toolkit.datasets.trajectories.formats import (
     POSITIONS_ALONE,
     checked_poses,

@@ -41,11 +41,7 @@ def drawn(comparison: "Comparison", choice: FigureChoice = "all") -> Iterator[Na
         bands.draw_nees,
         over_time.draw_bound,
     )
-    more = (
-        bands.draw_nis,
-        over_time.draw_other_components,
-        from_above.draw_each,
-    )
+    more = (bands.draw_nis, over_time.draw_other_components, from_above.draw_each)
     drawings = (bands.draw_over_seeds,) if comparison.over_seeds else few + (more if choice == "all" else ())
     if choice == "none":
         drawings = ()
