@@ -19,6 +19,7 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.measurements import (
     GRAVITY_WORLD,
     NS_PER_S,
+    Motion,
     MotionKind,
     MotionNoise,
     Packet,
@@ -193,14 +194,22 @@ class Sequence:
         Raises DataError where time does not increase, a value is not finite, or frames lie outside the
         motion samples.
         """
-        check_runnable(self)
-        seen = self.visible
+        motions, seen = self.motions(), self.visible
         first_row = self._frame_starts(seen)
-        motions = motions_between(self.motion, self.frames_t_ns, self.bridges, self.gap_twists)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
             frame = StereoFrame(int(self.frames_t_ns[k]), seen.track_id[rows], seen.uv_px[rows])
             yield Packet(k, next(motions) if k else None, frame)
+
+    def motions(self) -> Iterator[Motion]:
+        """Return the motion of each interval between frames, in order of time; raise as :meth:`packets` does."""
+        _ = self._is_runnable
+        return motions_between(self.motion, self.frames_t_ns, self.bridges, self.gap_twists)
+
+    @cached_property
+    def _is_runnable(self) -> bool:
+        check_runnable(self)  # once: its arrays are read-only
+        return True
 
     def truncated(self, max_frames: int) -> Self:
         """Return the first frames of the sequence only; the motion samples stay whole."""

@@ -97,8 +97,8 @@ def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> PredictedStep
 
 def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
     """Yield the motions between neighbouring frames if the trajectory has both, with the rows of these."""
-    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
-    for before, packet in pairwise(sequence.packets()):
-        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
-        if start is not None and end is not None and packet.motion is not None:
-            yield start, end, packet.motion
+    row_of = {t_ns: row for row, t_ns in enumerate(trajectory.t_ns.tolist())}
+    for ends_ns, motion in zip(pairwise(sequence.frames_t_ns.tolist()), sequence.motions(), strict=True):
+        start, end = map(row_of.get, ends_ns)
+        if start is not None and end is not None:
+            yield start, end, motion
