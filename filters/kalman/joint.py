@@ -81,7 +81,10 @@ class JointBelief:
 
     def clone(self) -> None:
         """Add a clone of the present pose with all its correlations (stochastic cloning)."""
-        self._cov = _of_slices(self._cov, [slice(0, self._cov.shape[0]), slice(0, 6)])
+        cov, n = self._cov, len(self._cov)
+        self._cov = np.empty((n + 6, n + 6))
+        self._cov[:n, :n], self._cov[n:, :n] = cov, cov[:6]
+        self._cov[:n, n:], self._cov[n:, n:] = cov[:, :6], cov[:6, :6]
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
 
@@ -301,16 +304,22 @@ def transposed_root_times(root: Array, right: Array) -> Array:
     return result
 
 
-def root_with_information(root: Array, blocks: Array, taken: Array, weight: float = 1.0) -> Array:
+def root_with_information(
+    root: Array, blocks: Array, taken: Array, weight: float = 1.0, narrow: Array | None = None
+) -> Array:
     """Return the root of ``1 + weight (R^T D R - E^T E)``: R lower triangular (6 W, 6 W), D of blocks (W, 6, 6).
 
-    E = ``taken`` (m, 6 W) is what multiplies errors of unit covariance, R times which are those of W poses.
+    E = ``taken`` (m, 6 W) is what multiplies errors of unit covariance, R times which are those of W poses; ``narrow``
+    (l, k) are further rows of E of which only the first k columns are not zero.
     """
     size = len(root)
     by_blocks = (blocks @ root.reshape(-1, 6, size)).reshape(size, size)
     matrix = transposed_root_times(root, by_blocks)
     # Of the symmetric matrix only the lower half is made.
     matrix = dsyrk(-weight, taken.T, weight, matrix.T, overwrite_c=1).T if len(taken) else weight * matrix
+    if narrow is not None:
+        k = narrow.shape[1]
+        matrix[:k, :k] -= weight * (narrow.T @ narrow)
     matrix.flat[:: size + 1] += 1.0
     return cholesky_root(matrix)
 

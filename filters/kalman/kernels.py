@@ -34,6 +34,8 @@ LEAST_RAY = 1e-6
 Arrays = tuple[Any, ...]
 _ROW, _MATRIX, _STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 _MASK = types.boolean[:, ::1]
+# Ids (S,) and sightings (S, 3) of a frame, which may be read-only.
+_IDS, _SIGHTINGS = types.Array(types.int64, 1, "C", readonly=True), types.Array(types.float64, 2, "C", readonly=True)
 # T_world_imu (W, 4, 4) of the window's poses, at present and where Jacobians are evaluated.
 _WINDOW = types.Tuple((_STACK, _STACK))
 # fx, fy, cx, cy px and baseline m (5,); the whiteners (3, 3) of sightings in both images and in the left one alone;
@@ -488,18 +490,19 @@ def add_cross(rows: Arrays, at: int, B: Array, f: int, j: int) -> None:
 
 
 @compiled
-def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
+def eliminate(f: int, N: Array, E: Array, width: int, e: Array) -> None:
     """Overwrite the three rows B of a track by ``C^-1 B``, with ``C C^T = H_f^T H_f``, and write ``C^-1 H_f^T r`` to e.
 
-    What the track then says of the poses is the information ``H_x^T H_x - E^T E`` and the vector ``H_x^T r - E^T e``:
-    that of its residuals on the left null space of H_f, without forming the null space (the Schur complement).
+    Beyond column ``width`` B is zero. What the track then says of the poses is the information ``H_x^T H_x - E^T E``
+    and the vector ``H_x^T r - E^T e``: that of its residuals on the left null space of H_f, without forming the null
+    space (the Schur complement).
     """
     l00 = math.sqrt(N[f, 0, 0])
     l10, l20 = N[f, 1, 0] / l00, N[f, 2, 0] / l00
     l11 = math.sqrt(N[f, 1, 1] - l10 * l10)
     l21 = (N[f, 2, 1] - l20 * l10) / l11
     l22 = math.sqrt(N[f, 2, 2] - l20 * l20 - l21 * l21)
-    for c in range(E.shape[1]):
+    for c in range(width):
         x = E[3 * f, c] / l00
         y = (E[3 * f + 1, c] - l10 * x) / l11
         E[3 * f, c], E[3 * f + 1, c] = x, y
@@ -580,7 +583,7 @@ def eliminate_tracks(
             for k in range(m):
                 add_pose((A, J), 3 * k, D, d, where[k])
                 add_cross((A, J), 3 * k, E, f, where[k])
-            eliminate(f, N, E, e)
+            eliminate(f, N, E, 2 * most, e)
         elif nis[f] > mismatched_factor * weigher[0][dof[f]]:
             worst[f] = where[worst_sighting(S, m, V, whitened, B)]
     return points, reliable, nis, dof, worst, weights, (N, E, e, D, d)
@@ -600,27 +603,81 @@ def start_landmark(sightings: Arrays, points: Array, f: int, where: IntArray, he
 _TRACKS = types.Tuple((_STACK, _MASK, _MATRIX, _MATRIX))
 
 
+@kernel(types.int64[::1], _TRACKS, types.int64[::1], _IDS, _SIGHTINGS)
+def with_frame(
+    track_ids: IntArray, tracks: Arrays, ascending: IntArray, frame_ids: IntArray, frame_uvs_px: Array
+) -> tuple[IntArray, Array, BoolArray, Array, Array]:
+    """Return tracks with a frame's sightings (S, 3) px as a new column: ids, and arrays as those of ``tracks``.
+
+    ``tracks`` are those of :func:`normals_in_view`, ``track_ids`` (F,) theirs and ``ascending`` (F,) their rows in the
+    order of the ids. Tracks that no pose has seen leave; ids (S,) unknown so far start new tracks, after the others.
+    """
+    uvs_px, seen, weights, points = tracks
+    before, window = seen.shape
+    row_of, source, count = np.full(before, -1), np.empty(before + frame_ids.size, dtype=np.int64), 0
+    for f in range(before):
+        for j in range(window):
+            if seen[f, j]:
+                row_of[f], source[count] = count, f
+                count += 1
+                break
+    kept, rows = count, np.empty(frame_ids.size, dtype=np.int64)
+    for i in range(frame_ids.size):
+        low, high = 0, before
+        while low < high:
+            middle = (low + high) // 2
+            if track_ids[ascending[middle]] < frame_ids[i]:
+                low = middle + 1
+            else:
+                high = middle
+        if low < before and track_ids[ascending[low]] == frame_ids[i] and row_of[ascending[low]] >= 0:
+            rows[i] = row_of[ascending[low]]
+        else:
+            rows[i], source[count] = count, i
+            count += 1
+    ids, now_points, now_uvs_px = np.empty(count, np.int64), np.empty((count, 3)), np.zeros((count, window + 1, 3))
+    now_seen, now_weights = np.zeros((count, window + 1), dtype=np.bool_), np.zeros((count, window + 1))
+    for row in range(count):
+        f = source[row]
+        ids[row] = track_ids[f] if row < kept else frame_ids[f]
+        for d in range(3):
+            now_points[row, d] = points[f, d] if row < kept else np.nan
+        if row < kept:
+            for j in range(window):
+                now_seen[row, j], now_weights[row, j] = seen[f, j], weights[f, j]
+                for d in range(3):
+                    now_uvs_px[row, j, d] = uvs_px[f, j, d]
+    for i in range(frame_ids.size):
+        now_seen[rows[i], window], now_weights[rows[i], window] = True, 1.0
+        for d in range(3):
+            now_uvs_px[rows[i], window, d] = frame_uvs_px[i, d]
+    return ids, now_uvs_px, now_seen, now_weights, now_points
+
+
 @kernel(_TRACKS, _WINDOW, _CAMERA, _LIMITS)
 def normals_in_view(
     tracks: Arrays, window: Arrays, camera: Arrays, limits: Arrays
-) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    """Return the normal equations of F tracks without their newest sightings, and the rows of the newest.
+) -> tuple[IntArray, Array, Array, Array, Array, Array, Array, Array, IntArray]:
+    """Return the normal equations of G of F tracks without their newest sightings, and the rows of the newest.
 
     ``tracks`` are (uL, uR, v) (F, W, 3) px, which were seen (F, W), their weights (F, W), 0 where one does not count,
-    and the landmarks (F, 3), NaN for none; a landmark starts here once two sightings allow it. Returns the least depth
-    (F,) of each, 0 where a track does not count: it has no landmark, the newest pose (the last) does not see it, it is
-    behind one of its cameras, or it lacks right images and its earlier sightings do not determine the landmark. In the
-    last two cases its landmark and its weights are forgotten. Then ``N = [H_f r]^T [H_f r]`` (F, 4, 4); the newest A
-    (3 F, 4); ``B = H_f^T H_x`` (3 F, 6 W); the newest J (3 F, 6); ``H_x^T H_x``, one block (W, 6, 6) a pose, and
-    ``H_x^T r`` (6 W,) of the others.
+    and the landmarks (F, 3), NaN for none; a landmark starts here once two sightings allow it. A track does not count
+    if it has no landmark, the newest pose (the last) does not see it, it is behind one of its cameras, or it lacks
+    right images and its earlier sightings do not determine the landmark. In the last two cases its landmark and its
+    weights are forgotten. Returns which tracks count (G,) and the least depth (G,) of each; ``N = [H_f r]^T [H_f r]``
+    (G, 4, 4); the newest A (3 G, 4); ``B = H_f^T H_x`` (3 G, 6 W); the newest J (3 G, 6); ``H_x^T H_x``, one block
+    (W, 6, 6) a pose, and ``H_x^T r`` (6 W,) of the others. In these the newest pose is the first, so that of a track
+    only the leading columns of B are not zero; their numbers (G,) are returned last.
     """
     uvs_px, seen, weights, points = tracks
     least_px, least_m = limits
     T_cam_world = in_camera(window[0], camera)
     window_at = (T_cam_world, in_camera(window[1], camera), window[1])
     count, longest = weights.shape
-    depths, N, B = np.zeros(count), np.zeros((count, 4, 4)), np.zeros((3 * count, 6 * longest))
-    A_newest, J_newest = np.zeros((3 * count, 4)), np.zeros((3 * count, 6))
+    counting, widths = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    depths, g = np.empty(count), 0
+    N, B = np.zeros((count, 4, 4)), np.zeros((3 * count, 6 * longest))
+    A_newest, J_newest = np.empty((3 * count, 4)), np.empty((3 * count, 6))
     D, d = np.zeros((longest, 6, 6)), np.zeros(6 * longest)
     where, A, J = np.empty(longest, dtype=np.int64), np.empty((3 * longest, 4)), np.empty((3 * longest, 6))
     for f in range(count):
@@ -633,89 +690,96 @@ def normals_in_view(
         for k in range(m):
             left_only = left_only or math.isnan(uvs_px[f, where[k], 1])
             scale((A, J), 3 * k, 3 * k + 3, weights[f, where[k]])
-        add_normals(A, 0, last, N, f)
-        if not nearest > least_m or (left_only and not is_determined(N, f, nearest)):
+        clear(N, g)
+        add_normals(A, 0, last, N, g)
+        if not nearest > least_m or (left_only and not is_determined(N, g, nearest)):
             points[f, 0] = np.nan
             for j in range(longest):
                 weights[f, j] = seen[f, j]
             continue
-        depths[f] = nearest
+        counting[g], depths[g], widths[g] = f, nearest, 6 * (longest - where[0])
         for i in range(3):
             for c in range(4):
-                A_newest[3 * f + i, c] = A[last + i, c]
+                A_newest[3 * g + i, c] = A[last + i, c]
             for c in range(6):
-                J_newest[3 * f + i, c] = J[last + i, c]
+                J_newest[3 * g + i, c] = J[last + i, c]
         for k in range(m - 1):
-            add_pose((A, J), 3 * k, D, d, where[k])
-            add_cross((A, J), 3 * k, B, f, where[k])
-    return depths, N, A_newest, B, J_newest, D, d
+            add_pose((A, J), 3 * k, D, d, longest - 1 - where[k])
+            add_cross((A, J), 3 * k, B, g, longest - 1 - where[k])
+        g += 1
+    of_tracks = counting[:g], depths[:g], N[:g], A_newest[: 3 * g]
+    return *of_tracks, B[: 3 * g], J_newest[: 3 * g], D, d, widths[:g]
 
 
 @compiled
-def innovate(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array, S: Array) -> None:
+def innovate(f: int, N: Array, A: Array, JR: Array, BR: Array, width: int, H: Array, S: Array) -> None:
     """Write the covariance and the innovation of a track's newest sighting, given the others, to S[0] (4, 4).
 
     The others place the landmark at ``V (b + B x)`` with ``V = N^-1``; the newest measures ``H_f V (b + B x)`` of it.
-    H (3, 6 W) is its Jacobian to errors of unit covariance.
+    H (3, 6 W) is its Jacobian to errors of unit covariance, zero beyond ``width``.
     """
     b = right_side(N, f)
     for a in range(3):
         row = 3 * f + a
         x, y, z = solve(N, f, 0.0, 0.0, (A[row, 0], A[row, 1], A[row, 2]))  # a row of H_f V
-        for c in range(JR.shape[1]):
-            H[a, c] = JR[row, c] - x * BR[3 * f, c] - y * BR[3 * f + 1, c] - z * BR[3 * f + 2, c]
+        for c in range(width):
+            H[a, c] = -(x * BR[3 * f, c] + y * BR[3 * f + 1, c] + z * BR[3 * f + 2, c])
+        for c in range(6):
+            H[a, c] += JR[row, c]
         S[0, 3, a] = A[row, 3] - x * b[0] - y * b[1] - z * b[2]
         for k in range(a + 1):
             S[0, a, k] = x * A[3 * f + k, 0] + y * A[3 * f + k, 1] + z * A[3 * f + k, 2]
         S[0, a, a] += 1.0
     # Six independent sums: a single one would wait for each of its products.
     s00, s10, s11, s20, s21, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for c in range(JR.shape[1]):
+    for c in range(width):
         x, y, z = H[0, c], H[1, c], H[2, c]
         s00, s10, s11, s20, s21, s22 = s00 + x * x, s10 + y * x, s11 + y * y, s20 + z * x, s21 + z * y, s22 + z * z
     S[0, 0, 0], S[0, 1, 0], S[0, 1, 1] = S[0, 0, 0] + s00, S[0, 1, 0] + s10, S[0, 1, 1] + s11
     S[0, 2, 0], S[0, 2, 1], S[0, 2, 2] = S[0, 2, 0] + s20, S[0, 2, 1] + s21, S[0, 2, 2] + s22
 
 
-@kernel(_TRACKS, types.Tuple((_ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW)), types.Tuple((_MATRIX, _MATRIX)), _WEIGHER)
+_NORMALS = types.Tuple((types.int64[::1], _ROW, _STACK, _MATRIX, _MATRIX, _STACK, _ROW))
+
+
+@kernel(_TRACKS, _NORMALS, types.Tuple((_MATRIX, _MATRIX, types.int64[::1])), _WEIGHER)
 def add_newest(tracks: Arrays, normals: Arrays, by_root: Arrays, weigher: Arrays) -> Array:
-    """Gate the newest sightings of F tracks, add them, and eliminate the landmarks.
+    """Gate the newest sightings of G of F tracks, add them, and eliminate the landmarks.
 
-    ``normals`` are those of :func:`normals_in_view` without B; ``by_root`` are J R of the newest sightings (3 F, 6 W)
-    and B R (3 F, 6 W), with R the root of the covariance of the poses; ``weigher`` has the gate's bound of the NIS (4,)
-    and Huber's threshold (4,).
+    ``normals`` are those of :func:`normals_in_view` without B; ``by_root`` are J R of the newest sightings (3 G, 6),
+    B R (3 G, 6 W), and up to which columns (G,) this is not zero, with R the lower root of the covariance of the
+    poses, newest first; ``weigher`` has the gate's bound of the NIS (4,) and Huber's threshold (4,).
 
-    Returns the landmarks' part e (3 F,) of the vector. In place, the newest sightings get their weights, B R becomes E,
+    Returns the landmarks' part e (3 G,) of the vector. In place, the newest sightings get their weights, B R becomes E,
     ``H_x^T H_x`` and ``H_x^T r`` those of all sightings, and the landmarks move by a Gauss-Newton step of at most a
     fifth of their least depth. The information on errors of unit covariance is then
     ``R^T H_x^T H_x R - E^T E`` and ``R^T H_x^T r - E^T e``.
     """
     uvs_px, _, weights, points = tracks
-    depths, N, A, J, D, d = normals
-    JR, BR = by_root
-    count, last = depths.size, D.shape[0] - 1
-    e, H, S = np.zeros(3 * count), np.empty((3, JR.shape[1])), np.empty((1, 4, 4))
-    for f in range(count):
-        if depths[f] == 0.0:
-            continue
-        innovate(f, N, A, JR, BR, H, S)
+    counting, depths, N, A, J, D, d = normals
+    JR, BR, widths = by_root
+    last = D.shape[0] - 1
+    e, H, S = np.zeros(3 * depths.size), np.empty((3, BR.shape[1])), np.empty((1, 4, 4))
+    for g in range(depths.size):
+        f = counting[g]
+        innovate(g, N, A, JR, BR, widths[g], H, S)
         x, y, z = solve(S, 0, 0.0, 0.0, right_side(S, 0))
         nis = x * S[0, 3, 0] + y * S[0, 3, 1] + z * S[0, 3, 2]
         weights[f, last] = weight_of(nis, 2 if math.isnan(uvs_px[f, last, 1]) else 3, weigher)
         root = math.sqrt(weights[f, last])
-        scale((A, J), 3 * f, 3 * f + 3, weights[f, last])
-        for i in range(3 * f, 3 * f + 3):
+        scale((A, J), 3 * g, 3 * g + 3, weights[f, last])
+        for i in range(3 * g, 3 * g + 3):
             for b in range(3):
-                for c in range(BR.shape[1]):
-                    BR[3 * f + b, c] += root * A[i, b] * JR[i, c]
-        add_normals(A, 3 * f, 3 * f + 3, N, f)
-        add_pose((A, J), 3 * f, D, d, last)
-        x, y, z = solve(N, f, 0.0, 0.0, right_side(N, f))
-        share = min(1.0, 0.2 * depths[f] / max(math.sqrt(x * x + y * y + z * z), 1e-9))
+                for c in range(6):
+                    BR[3 * g + b, c] += root * A[i, b] * JR[i, c]
+        add_normals(A, 3 * g, 3 * g + 3, N, g)
+        add_pose((A, J), 3 * g, D, d, 0)
+        x, y, z = solve(N, g, 0.0, 0.0, right_side(N, g))
+        share = min(1.0, 0.2 * depths[g] / max(math.sqrt(x * x + y * y + z * z), 1e-9))
         points[f, 0] += share * x
         points[f, 1] += share * y
         points[f, 2] += share * z
-        eliminate(f, N, BR, e)
+        eliminate(g, N, BR, widths[g], e)
     return e
 
 
@@ -793,7 +857,7 @@ def test_landmarks(
 
 def _what_was_compiled() -> tuple[str, ...]:
     """Return a line about the compilation, if it was not done before."""
-    stats = [each.stats for each in (eliminate_tracks, normals_in_view, add_newest, test_landmarks)]
+    stats = [each.stats for each in (eliminate_tracks, with_frame, normals_in_view, add_newest, test_landmarks)]
     if all(each.cache_hits for each in stats):
         return ()
     kept = all(each.cache_path for each in stats)

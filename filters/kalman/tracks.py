@@ -34,7 +34,6 @@ from filters.kalman.joint import (
     root_with_information,
     times_root,
 )
-from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse
 from toolkit.measurements import StereoFrame, StereoRig
 from toolkit.models import stereo
@@ -88,20 +87,13 @@ class WindowTracks:
 
     def add_frame(self, frame: StereoFrame) -> None:
         """Append the frame's sightings as a new column; ids unknown so far start new tracks, tracks unseen leave."""
-        kept = np.flatnonzero(self.seen.any(axis=1))
-        track_ids, before, window = self.track_ids[kept], len(kept), self.seen.shape[1]
-        order = np.argsort(track_ids)
-        at, known = rows_of(frame.track_ids, track_ids[order])
-        count = before + np.count_nonzero(~known)
-        rows = np.empty(len(known), dtype=np.int64)
-        rows[known], rows[~known] = order[at[known]], np.arange(before, count)
-        uvs_px, seen, weights = (np.zeros((count, window + 1, *more), kind) for more, kind in _COLUMNS)
-        uvs_px[:before, :-1], seen[:before, :-1] = self.uvs_px[kept], self.seen[kept]
-        weights[:before, :-1] = self.weights[kept]
-        uvs_px[rows, -1], seen[rows, -1], weights[rows, -1] = frame.uvs_px, True, 1.0
-        self.track_ids = np.concatenate([track_ids, frame.track_ids[~known]])
-        self.points = np.concatenate([self.points[kept], np.full((count - before, 3), np.nan)])
-        self.uvs_px, self.seen, self.weights = uvs_px, seen, weights
+        from filters.kalman import kernels
+
+        tracks = self.uvs_px, self.seen, self.weights, self.points
+        frame_ids, frame_uvs_px = np.ascontiguousarray(frame.track_ids), np.ascontiguousarray(frame.uvs_px)
+        self.track_ids, self.uvs_px, self.seen, self.weights, self.points = kernels.with_frame(
+            self.track_ids, tracks, np.argsort(self.track_ids), frame_ids, frame_uvs_px
+        )
 
     def drop_oldest(self, count: int) -> None:
         """Drop the sightings from the ``count`` oldest poses."""
@@ -121,10 +113,6 @@ class WindowTracks:
         taken = TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
         self.seen[rows] = False
         return taken
-
-
-# What a track has for each pose: further axes and type of the sightings, of whether it was seen, and of the weights.
-_COLUMNS = ((3,), float), ((), bool), ((), float)
 
 
 class WindowPoses(NamedTuple):
@@ -185,13 +173,13 @@ def eliminated_tracks(
     twice.
     """
     passed, again = _tested(sightings, window, rig, gate)
-    return passed.joined(_tested(again, window, rig, gate)[0]) if len(again.track_ids) else passed
+    return passed if again is None else passed.joined(_tested(again, window, rig, gate)[0])
 
 
 def _tested(
     sightings: TrackSightings, window: WindowPoses, rig: StereoRig, gate: FrameGate
-) -> tuple[EliminatedTracks, TrackSightings]:
-    """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, to retest."""
+) -> tuple[EliminatedTracks, TrackSightings | None]:
+    """Return the tracks that pass, and without their worst sighting those that fail by a wide margin, if any."""
     from filters.kalman import kernels
 
     count, width = sightings.seen.shape
@@ -216,6 +204,8 @@ def _tested(
         vector - halves.T @ of_halves,
     )
     mismatched = np.flatnonzero(worst >= 0)
+    if not mismatched.size:
+        return passed, None
     less = sightings.select(mismatched)
     less.seen[np.arange(mismatched.size), worst[mismatched]] = False
     return passed, less
@@ -255,28 +245,34 @@ def given_tracks_in_view(
 
     in_view = tracks.uvs_px, tracks.seen, tracks.weights, tracks.points
     poses, limits = (window.poses, window.poses_at), (LEAST_DISPARITY_PX, LEAST_DEPTH_M)
-    depths_m, *of_points, between, H_newest, blocks, vector = kernels.normals_in_view(
+    counting, *of_tracks, between, H_newest, blocks, vector, widths = kernels.normals_in_view(
         in_view, poses, camera_for_kernels(rig), limits
     )
-    if not depths_m.any():
+    if not counting.size:
         return joint.core
-    root = regular_root(window.cov)
-    by_root = H_newest @ root[-6:], times_root(between, root)
-    normals = depths_m, *of_points, H_newest, blocks, vector
+    count = len(window.poses)
+    root = regular_root(window.cov.reshape(count, 6, count, 6)[::-1, :, ::-1].reshape(6 * count, 6 * count))
+    # Long tracks come first: in the second half the last columns are zero, and so they are in its product with R.
+    half, width = 3 * (counting.size // 2), widths[counting.size // 2 :].max()
+    between[:half] = times_root(between[:half], root)
+    between[half:, :width] = times_root(between[half:, :width], root[:width, :width])
+    normals, by_root = (counting, *of_tracks, H_newest, blocks, vector), (H_newest @ root[:6, :6], between, widths)
     eliminated = kernels.add_newest(in_view, normals, by_root, gate.limits(3))
-    matrix_root = root_with_information(root, blocks, by_root[1], rig.track_weight)
-    return _corrected(joint, root, matrix_root, rig.track_weight * (root.T @ vector - by_root[1].T @ eliminated))
+    matrix_root = root_with_information(root, blocks, between[:half], rig.track_weight, between[half:, :width])
+    return _corrected(joint, root, matrix_root, rig.track_weight * (root.T @ vector - between.T @ eliminated))
 
 
 def _corrected(joint: JointBelief, root: Array, matrix_root: Array, vector: Array) -> Belief:
     """Return the present state given an information matrix L and a vector n (6 W,) on errors u of the clones.
 
-    The errors of the clones are R u, with R the ``root`` of their covariance; ``matrix_root`` is that of 1 + L. With
+    The errors of the clones, newest first, are R u, with R the root of their covariance; ``matrix_root`` is that of
+    1 + L. With
     ``Y = R^-1 P_cx`` the update moves the state's error by ``Y^T (1 + L)^-1 n`` and its covariance becomes
     ``P_xx - Y^T Y + Y^T (1 + L)^-1 Y``.
     """
     core = joint.core
-    to_core = divided_by_root(root, joint.cov[joint.clone_columns, : core.layout.size].copy())
+    of_clones = joint.cov[joint.clone_columns, : core.layout.size].reshape(-1, 6, core.layout.size)
+    to_core = divided_by_root(root, of_clones[::-1].reshape(len(root), core.layout.size))
     halves = divided_by_root(matrix_root, np.concatenate([to_core, vector[:, None]], axis=1))
     half = halves[:, :-1]
     delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half

@@ -123,14 +123,16 @@ class FrameGate:
 
     def count(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> None:
         """Count innovations of NIS (N,) and ``dof`` (N,), of which the ``accepted`` (N,) have passed."""
-        table, count = self._table(dof), int(np.count_nonzero(accepted))
-        self.nis += float(nis[accepted].sum())
+        passed = nis[accepted]
+        count = passed.size
+        self.nis += float(passed.sum())
         if isinstance(dof, int):
             self.dof += dof * count
-            self.nis_expected += float(table.expected[dof]) * count
-        else:
-            self.dof += int(dof[accepted].sum())
-            self.nis_expected += float(table.expected[dof][accepted].sum())
+            self.nis_expected += float(self._table(dof).expected[dof]) * count
+        elif count:
+            freedom = dof[accepted]
+            self.dof += int(freedom.sum())
+            self.nis_expected += float(self._table(freedom).expected[freedom].sum())
         self.tested += accepted.size
         self.accepted += count
 
